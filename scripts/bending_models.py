@@ -18,8 +18,7 @@ from mpi4py import MPI
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.answers import data
-from lyra_petsc.experiments.verification.cases.plates import HELD
-from lyra_petsc.experiments.verification.flat_plates import flat_mesh
+from lyra_petsc.experiments.verification.flat_plates import flat_mesh, held
 from lyra_petsc.show.report.plots import Series, work_precision
 
 PLATES = data("linear_plate")["deflection"]
@@ -36,8 +35,8 @@ DEFLECTION = 1e-6
 def measure(bench: Bench, name: str, model: str, kind: str, n: int) -> tuple[float, float]:
     """Relative error of the deflection, and wall seconds."""
     exact = PLATES[name]
-    held, ratio = name.split()
-    (how, edges), poisson = HELD[held], float(ratio)
+    edges, ratio = name.split()
+    poisson = float(ratio)
     scene = {
         "mesh": flat_mesh(bench, kind, n, n),
         "material": {
@@ -48,7 +47,7 @@ def measure(bench: Bench, name: str, model: str, kind: str, n: int) -> tuple[flo
             "bending_model": model,
         },
         "gravity": [0.0, 0.0, DEFLECTION / exact["at"]],
-        "handles": [{"group": edge, "clamp": how == "clamp"} for edge in edges],
+        "handles": held(edges),
         "time": {"analysis": "static", "step": 1.0},
     }
     with bench.simulation(scene) as trial:

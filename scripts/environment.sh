@@ -1,4 +1,4 @@
-# Sourced by run.sh, test.sh and .ci/run: finds a Python that sees petsc4py and mpi4py, or installs
+# Sourced by lyra.sh, test.sh and .ci/run: finds a Python that sees petsc4py and mpi4py, or installs
 # the distribution's, and lays what is missing from PyPI over it in .venv.
 #
 #   set_up [EXTRA...]     afterwards the arrays python and launcher hold the commands that start

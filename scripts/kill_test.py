@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import collections
-import csv
 import os
 import random
 import shutil
@@ -36,7 +35,7 @@ sys.path[:0] = map(str, (ROOT, ROOT / "tests" / "surviving", ROOT / "tests" / "c
 from leftovers import announced, ranks_in  # noqa: E402
 
 from lyra_petsc.api.mpirun import environment, find_launcher  # noqa: E402
-from lyra_petsc.output.read_run import StoredRun  # noqa: E402
+from lyra_petsc.output.read_run import StoredRun, read_table  # noqa: E402
 
 PATIENCE = 20.0
 """Seconds within which the other ranks must be gone."""
@@ -177,11 +176,8 @@ def check_vtkhdf(out: Path, times: list[float]) -> None:
 
 def table(path: Path) -> np.ndarray:
     """The rows of a CSV file, without wall times."""
-    with path.open(encoding="utf-8") as file:
-        lines = list(csv.reader(file))
     skipped = {"wall_seconds", "residual", "linear_iterations"}
-    columns = [i for i, name in enumerate(lines[0]) if name not in skipped]
-    return np.array([[float(line[i]) for i in columns] for line in lines[1:]])
+    return np.column_stack([column for name, column in read_table(path).items() if name not in skipped])
 
 
 def last_state(out: Path) -> tuple[float, np.ndarray]:

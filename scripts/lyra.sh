@@ -6,20 +6,23 @@
 # RANKS says on how many ranks (2 for run, else 1).
 set -euo pipefail
 source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
-source "$root/scripts/share_cores.sh"
 ranks=${RANKS:-1}
 extras=()
 case ${1:-} in
-    run) ranks=${RANKS:-2} ;;
+    run) ranks=${RANKS:-2} extras=(study) ;;
     render | view) extras=(view) ;;
     export) extras=(export) ;;
-    study | stress | verify | report) extras=(study) ;;
+    study | stress | verify | fabric | fit | report) extras=(study) ;;
 esac
 [[ $ranks =~ ^[1-9][0-9]*$ ]] || give_up "RANKS=$ranks is not a number of ranks"
 for argument in "$@"; do
     [[ $argument != --live ]] || extras+=(view)
 done
-share_cores "$ranks"
+# a rank that waits gives its core away only where there are more ranks than cores: beside other programs, which
+# take what is given, a run would hardly get on (read by Open MPI; nproc takes OpenMP's variables for cores)
+crowded=0
+((ranks <= $(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc))) || crowded=1
+export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-$crowded}
 set_up "${extras[@]}"
 start=("${python[@]}" -m lyra_petsc)
 ((ranks == 1)) || start=("${launcher[@]}" -n "$ranks" "${start[@]}")

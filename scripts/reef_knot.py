@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.experiments.meshes import evenly
 
 FILE = Path(__file__).resolve().parent.parent / "meshes" / "reef-knot.obj"
 UNIT = 0.05  # m, of the points below
@@ -28,12 +29,6 @@ def mirrored(half: list[list[float]]) -> Array:
     """The whole way of a strip: its first half, and this turned over to the other side of the xz plane."""
     points = np.array(half, dtype=np.float64)
     return np.concatenate([points, points[-2::-1] * [1, -1, 1]])
-
-
-def evenly(points: Array, n: int) -> Array:
-    """n points at equal distances along a polygon."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    return np.column_stack([np.interp(np.linspace(0.0, way[-1], n), way, points[:, k]) for k in range(3)])
 
 
 def smooth(points: Array) -> tuple[Array, float]:

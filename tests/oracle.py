@@ -16,7 +16,7 @@ from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessia
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import UPRIGHT, MidEdge, mean_directors
 from lyra_petsc.terms.midedge_friction import MidEdgeFriction
-from lyra_petsc.terms.midedge_shape import Frames, carried, fading_tangent, tangent_of, unit
+from lyra_petsc.terms.midedge_shape import Frames, carried, derivatives, fading_tangent, tangent_of, unit
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
 
@@ -163,11 +163,11 @@ def midedge_blocks(
     """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
-        (stiffness, rest, tilt, limit, _), edges = term._constants, term.of_edges.of_triangles
-        shape, length = term.shape(x, frames), term.of_edges.length
+        (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
+        shape, length = term.bent(x, frames)[0], term.of_edges.length
     else:
-        stiffness, rest, tilt, limit, friction = term._constants(term._sliding(x, frames))
-        edges, shape = term._edges, term._sheet.shape(x, frames)
+        _, stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
+        edges, shape = term._edges, term._sheet.bent(x, frames)[0]
         length = term._sheet.of_edges.length
     rest = rest if len(rest) else np.zeros((term.n_elements, 3))
     for e, points in enumerate(term.stencil):
@@ -178,14 +178,14 @@ def midedge_blocks(
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
         director, spin = shape[edges[e]].reshape(3, 2, 3).transpose(1, 0, 2)
-        if len(tilt):
-            cosine, sine = tilt[e].T[:, :, None]
+        if len(term._tilt):
+            cosine, sine = term._tilt[e].T[:, :, None]
             director = cosine * director - sine * np.cross(sides / along[:, None], director)
         tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
         beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
         about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)
-        angles = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
-        t, t1, t2, s, s1, s2 = np.array(angles).T
+        t = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
+        t1, t2, s, s1, s2 = np.array([derivatives(each) for each in t]).T
         omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double
         ends = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
         own, between = np.diag(np.diag(k)), k - np.diag(np.diag(k))

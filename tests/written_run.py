@@ -35,7 +35,6 @@ def ring(vt: str = "each vertex") -> Mesh:
         uv,
         np.ones(len(TRIANGLES), dtype=bool),
         has_uv=vt != "none",
-        has_seams=vt == "seam",
     )
 
 
@@ -94,13 +93,8 @@ class Writer:
         i, self.count = self.count, self.count + 1
         row = dict.fromkeys(HISTORY_COLUMNS, 0.5) | {"linear_iterations": 9, "rejected": 0}
         self.history.append(row | {"step": i, "time": 0.1 * i, "newton_iterations": 2})
-        self.states.write(
-            i,
-            0.1 * i,
-            position(i),
-            {"velocity": velocity(i)} if self.fields else {},
-            {"stress": self.stress(i)} if self.fields else {},
-        )
+        fields = {"velocity": ("vertex", velocity(i)), "stress": ("triangle", self.stress(i))}
+        self.states.write(i, 0.1 * i, position(i), fields if self.fields else {})
 
 
 def written(

@@ -16,7 +16,7 @@ from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, S
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderChoice, RunDirectory
-from lyra_petsc.output.self_contained import import_ahead
+from lyra_petsc.output.stored import import_ahead
 from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 import numpy as np
@@ -15,13 +19,15 @@ from mpi4py import MPI
 from lyra_petsc.api.run_loop import ProgressCallbacks, StopAsked, simulate
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.api.simulations import refuse_mixed_options
-from lyra_petsc.errors import Interrupted
-from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.errors import Interrupted, LyraError
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 OnStep = Callable[[StepReport], object]
+
+
+REDRAW_SECONDS = 0.3
 
 
 def run(
@@ -33,27 +39,69 @@ def run(
     trust_mesh: bool = False,
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
-) -> StoredRun:
-    """`lyra_petsc.run` without showing progress; same parameters and errors; collective."""
+    progress: bool | None = None,
+) -> Path:
+    """`lyra_petsc.run`, of which it has the parameters and errors; the folder of the results; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
-    loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
-    refuse_mixed_options(loaded)
-    choice = choose(comm, loaded.source.stem if loaded.source else "scene", out, force=force, resume=resume)
+    callbacks = NotebookProgress(on_step, shown=in_notebook() if progress is None else progress)
     try:
+        loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
+        refuse_mixed_options(loaded)
+        stem = loaded.source.stem if loaded.source else "scene"
+        choice = choose(comm, stem, out, force=force, resume=resume)
         with _noted_interrupt(comm) as stop_asked, np.errstate(over="ignore", invalid="ignore"):
-            folder = simulate(comm, loaded, choice, _Callback(on_step), stop_asked)
-    except Interrupted as stopped:
-        raise KeyboardInterrupt(str(stopped)) from None
-    return StoredRun(folder)
+            folder = simulate(comm, loaded, choice, callbacks, stop_asked)
+    except (LyraError, KeyboardInterrupt) as error:
+        callbacks.end("stopped")
+        if isinstance(error, Interrupted):
+            raise KeyboardInterrupt(str(error)) from None
+        raise
+    callbacks.end(f"done: {folder}")
+    return folder
 
 
-class _Callback(ProgressCallbacks):
-    def __init__(self, on_step: OnStep | None) -> None:
-        self._on_step = on_step
+def in_notebook() -> bool:
+    """Whether this is a notebook's kernel (and rank 0 of it)."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return type(shell).__name__ == "ZMQInteractiveShell"
+
+
+class NotebookProgress(ProgressCallbacks):
+    """Calls a function after each step, and shows a bar below the cell."""
+
+    def __init__(self, on_step: OnStep | None, *, shown: bool) -> None:
+        self._on_step, self._words, self._share = on_step, "set-up and first step", 0.0
+        self._drawn, self._handle = -REDRAW_SECONDS, None
+        if shown:
+            from IPython.display import display
+
+            self._handle = display(self, display_id=True)
 
     def step(self, simulation: SteppedScene, report: StepReport) -> None:
+        end = simulation.control.end
+        self._share = min(report.time / end, 1.0)
+        self._words = f"step {report.step}, t = {report.time:.4g} of {end:.4g}"
+        if time.monotonic() - self._drawn >= REDRAW_SECONDS:
+            self._draw()
         if self._on_step is not None:
             self._on_step(report)
+
+    def end(self, words: str) -> None:
+        """No step follows."""
+        self._words += f", {words}"
+        self._draw()
+
+    def _draw(self) -> None:
+        self._drawn = time.monotonic()
+        if self._handle is not None:
+            self._handle.update(self)
+
+    def _repr_html_(self) -> str:
+        return f'<progress max="1" value="{self._share:.4f}"></progress> {html.escape(self._words)}'
+
+    def __repr__(self) -> str:
+        return f"{self._share:.0%} {self._words}"
 
 
 @contextmanager

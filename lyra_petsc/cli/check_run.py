@@ -98,8 +98,8 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
         found = on_each(comm, partial(_of_state, run, obstacles, begin + comm.rank))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
-                rows.append(one.counts)
-                _say(comm, row.format(state, f"{run.times[state]:g}", *one.counts) + one.first)
+                rows.append(one[0])
+                _say(comm, row.format(state, f"{run.times[state]:g}", *one[0]) + one[1])
     counts = np.array(rows)
     pairs, inside = counts[:, :2].sum(axis=1), counts[:, 2:].sum(axis=1)
     _say(comm, _summary("crossings", pairs, "pairs"))
@@ -111,24 +111,19 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     return int(inside.any() or (judged and pairs.any()))
 
 
-class _Found(NamedTuple):
-    """The crossings in one state: the counts of its row, and the names to print."""
-
-    counts: tuple[int, ...]
-    first: str
-
-
-def _of_state(run: StoredRun, obstacles: Sequence[Solid | Container], state: int) -> _Found | None:
-    """What crosses in a state; None beyond the last one."""
+def _of_state(
+    run: StoredRun, obstacles: Sequence[Solid | Container], state: int
+) -> tuple[list[int], str] | None:
+    """The counts of a state's row, and the names to print; None beyond the last state."""
     if state >= len(run):
         return None
     found = crossings_of(run, obstacles, state)
     inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
-    in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else (0, 0, 0)
+    in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else [0, 0, 0]
     pairs = np.concatenate([found.pairs[:NAMED], found.corner_pairs[:NAMED]])[:NAMED]
     first = [f"{one}-{other}" for one, other in pairs.tolist()]
     first += [_where(name, overlap) for name, overlap in found.overlaps.items() if len(overlap.triangles)]
-    return _Found((len(found.pairs), len(found.corner_pairs), *in_all), ", ".join(first[: 2 * NAMED]))
+    return [len(found.pairs), len(found.corner_pairs), *in_all], ", ".join(first[: 2 * NAMED])
 
 
 def _where(name: str, overlap: Overlaps) -> str:

@@ -6,15 +6,12 @@ import os
 import shlex
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lyra_petsc.cli.options import trust_mesh, verb
 from lyra_petsc.errors import InputError
-
-if TYPE_CHECKING:
-    from lyra_petsc.scene.starter import OwnMesh
 
 
 @verb("lyra-petsc new pennant --mesh pennant.geo")
@@ -45,7 +42,7 @@ def ways_to_start() -> tuple[str, str]:
     return "lyra-petsc", "mpirun -n 2 lyra-petsc"
 
 
-def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool = False) -> Path:
+def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
     """Write it; the file's path.
 
     Raises
@@ -53,7 +50,7 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool = False) -> 
     InputError
         If there is such a file already, it cannot be written, or the mesh cannot be used.
     """
-    from lyra_petsc.scene.starter import starter
+    from lyra_petsc.cli.starter import starter
 
     given = Path(name)
     if not given.name or not name.isprintable():
@@ -61,7 +58,7 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool = False) -> 
     path = given if given.suffix.lower() in (".yaml", ".yml") else given.with_name(f"{given.name}.yaml")
     if os.path.lexists(path):  # before the mesh, which may take long
         raise InputError("exists and is left as it is; choose another name", file=path)
-    text = starter(path, ways_to_start(), None if mesh is None else _own_mesh(mesh, trust_mesh))
+    text = starter(path, ways_to_start(), mesh, trust_mesh=trust_mesh)
     try:
         # two at the same time: only one makes the file
         with open(path, "x", encoding="utf-8") as file:
@@ -69,27 +66,3 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool = False) -> 
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=path) from None
     return path
-
-
-def _own_mesh(file: Path, trust_mesh: bool) -> OwnMesh:
-    from pydantic import ValidationError
-
-    from lyra_petsc.mesh.build import build_mesh
-    from lyra_petsc.mesh.select import DIMENSION_NAMES
-    from lyra_petsc.scene.schema import MeshSource
-    from lyra_petsc.scene.starter import OwnMesh
-
-    try:
-        source = MeshSource.model_validate({"file": str(file)})
-    except ValidationError as error:
-        raise InputError(error.errors()[0]["msg"], key="--mesh") from None
-    if not file.is_file():
-        raise InputError(f"no such file: {file}", key="--mesh")
-    built = build_mesh([source], trust_scripts=trust_mesh)
-    groups = {
-        group: (DIMENSION_NAMES[found.dimension], len(found.vertices))
-        for group, found in built.groups.items()
-    }
-    low, high = built.positions.min(axis=0), built.positions.max(axis=0)
-    span = tuple(map(float, low)), tuple(map(float, high))
-    return OwnMesh(file, built.n_vertices, built.n_triangles, groups, span)

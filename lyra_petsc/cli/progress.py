@@ -50,7 +50,8 @@ class ProgressBar:
     ) -> None:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
-        self._drawn, self._told = -math.inf, clock()
+        self._drawn, self._told, self._part_told = -math.inf, clock(), 0.0
+        self._pending = ""
         self._first: tuple[float, float] | None = None
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
@@ -68,25 +69,26 @@ class ProgressBar:
             else:
                 print(text, file=self._stream, flush=True)
 
-    def _draw(self, fraction: float, state: str) -> None:
-        """Move the bar, which is redrawn a few times a second and at the end."""
-        if self._bar is None:
+    def _show(
+        self, fraction: float, state: str, *, seconds: float = LINE_AT_LEAST_SECONDS, part: float = math.inf
+    ) -> None:
+        """Move the bar, or print a line where none has come for so many seconds, or for that part of all."""
+        now = self._clock()
+        if self._bar is not None:  # redrawn a few times a second and at the end
+            with suppress(OSError):
+                self._bar.update(self._task, completed=fraction, state=state)
+                if fraction >= 1.0 or now - self._drawn >= REDRAW_SECONDS:
+                    self._drawn = now
+                    self._bar.refresh()
             return
-        with suppress(OSError):
-            self._bar.update(self._task, completed=fraction, state=state)
-            if fraction >= 1.0 or self._clock() - self._drawn >= REDRAW_SECONDS:
-                self._drawn = self._clock()
-                self._bar.refresh()
-
-    def _show(self, fraction: float, state: str, seconds: float = LINE_AT_LEAST_SECONDS) -> None:
-        """Move the bar, or print a line where none has come for so many seconds."""
-        self._draw(fraction, state)
-        if self._bar is None and self._clock() - self._told >= seconds:
-            self._line(f"{fraction:4.0%}  {state}")
+        self._pending, since = f"{fraction:4.0%}  {state}", now - self._told
+        if since >= seconds or (since >= LINE_SECONDS and fraction - self._part_told >= part - 1e-9):
+            self._part_told = fraction
+            self._line(self._pending)
 
     def _line(self, text: str) -> None:
         self.say(text)
-        self._told = self._clock()
+        self._told, self._pending = self._clock(), ""
 
     def _left(self, done: float, whole: float = 1.0) -> float:
         """Estimated seconds left, at the mean speed since the first call; NaN at the first call."""
@@ -133,10 +135,7 @@ class Progress(ProgressBar):
         self._name = "t" if unit else "load"
         self._unit = f" {unit}" if unit else ""
         self._start, self._end = start, end
-        self._steps = 0
-        self._last_shown: float | None = None
-        self._fraction_shown = 0.0
-        self._latest: str | None = None
+        self._steps, self._told = 0, -math.inf  # the first step is told at once
 
     def update(
         self, step: int, time: float, newton_iterations: int, linear_iterations: int, energy: float
@@ -154,8 +153,6 @@ class Progress(ProgressBar):
         energy : float
             Kinetic and potential energy [J].
         """
-        if not self._shown:
-            return
         now = self._clock()
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
@@ -169,25 +166,13 @@ class Progress(ProgressBar):
         )
         if self._steps > FEWEST_STEPS and enough and math.isfinite(left):
             state += f"  {duration(left)} left"
-        if self._bar is not None:
-            self._draw(fraction, state)
-            return
-        since = math.inf if self._last_shown is None else now - self._last_shown
-        self._latest = f"{fraction:4.0%}  {state}"
-        far = fraction - self._fraction_shown >= LINE_FRACTION - 1e-9
-        if since >= LINE_SECONDS and (self._last_shown is None or far or since >= LINE_AT_LEAST_SECONDS):
-            self._last_shown, self._fraction_shown = now, fraction
-            self._say_latest()
+        self._show(fraction, state, part=LINE_FRACTION)
 
     def close(self) -> None:
         """Show the last step and leave the terminal as it was."""
         super().close()
-        self._say_latest()
-
-    def _say_latest(self) -> None:
-        if self._latest is not None:
-            self.say(self._latest)
-            self._latest = None
+        if self._pending:
+            self._line(self._pending)
 
 
 class FrameProgress(ProgressBar):
@@ -195,15 +180,10 @@ class FrameProgress(ProgressBar):
 
     LINE_SECONDS = 10.0
 
-    def __init__(self, comm: MPI.Comm, **options: Any) -> None:
-        super().__init__(comm, **options)
-        self._first = self._told, 0.0
-
     def update(self, done: int, count: int) -> None:
         """Show how many of the states are drawn."""
-        if self._shown:
-            text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
-            self._show(done / count, text, self.LINE_SECONDS)
+        text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
+        self._show(done / count, text, seconds=self.LINE_SECONDS)
 
 
 class StudyProgress(ProgressBar):
@@ -236,8 +216,6 @@ class StudyProgress(ProgressBar):
     def progress(self, done: float, whole: float) -> None:
         """Work done and in all; may raise, see ``stop``."""
         self._stop()
-        if not self._shown:
-            return
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
         # what was finished before took no time now
         self._show(fraction, f"{self._label}  {duration(self._left(done, whole))} left")
@@ -247,14 +225,7 @@ class StudyProgress(ProgressBar):
         self._line(f"note: {text}")
 
 
-def closing_table(
-    comm: MPI.Comm,
-    phases: Mapping[str, float],
-    folder: Path | str,
-    outcome: str,
-    *,
-    stream: TextIO | None = None,
-) -> None:
+def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | str, outcome: str) -> None:
     """Show where the time went, where the results are and how to open them. Rank 0 only.
 
     Parameters
@@ -267,43 +238,21 @@ def closing_table(
         The run's folder.
     outcome : str
         How the run ended, in words.
-    stream : text stream
-        stdout unless given.
     """
     if comm.rank > 0:
         return
-    stream = stream or sys.stdout
     total = sum(phases.values())
-    rows = [
-        (name, f"{seconds:.2f} s", f"{seconds / total:.0%}" if total > 0 else "")
+    lines = [f"{'phase':<12} {'wall time':>12} {'share':>5}"]
+    lines += [
+        f"{name:<12} {seconds:>10.2f} s {f'{seconds / total:.0%}' if total > 0 else '':>5}".rstrip()
         for name, seconds in [*phases.items(), ("total", total)]
         if seconds >= 0.005 or name == "total"
     ]
     states = f"paraview {Path(folder) / 'states.xdmf'}"
-    facts = [("results", str(folder)), ("open", states), ("outcome", outcome)]
+    for name, text in (("results", folder), ("open", states), ("outcome", outcome)):
+        lines.append(f"{name:<12} {text}")
     with suppress(OSError):
-        if stream.isatty():
-            _print_table(rows, facts, stream)
-            return
-        lines = [f"{name:<12} {seconds:>12} {share:>5}".rstrip() for name, seconds, share in rows]
-        lines += [f"{name:<12} {text}" for name, text in facts]
-        print("\n".join(lines), file=stream, flush=True)
-
-
-def _print_table(rows: list[tuple[str, str, str]], facts: list[tuple[str, str]], stream: TextIO) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table("phase", box=None, pad_edge=False, header_style="")
-    table.add_column("wall time", justify="right")
-    table.add_column("share", justify="right")
-    for row in rows:
-        table.add_row(*row)
-    console = Console(file=stream)
-    console.print(table)
-    for name, text in facts:  # not wrapped, so that paths can be copied
-        console.print(Text(f"{name:<8} {text}"), soft_wrap=True)
+        print("\n".join(lines), flush=True)
 
 
 def duration(seconds: float) -> str:

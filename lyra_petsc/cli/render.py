@@ -106,7 +106,7 @@ def _line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
 def export(comm: Any, /, run: Path, **asked: Any) -> None:
     """Write the states of RUN for other programs."""
     from lyra_petsc.parallel import on_root
-    from lyra_petsc.show.export.export_run import export_run
+    from lyra_petsc.show.export import export_run
 
     for number in watched():  # rank 0 does the work and prints the message
         signal.signal(number, _give_up if comm.rank == 0 else signal.SIG_IGN)

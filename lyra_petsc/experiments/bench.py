@@ -93,6 +93,13 @@ class Trial:
             self.step()
         return self
 
+    def through(self, times: Sequence[float]) -> Iterator[SteppedScene]:
+        """Steps to each of these times [s], ascending, at which steps end; collective."""
+        for end in times:
+            while self.simulation.time < end - 1e-9:
+                self.step()
+            yield self.simulation
+
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
         return self.simulation.problem.points.gathered(owned)
@@ -140,18 +147,6 @@ def direct_options(comm: MPI.Comm) -> dict[str, Any]:
     parallel factorisation, and it needs no other package.
     """
     return {"pc_type": "lu"} if comm.size == 1 else {"pc_type": "redundant", "redundant_pc_type": "lu"}
-
-
-def direct_solver(comm: MPI.Comm, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
-    """A solver that factors the matrix once; collective. To be destroyed."""
-    solver = PETSc.KSP().create(comm)
-    solver.setOptionsPrefix(prefix)
-    solver.setOperators(matrix)
-    solver.setType(PETSc.KSP.Type.PREONLY)
-    solver.getPC().setType(direct_options(comm)["pc_type"])  # whose own default on several ranks is LU
-    solver.setFromOptions()
-    solver.setUp()
-    return solver
 
 
 class Bench:

@@ -35,6 +35,11 @@ class Verdict:
     passed: bool
     words: str
 
+    @property
+    def line(self) -> str:
+        """``passed: `` or ``FAILED: `` and the words."""
+        return f"{'passed' if self.passed else 'FAILED'}: {self.words}"
+
 
 @dataclass(frozen=True)
 class Case:

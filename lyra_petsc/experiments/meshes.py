@@ -70,14 +70,21 @@ def sides(nx: int, ny: int) -> dict[str, Ints]:
     return {name: np.column_stack([chain[:-1], chain[1:]]) for name, chain in zip(SIDES, chains, strict=True)}
 
 
-def rectangle_script(width: float, height: float, size: float, inside: Sequence[float] = ()) -> str:
+def rectangle_script(
+    width: float, height: float, size: float | Sequence[float], inside: Sequence[float] = ()
+) -> str:
     """For gmsh: a rectangle in the xy plane with edges of about ``size`` [m], its sides named as a grid's.
 
-    ``inside`` (x, y) [m] is where a vertex must be.
+    ``size`` may be one for each corner, from (0, 0) on against the clock; ``inside`` (x, y) [m] is where a
+    vertex must be.
     """
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
     points = corners + ([(inside[0], inside[1])] if inside else [])
-    lines = [f"Point({k}) = {{{x!r}, {y!r}, 0, {size:.9g}}};" for k, (x, y) in enumerate(points, 1)]
+    sizes = np.broadcast_to(size, len(points))
+    lines = [
+        f"Point({k}) = {{{x!r}, {y!r}, 0, {h:.9g}}};"
+        for k, ((x, y), h) in enumerate(zip(points, sizes, strict=True), 1)
+    ]
     lines += [f"Line({k}) = {{{k}, {k % 4 + 1}}};" for k in range(1, 5)]
     lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};"]
     lines += ["Point{5} In Surface{1};"] if inside else []
@@ -93,6 +100,12 @@ def _halved(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
     first = np.where(other, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
     second = np.where(other, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
     return np.concatenate([first, second])
+
+
+def evenly(points: Array, n: int) -> Array:
+    """n points (n, 3) at equal distances along a polygon (m, 3)."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return np.column_stack([np.interp(np.linspace(0.0, way[-1], n), way, points[:, k]) for k in range(3)])
 
 
 def rounded(flat: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.experiments.case import Case, Outcome, passed_of
+from lyra_petsc.experiments.case import Case, Outcome, Verdict, passed_of
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
@@ -37,6 +37,18 @@ def aligned(rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
     return [line.rstrip() for line in lines]
 
 
+def write_csv(path: Path, lines: Iterable[Iterable[Any]]) -> None:
+    """Write a table; the file is the old or the new one, never half. Call on one rank."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    replace_text(path, text.getvalue())
+
+
+def verdict_line(verdict: Verdict, name: str = "") -> Line:
+    """A verdict below its case; those that are not good stand out."""
+    return f"  {name}{verdict.line}", "" if verdict.passed else "bold red"
+
+
 class View(ABC, Generic[O]):
     """How a verb tells of its cases: in a table, in a file for programs, and on a page.
 
@@ -49,6 +61,8 @@ class View(ABC, Generic[O]):
         What the page lacks without the packages that draw.
     columns : sequence of str
         Of the CSV.
+    entry : str
+        What a case is called in the table at the end.
     ready : bool
         Whether there is something to write.
     """
@@ -57,6 +71,7 @@ class View(ABC, Generic[O]):
     title: str
     pictures: str = ""
     columns: Sequence[str]
+    entry: ClassVar[str] = "case"
     ready: bool = True
 
     def heading(self) -> str:
@@ -69,7 +84,8 @@ class View(ABC, Generic[O]):
 
     def summary(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
         """The table that the terminal shows at the end, its headings first."""
-        return []
+        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
+        return [(self.entry, "verdict", "run time [s]"), *table]
 
     def ended(self, outcomes: Sequence[O]) -> None:
         """Another case has ended: what no later use has of the outcomes so far may be freed."""
@@ -203,10 +219,8 @@ class Results(Generic[O]):
 
         def table() -> None:
             rows = [row for outcome in _run(outcomes) for row in view.rows(outcome)]
-            lines = [view.columns, *([view.cell(row.get(name)) for name in view.columns] for row in rows)]
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(lines)
-            replace_text(path, text.getvalue())
+            cells = ([view.cell(row.get(name)) for name in view.columns] for row in rows)
+            write_csv(path, [view.columns, *cells])
 
         on_root(self._comm, table)
         content = view.content(outcomes, self._ranks, self._command)

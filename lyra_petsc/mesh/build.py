@@ -223,52 +223,37 @@ def _grid_groups(nx: int, ny: int, n_triangles: int) -> list[NamedSet]:
     return groups
 
 
-class GroupTable:
-    """Collects the groups of each source, then makes one dictionary of them."""
+Members = dict[tuple[str, int], list[Ints]]
+"""Of groups of the whole mesh, by name and dimension: from each source."""
 
-    def __init__(self) -> None:
-        self._members: dict[tuple[str, int], list[Ints]] = {}
 
-    def add(
-        self,
-        groups: list[NamedSet],
-        source: str | None,
-        n_triangles: int,
-        first_vertex: int,
-        first_triangle: int,
-    ) -> None:
-        """Take the groups of one source of ``n_triangles``, numbered from the given vertex and triangle."""
-        for group in groups:
-            members = group.members + (first_triangle if group.dimension == 2 else first_vertex)
-            self._put(group.name, group.dimension, members)
-            if source is not None:
-                self._put(f"{source}.{group.name}", group.dimension, members)
-        if source is not None:
-            self._put(source, 2, np.arange(first_triangle, first_triangle + n_triangles, dtype=np.int64))
+def _take_groups(
+    members: Members, groups: list[NamedSet], source: str | None, n_triangles: int, first: tuple[int, int]
+) -> None:
+    """Add the groups of a source of ``n_triangles``; ``first`` numbers its vertex 0 and its triangle 0."""
+    found = [(each.name, each.dimension, each.members + first[each.dimension == 2]) for each in groups]
+    if source is not None:
+        found += [(f"{source}.{name}", dimension, each) for name, dimension, each in found]
+        found.append((source, 2, np.arange(first[1], first[1] + n_triangles, dtype=np.int64)))
+    for name, dimension, each in found:
+        members.setdefault((name, dimension), []).append(each)
 
-    def finish(self, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
-        """Groups by unique name, and a note for each name that had to change.
 
-        ``triangles`` is (F, 3), of the whole mesh.
-        """
-        groups: dict[str, Group] = {}
-        notes: list[str] = []
-        # surfaces first: they keep the name, as materials can be told by surface groups only
-        for name, dimension in sorted(self._members, key=lambda entry: -entry[1]):
-            members = np.concatenate(self._members[name, dimension])
-            unique = name
-            while unique in groups:
-                unique = f"{unique}.{DIMENSION_NAMES[dimension]}"
-            if unique != name:
-                notes.append(
-                    f"group '{name}' is used for several dimensions; that of {DIMENSION_NAMES[dimension]}s "
-                    f"is called '{unique}'"
-                )
-            groups[unique] = _group(dimension, members, triangles)
-        return groups, notes
-
-    def _put(self, name: str, dimension: int, members: Ints) -> None:
-        self._members.setdefault((name, dimension), []).append(members)
+def _named_groups(members: Members, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
+    """Groups by unique name, and a note for each that had to change; ``triangles`` (F, 3) of the mesh."""
+    groups: dict[str, Group] = {}
+    notes: list[str] = []
+    # surfaces first: they keep the name, as materials can be told by surface groups only
+    for name, dimension in sorted(members, key=lambda entry: -entry[1]):
+        unique, kind = name, DIMENSION_NAMES[dimension]
+        while unique in groups:
+            unique = f"{unique}.{kind}"
+        if unique != name:
+            notes.append(
+                f"group '{name}' is used for several dimensions; that of {kind}s is called '{unique}'"
+            )
+        groups[unique] = _group(dimension, np.concatenate(members[name, dimension]), triangles)
+    return groups, notes
 
 
 def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
@@ -348,7 +333,7 @@ def build_mesh(
     InputError
         Whatever cannot be read or simulated; names the mesh file, or the scene's key.
     """
-    groups = GroupTable()
+    members: Members = {}
     pieces: list[Mesh] = []
     notes: list[str] = []
     listed: list[Source] = []
@@ -365,14 +350,15 @@ def build_mesh(
             raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
         label = source.name or (source.file.name if source.file is not None else "grid")
         notes += [f"{label}: {note}" for note in sheet.notes]
-        groups.add(sheet.groups, source.name, piece.n_triangles, n_vertices, n_triangles)
+        first = n_vertices, n_triangles
+        _take_groups(members, sheet.groups, source.name, piece.n_triangles, first)
         pieces.append(piece)
         listed.append(Source(label, piece.n_vertices, piece.n_triangles))
         tags.append(np.zeros(piece.n_vertices, np.int64) if sheet.tags is None else sheet.tags)
         n_vertices += piece.n_vertices
         n_triangles += piece.n_triangles
     mesh = _join(pieces)
-    mesh.groups, group_notes = groups.finish(mesh.triangles)
+    mesh.groups, group_notes = _named_groups(members, mesh.triangles)
     mesh.notes = notes + group_notes
     mesh.sources = listed
     mesh.tags = np.concatenate(tags) if any(each.any() for each in tags) else None
@@ -405,12 +391,12 @@ def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) ->
     check_topology(sheet, **where)
     orient(sheet, **where)
     rest, positions = _placed(sheet.points, source.transform)
-    uv, seams = sheet.uv, False
+    uv = sheet.uv
     if uv is not None:
         check_shape(uv, "rest", **where)
         laid = np.zeros_like(rest)
         laid[sheet.triangles.reshape(-1), :2] = uv.reshape(-1, 2)
-        seams = bool((laid[sheet.triangles][:, :, :2] != uv).any())
+        seams = (laid[sheet.triangles][:, :, :2] != uv).any()
         rest = rest if seams else laid
     else:
         check_shape(rest[sheet.triangles], "rest", **where)
@@ -418,7 +404,7 @@ def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) ->
     check_shape(positions[sheet.triangles], "start", **where)
     with_uv = sheet.uv is not None
     flat = np.full(len(sheet.triangles), with_uv)
-    return Mesh(positions, rest, sheet.triangles, uv, flat, has_seams=seams, has_uv=with_uv)
+    return Mesh(positions, rest, sheet.triangles, uv, flat, has_uv=with_uv)
 
 
 def _join(pieces: list[Mesh]) -> Mesh:
@@ -430,7 +416,6 @@ def _join(pieces: list[Mesh]) -> Mesh:
         np.concatenate(triangles),
         np.concatenate([piece.triangle_uv for piece in pieces]),
         np.concatenate([piece.flat_rest for piece in pieces]),
-        has_seams=any(piece.has_seams for piece in pieces),
         has_uv=any(piece.has_uv for piece in pieces),
     )
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,26 +158,6 @@ LEAF = 4
 """Triangles in a leaf of the tree."""
 
 
-class _Tree(NamedTuple):
-    """A complete binary tree of boxes: node k has the children 2 k and 2 k + 1, node 1 contains all.
-
-    Attributes
-    ----------
-    order : (F,) int64
-        Triangles in the order of the leaves, `LEAF` to each.
-    low, high : (F, 3) float64
-        Boxes of the triangles, in this order [m].
-    node_low, node_high : (2 n, 3) float64
-        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
-    """
-
-    order: Ints
-    low: Array
-    high: Array
-    node_low: Array
-    node_high: Array
-
-
 def self_crossings(points: Array, triangles: Ints) -> Ints:
     """The pairs of triangles of a surface that cross.
 
@@ -234,8 +214,18 @@ def _certain(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided:
     return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
 
 
-def _tree(points: Array, triangles: Ints) -> _Tree:
-    """The tree of boxes of triangles, along a space-filling curve."""
+def _tree(points: Array, triangles: Ints) -> tuple[Ints, Array, Array, Array, Array]:
+    """A complete binary tree of boxes: node k has the children 2 k and 2 k + 1, node 1 contains all.
+
+    Returns
+    -------
+    order : (F,) int64
+        Triangles in the order of the leaves, `LEAF` to each: along a space-filling curve.
+    low, high : (F, 3) float64
+        Boxes of the triangles, in this order [m].
+    node_low, node_high : (2 n, 3) float64
+        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
+    """
     corners = points[triangles]
     low, high = corners.min(axis=1), corners.max(axis=1)
     order = np.argsort(_curve(low, high), kind="stable")
@@ -251,7 +241,7 @@ def _tree(points: Array, triangles: Ints) -> _Tree:
         below, level = slice(level, 2 * level), level // 2
         node_low[level : 2 * level] = node_low[below].reshape(level, 2, 3).min(axis=1)
         node_high[level : 2 * level] = node_high[below].reshape(level, 2, 3).max(axis=1)
-    return _Tree(order, low, high, node_low, node_high)
+    return order, low, high, node_low, node_high
 
 
 def _curve(low: Array, high: Array) -> NDArray[np.uint64]:

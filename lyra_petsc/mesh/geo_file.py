@@ -21,7 +21,8 @@ from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.geo_script import check_script
 from lyra_petsc.mesh.mesh import Sheet
 from lyra_petsc.mesh.msh_file import ElementBlock, MshError, assemble, element_type
-from lyra_petsc.mesh.readers import printable, read_bytes
+from lyra_petsc.mesh.readers import printable
+from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
 
 # beyond this ratio of the mean edge to the size asked for, the script sets sizes of its own

@@ -22,13 +22,14 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.geo_words import (
     COLOUR,
     JUMPS,
+    NUMBERED,
     OPERANDS,
     OPTIONS,
     REFUSED,
     RESERVED,
     STATEMENTS,
 )
-from lyra_petsc.mesh.readers import read_bytes
+from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
 
 LONGEST_STRING = 900
@@ -428,8 +429,10 @@ def _is_option(script: _Script, number: int) -> bool:
             and tokens[at - 1].text == "."
             and re.fullmatch("[A-Z][a-z]+", tokens[number].text) is not None
         )
-    group = tokens[at].text if at >= 0 else ""
-    return group != "Field" and tokens[number].text in OPTIONS.get(group, ())
+    group, option = tokens[at].text if at >= 0 else "", tokens[number].text
+    if group in NUMBERED:
+        return option not in JUMPS and not option.endswith("Command")
+    return group != "Field" and option in OPTIONS.get(group, ())
 
 
 def _check_printf(script: _Script, number: int) -> None:

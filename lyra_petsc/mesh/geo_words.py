@@ -1,7 +1,7 @@
 """The words that a mesh script may use: gmsh's own that describe geometry and mesh size, and no others.
 
 From gmsh 4.8 to 4.15: ``src/parser/Gmsh.l`` and ``Gmsh.y`` (keywords and commands),
-``src/common/DefaultOptions.h`` (options with a number for value), ``src/mesh/Field.cpp`` (size fields).
+``src/common/DefaultOptions.h`` (options), ``src/mesh/Field.cpp`` (size fields).
 """
 
 from __future__ import annotations
@@ -54,64 +54,7 @@ OPERANDS = _words("""
 """)
 """Functions, constants, and words within a statement."""
 
-_NUMBERS = """
-    Curves CurveLabels CurveNumbers CurveSelectWidth CurveType CurveWidth LabelType Light
-    LightTwoSide Lines LineNumbers LineSelectWidth LineType LineWidth LineLabels Normals NumSubEdges
-    Points PointLabels PointNumbers PointSelectSize PointSize PointType ScalingFactor Surfaces
-    SurfaceLabels SurfaceNumbers SurfaceType Tangents Volumes VolumeLabels VolumeNumbers VolumeType
-    Color
-"""
-
 OPTIONS: dict[str, frozenset[str]] = {
-    "Geometry": _words(_NUMBERS)
-    | _words("""
-    AutoCoherence CopyMeshingMethod DoubleClickedEntityTag ExactExtrusion
-    ExtrudeReturnLateralEntities ExtrudeSplinePoints FirstEntityTag FirstPhysicalTag HideCompounds
-    HighlightOrphans MatchGeomAndMesh MatchMeshScaleFactor MatchMeshTolerance OCCAutoEmbed
-    OCCAutoFix OCCBooleanCheckInverted OCCBooleanGlue OCCBooleanNonDestructive
-    OCCBooleanPreserveNumbering OCCBooleanSimplify OCCBoundsUseStl OCCDisableStl OCCFixDegenerated
-    OCCFixSmallEdges OCCFixSmallFaces OCCImportLabels OCCMakeSolids OCCParallel OCCFastUnbind
-    OCCScaling OCCSewFaces OCCTargetUnit OCCThruSectionsDegree OCCUnionUnify OCCFastProjection
-    OCCUseGenericClosestPoint OldCircle OldRuledSurface OldNewReg OffsetX OffsetY OffsetZ
-    OrientedPhysicals ReparamOnFaceRobust SnapX SnapY SnapZ SnapPoints Tolerance ToleranceBoolean
-    Transform TransformXX TransformXY TransformXZ TransformYX TransformYY TransformYZ TransformZX
-    TransformZY TransformZZ
-"""),
-    "Mesh": _words(_NUMBERS)
-    | _words("""
-    Algorithm Algorithm3D AlgorithmSwitchOnFailure AllowSwapAngle AngleSmoothNormals
-    AngleToleranceFacetOverlap AnisoMax Binary BoundaryLayerFanElements BoundaryLayerFanPoints
-    CharacteristicLengthExtendFromBoundary CharacteristicLengthFactor CharacteristicLengthMin
-    CharacteristicLengthMax CharacteristicLengthFromCurvature CharacteristicLengthFromPoints
-    CharacteristicLengthFromParametricPoints CheckSurfaceNormalValidity ColorCarousel
-    CompoundClassify CompoundCharacteristicLengthFactor CompoundMeshSizeFactor CreateEdges
-    CreateFaces CrossFieldClosestPoint Dual ElementOrder FirstElementTag FirstNodeTag FlatOptimize3D
-    FlexibleTransfinite Format Hexahedra HighOrderDistCAD HighOrderFixBoundaryNodes HighOrderIterMax
-    HighOrderNumLayers HighOrderOptimize HighOrderPassMax HighOrderPeriodic HighOrderPoissonRatio
-    HighOrderPrimSurfMesh HighOrderThresholdMin HighOrderThresholdMax HighOrderFastCurvingNewAlgo
-    HighOrderCurveOuterBL HighOrderMaxRho HighOrderMaxAngle HighOrderMaxInnerAngle IgnorePeriodicity
-    IgnoreParametrization LabelSampling LcIntegrationPrecision MaxIterDelaunay3D MaxNumThreads1D
-    MaxNumThreads2D MaxNumThreads3D MaxRetries MeshOnlyVisible MeshOnlyEmpty
-    MeshSizeExtendFromBoundary MeshSizeFactor MeshSizeMin MeshSizeMax MeshSizeFromCurvature
-    MeshSizeFromCurvatureIsotropic MeshSizeFromPoints MeshSizeFromParametricPoints
-    MinimumCircleNodes MinimumCirclePoints MinimumCurveNodes MinimumCurvePoints
-    MinimumElementsPerTwoPi MinimumLineNodes MinCircleNodes MinCurveNodes MinLineNodes
-    MshFileVersion NbHexahedra NbNodes NbPartitions NbPrisms NbPyramids NbQuadrangles NbTetrahedra
-    NbTriangles NbTrihedra NewtonConvergenceTestXYZ Nodes NodeLabels NodeNumbers NodeSize NodeType
-    OldInitialDelaunay2D Optimize OptimizeNetgen OptimizePyramids OptimizeThreshold
-    PreserveNumberingMsh2 Prisms Pyramids QuadqsSizemapMethod QuadqsTopologyOptimizationMethods
-    QuadqsRemeshingBoldness QuadqsScalingOnTriangulation Quadrangles QualityInf QualitySup
-    QualityType RadiusInf RadiusSup RandomFactor RandomFactor3D RandomSeed RecombinationAlgorithm
-    RecombineAll RecombineOptimizeTopology RecombineNodeRepositioning RecombineMinimumQuality
-    Recombine3DAll Recombine3DLevel Recombine3DConformity RefineSteps Renumber ReparamMaxTriangles
-    Reproducible SaveAll SaveElementTagType SaveGroupsOfElements SaveGroupsOfNodes SaveParametric
-    SaveWithoutOrphans SecondOrderIncomplete SecondOrderLinear SecondOrderExperimental Smoothing
-    SmoothCrossField SmoothNormals SmoothRatio StlAngularDeflection StlLinearDeflection
-    StlLinearDeflectionRelative StlOneSolidPerSurface StlRemoveBadTriangles
-    StlRemoveDuplicateTriangles SubdivisionAlgorithm SurfaceEdges SurfaceFaces SwitchElementTags
-    Tetrahedra ToleranceEdgeLength ToleranceInitialDelaunay ToleranceReferenceElement TransfiniteTri
-    Triangles Trihedra VolumeEdges VolumeFaces Voronoi
-"""),
     "General": _words("""
     Terminal Verbosity AbortOnError NumThreads ExpertMode NoPopup Axes AxesMikado AxesAutoPosition
     SmallAxes Trackball RotationX RotationY RotationZ RotationCenterGravity RotationCenterX
@@ -135,6 +78,9 @@ OPTIONS: dict[str, frozenset[str]] = {
 """),
 }
 """Options by their group; those of ``Field`` belong to size fields."""
+
+NUMBERED = ("Geometry", "Mesh")
+"""Groups whose options are all numbers, but for commands that a window would run."""
 
 COLOUR = re.compile(
     r"(?:Light|Dark|Medium|Dim|Pale|Deep|Dodger|Royal|Navy|Midnight|Sky|Steel|Slate|Forest|Sea|Spring|Lawn|Olive"

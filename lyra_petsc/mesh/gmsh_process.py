@@ -73,7 +73,9 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
                 job["folder"],
             ]
             tell(fence=raise_fence(None if job["folder"] is None else readable))
-            _run_script(gmsh, job)
+            _set_size(gmsh, job["size"])
+            with _errors_told(gmsh, job["script"]):
+                gmsh.merge(job["script"])
             tell(stage="mesh")
             _allow_seconds(job["mesh_seconds"])
             _mesh(gmsh, job, lambda count: tell(triangles=round(count)))
@@ -126,12 +128,6 @@ def _session() -> Iterator[ModuleType]:
     gmsh.option.setNumber("General.AbortOnError", 0)
     gmsh.logger.start()
     yield gmsh
-
-
-def _run_script(gmsh: ModuleType, job: dict[str, Any]) -> None:
-    _set_size(gmsh, job["size"])
-    with _errors_told(gmsh, job["script"]):
-        gmsh.merge(job["script"])
 
 
 def _mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[float], None]) -> None:
@@ -208,7 +204,8 @@ def _refuse_many(number: float, what: str, size: float | None, most: int) -> Non
 
 def _curve_length(gmsh: ModuleType) -> float:
     """Sum [m] of the straight distances that the curves span."""
-    return sum(math.dist(box[:3], box[3:]) for box in _boxes(gmsh, 1))
+    boxes = (gmsh.model.getBoundingBox(*entity) for entity in gmsh.model.getEntities(1))
+    return sum(math.hypot(*_extent(box)) for box in boxes)
 
 
 def _estimate(gmsh: ModuleType, size: float | None) -> float:
@@ -232,13 +229,6 @@ def _longest_mean_edge(gmsh: ModuleType, surface: int) -> float | None:
         if edges and span > 0.0:
             means.append(span / edges)
     return max(means, default=None)
-
-
-def _boxes(gmsh: ModuleType, dimension: int) -> Iterator[tuple[float, ...]]:
-    for entity in gmsh.model.getEntities(dimension):
-        box = gmsh.model.getBoundingBox(*entity)
-        if all(math.isfinite(value) and abs(value) < 1e100 for value in box):
-            yield box
 
 
 def _extent(box: tuple[float, ...]) -> tuple[float, float, float]:

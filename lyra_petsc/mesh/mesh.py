@@ -70,8 +70,6 @@ class Mesh:
         Named groups; names are unique over all sources (see ``build``).
     notes : list[str]
         What was repaired or dropped, one line each, for the user.
-    has_seams : bool
-        True if some vertex has more than one material coordinate (``corner_uv`` is needed).
     has_uv : bool
         True if any sheet came with ``vt``.
     sources : list of Source
@@ -89,7 +87,6 @@ class Mesh:
     flat_rest: Mask
     groups: dict[str, Group] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    has_seams: bool = False
     has_uv: bool = False
     sources: list[Source] = field(default_factory=list)
     tags: Ints | None = None

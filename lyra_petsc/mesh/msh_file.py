@@ -18,7 +18,8 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
-from lyra_petsc.mesh.readers import first_few, printable, read_bytes, split_quads
+from lyra_petsc.mesh.readers import first_few, printable, split_quads
+from lyra_petsc.scene.text import read_bytes
 
 Names = dict[tuple[int, int], str]
 Width = Literal["int", "size"]

@@ -13,7 +13,8 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
-from lyra_petsc.mesh.readers import first_few, printable, read_bytes, split_polygon, split_quads
+from lyra_petsc.mesh.readers import first_few, printable, split_polygon, split_quads
+from lyra_petsc.scene.text import read_bytes
 
 # of no use to a simulation, and no reason to worry anybody
 _IGNORED = re.compile(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.schema import Cuboid, Keyframe, Obstacle, Scene, coefficients
+from lyra_petsc.scene.schema import Cuboid, Obstacle, Scene, coefficients
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -26,22 +26,11 @@ BOX_TRIANGLES: Ints = _SIDES[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np
 _BOX_EDGES = np.array([[i, i + s] for s in (1, 2, 4) for i in range(8) if not i & s], dtype=np.int64)
 
 
-class RigidMotion(Protocol):
-    """A motion in time, as `terms.motion.Motion` without scale."""
+RigidMotion: TypeAlias = Callable[[float], tuple[Array, Array]]
+"""Rotation (3, 3) and translation (3,) [m] at a time [s]."""
 
-    def transform(self, time: float) -> tuple[Array, Array]:
-        """Rotation (3, 3) and translation (3,) [m] at a time [s]."""
-        ...
-
-
-class MakesMotion(Protocol):
-    """The constructor of `terms.motion.Motion`, which this package does not know."""
-
-    def __call__(
-        self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str, file: object | None
-    ) -> RigidMotion:
-        """The motion through keyframes; ``key`` and ``file`` are for messages."""
-        ...
+MakesMotion: TypeAlias = Callable[..., Any]
+"""`terms.motion.Motion`, which this package does not know."""
 
 
 class _Carried:
@@ -54,7 +43,7 @@ class _Carried:
         """Rotation (3, 3) and translation (3,) [m] that lead from t = 0 to a time [s]."""
         if self.motion is None or time == 0.0:  # where rounding would move it
             return np.eye(3), np.zeros(3)
-        (start, from_), (turn, to) = self.motion.transform(0.0), self.motion.transform(time)
+        (start, from_), (turn, to) = self.motion(0.0), self.motion(time)
         rotation = turn @ start.T
         return rotation, to - rotation @ from_
 
@@ -187,7 +176,7 @@ def _made(
         named = (
             f"motions.{obstacle.motion}" if isinstance(obstacle.motion, str) else f"obstacles.{name}.motion"
         )
-        carried = motion(keyframes, obstacle.interpolation, key=named, file=scene.source)
+        carried = motion(keyframes, obstacle.interpolation, key=named, file=scene.source).transform
     if obstacle.plane is not None:
         normal = np.array(obstacle.plane.normal)
         normal /= np.abs(normal).max()  # squares of what is very large or small are no numbers

@@ -1,41 +1,15 @@
-"""What the readers of mesh files share: bytes, words for messages, quads and polygons as triangles."""
+"""What the readers of mesh files share: words for messages, quads and polygons as triangles."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError
 
 _FIRST_DIAGONAL = np.array([[0, 1, 2], [0, 2, 3]])
 _SECOND_DIAGONAL = np.array([[0, 1, 3], [1, 2, 3]])
-
-
-def read_bytes(path: Path) -> bytes:
-    """Content of ``path``.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no plain file, not readable or empty.
-    """
-    try:
-        if path.is_dir():
-            raise InputError("is a folder; a mesh file (.geo, .msh or .obj) is needed", file=path)
-        if not path.exists():
-            raise InputError("no such mesh file", file=path)
-        if not path.is_file():
-            raise InputError("is no plain file", file=path)
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot be read ({reason})", file=path) from None
-    if not data.strip():
-        raise InputError("the file is empty", file=path)
-    return data
 
 
 def first_few(indices: Iterable[object], limit: int = 5) -> str:

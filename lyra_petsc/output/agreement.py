@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, BinaryIO, TypeVar, cast
 
 from lyra_petsc.errors import LyraError, OutputError
 
@@ -27,14 +28,41 @@ def reason(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def missing_folder(path: Path) -> str:
-    """Why a file cannot be written whose folder is gone, whatever HDF5 says of it; empty if it is there."""
-    return "" if path.parent.is_dir() else os.strerror(errno.ENOENT)
-
-
 def cannot_write(path: Path, error: BaseException) -> OutputError:
-    """The refusal of a file that could not be written."""
-    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
+    """The refusal of a file that could not be written; that its folder is gone HDF5 says in other words."""
+    why = reason(error) if path.parent.is_dir() else os.strerror(errno.ENOENT)
+    return OutputError(f"{path}: cannot be written: {why}")
+
+
+@contextmanager
+def writing(path: Path, errors: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
+    """A context in which a file is written; what goes wrong is raised as `cannot_write` says."""
+    try:
+        yield
+    except errors as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[BinaryIO]:
+    """A new file that takes the place of another in one instant, at the end of the context. Call on one rank.
+
+    Raises
+    ------
+    OutputError
+        If it could not be written; what stood there before stands.
+    """
+    part = path.with_name(path.name + ".part")
+    with writing(path):
+        try:
+            with open(part, "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
 
 def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
@@ -92,14 +120,5 @@ def replace_text(path: str | os.PathLike[str], text: str) -> None:
 
 def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     """As `replace_text`, for content that is no text."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        with open(part, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise cannot_write(path, error) from error
+    with replaced(Path(path)) as file:
+        file.write(content)

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import writing
 from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
@@ -94,8 +94,6 @@ def checkpoint_file(
     if edge_order is not None:
         slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
     slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
-    if any(slab.dtype.itemsize != 8 for slab in slabs.values()):
-        raise ValueError("checkpoints hold float64 and int64")
     sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
     text = json.dumps(dict(scalars))
     facts = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
@@ -112,12 +110,10 @@ def checkpoint_file(
 
 
 def _rotate(folder: Path) -> None:
-    try:
+    with writing(folder / CHECKPOINT):
         if (folder / CHECKPOINT).exists():
             os.replace(folder / CHECKPOINT, folder / PREVIOUS)
         os.replace(folder / NEXT, folder / CHECKPOINT)
-    except OSError as error:
-        raise cannot_write(folder / CHECKPOINT, error) from error
 
 
 def read_checkpoint(
@@ -138,7 +134,7 @@ def read_checkpoint(
         On every rank, if there is none, if all are damaged, or if it is of another mesh.
     """
     newest: InputError | None = None
-    for file in checkpoint_files(folder, order.comm):
+    for file in on_root(order.comm, lambda: checkpoint_files(folder)):
         try:
             scalars, sums, counts = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
             arrays, edges = (

@@ -31,10 +31,10 @@ from lyra_petsc.output.agreement import (
     cannot_write,
     on_each,
     raise_together,
+    writing,
 )
 from lyra_petsc.output.ordering import row_type
-from lyra_petsc.output.self_contained import import_h5py
-from lyra_petsc.output.stored import open_stored
+from lyra_petsc.output.stored import import_h5py, open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
@@ -108,8 +108,7 @@ class NewFile:
         This rank's rows of each dataset; ranks' rows follow each other in rank order. Names,
         types and trailing shapes are the same on every rank; a rank may have no rows.
     attributes : mapping of str to mapping
-        Attributes of groups and datasets, by their path in the file; of the last file read on rank 0,
-        of others on any rank.
+        Attributes of groups and datasets, by their path in the file; read on rank 0.
     publish : callable
         What rank 0 does when all files have their names.
     places : sequence of int or None
@@ -142,8 +141,7 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
     Parameters
     ----------
     files : sequence of NewFile
-        As many on every rank. Where the ranks share a machine, one lays out a file while another does the
-        next.
+        As many on every rank.
     comm : MPI.Comm
         All ranks; collective.
     background : Background or None
@@ -161,28 +159,26 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
     slabs = [{name: np.ascontiguousarray(slab) for name, slab in file.datasets.items()} for file in files]
     of_ranks = comm.allgather([[len(slab) for slab in of_file.values()] for of_file in slabs])
     lengths = [np.array([of_files[number] for of_files in of_ranks]) for number in range(len(files))]
-    shared = comm.size if on_one_machine(comm) else 1
-    owners = [number % shared for number in reversed(range(len(files)))]
-    mine = [number for number, owner in enumerate(owners) if owner == comm.rank]
 
     def laid_out(number: int) -> list[int]:
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
         if file.places is not None:
             return list(file.places)
-        return _guarded(file.path, lambda: lay_out(file.part, slabs[number], rows, file.attributes))
+        with writing(file.path, HDF5_ERRORS):
+            return lay_out(file.part, slabs[number], rows, file.attributes)
 
     try:
-        known = comm.allgather(on_each(comm, lambda: {number: laid_out(number) for number in mine}))
-        for number, file in enumerate(files):
-            places, before = known[owners[number]][number], lengths[number][: comm.rank].sum(axis=0).tolist()
+        known = on_root(comm, lambda: [laid_out(number) for number in range(len(files))])
+        for number, (file, places) in enumerate(zip(files, known, strict=True)):
+            before = lengths[number][: comm.rank].sum(axis=0).tolist()
             pieces = [
                 (place + start * slab.itemsize * math.prod(slab.shape[1:]), slab)
                 for place, start, slab in zip(places, before, slabs[number].values(), strict=True)
             ]
             write_slabs(file.path, file.part, pieces, comm)
     except LyraError:
-        for number in mine:
-            files[number].discard()
+        for file in files if comm.rank == 0 else ():
+            file.discard()
         raise
     if background is not None:
         background.begin(partial(_complete, files))
@@ -195,10 +191,12 @@ def _complete(files: Sequence[NewFile]) -> None:
     try:
         for file in files:
             file.prepare()
-            _guarded(file.path, partial(_sync, file.part))
+            with writing(file.path), open(file.part, "rb") as raw:
+                os.fsync(raw.fileno())
         for file in files:
             if file.places is None:
-                _guarded(file.path, partial(os.replace, file.part, file.path))
+                with writing(file.path):
+                    os.replace(file.part, file.path)
     except LyraError:
         for file in files:
             file.discard()
@@ -228,35 +226,16 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
     InputError
         On every rank, if the file is damaged or the dataset missing or of another length.
     """
-    problem: LyraError | None = None
-    slab: NDArray[Any] = np.empty(0)
-    try:
+
+    def work() -> NDArray[Any]:
         with open_stored(Path(path)) as file:
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
-                problem = InputError(
-                    f"{dataset} has {stored.shape[0] if stored.shape else 'no'} rows, "
-                    f"{order.n_global} are expected",
-                    file=path,
-                )
-            else:
-                slab = stored[order.start : order.start + order.n_slab]
-    except InputError as error:
-        problem = error
-    raise_together(order.comm, problem)
-    return slab
+                found = f"{dataset} has {stored.shape[0] if stored.shape else 'no'} rows"
+                raise InputError(f"{found}, {order.n_global} are expected", file=path)
+            return np.asarray(stored[order.start : order.start + order.n_slab])
 
-
-def _guarded(path: Path, work: Callable[[], Result]) -> Result:
-    try:
-        return work()
-    except HDF5_ERRORS as error:
-        raise cannot_write(path, error) from error
-
-
-def _sync(part: Path) -> None:
-    with open(part, "rb") as raw:
-        os.fsync(raw.fileno())
+    return on_each(order.comm, work)
 
 
 def lay_out(
@@ -368,14 +347,11 @@ def _write_alone(path: Path, part: Path, pieces: Sequence[Piece], *, sync: bool)
     """These pieces, if there are any, into a plain file."""
     if not pieces:
         return
-    try:
-        with open(part, "r+b", buffering=0) as file:
-            for offset, rows in pieces:
-                _write_rows(file, offset, rows)
-            if sync:
-                os.fsync(file.fileno())
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with writing(path), open(part, "r+b", buffering=0) as file:
+        for offset, rows in pieces:
+            _write_rows(file, offset, rows)
+        if sync:
+            os.fsync(file.fileno())
 
 
 def _write_rows(file: FileIO, offset: int, rows: NDArray[Any]) -> None:

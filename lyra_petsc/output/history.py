@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import replaced, writing
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -75,11 +75,8 @@ class History:
         *,
         resume_after: int | None = None,
     ) -> None:
-        if not columns or columns[0] != "step":
-            raise ValueError("the first column is step")
         self.path = Path(path)
         self.columns = tuple(columns)
-        self._names = frozenset(columns)
         self._file: BinaryIO | None = None
         self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
@@ -91,23 +88,15 @@ class History:
         Parameters
         ----------
         rows : mapping
-            A number, or a name, for each column and nothing else.
+            A number, or a name, for each column.
 
         Raises
         ------
         OutputError
             On rank 0.
         """
-        lines = StringIO()
-        table = csv.writer(lines, lineterminator="\n")
-        for values in rows:
-            if values.keys() != self._names:
-                raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
-            table.writerow([_text(values[name]) for name in self.columns])
-        try:
-            self._write(lines.getvalue())
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
+        with writing(self.path):
+            self._write([_text(values[name]) for name in self.columns] for values in rows)
 
     def close(self) -> None:
         """Close the file; nothing can be appended afterwards.
@@ -120,41 +109,32 @@ class History:
             self._file = None
 
     def _open(self, resume_after: int | None) -> None:
-        try:
+        with writing(self.path):
             go_on = resume_after is not None and self.path.exists()
             if resume_after is not None and go_on:
                 self._cut(resume_after)
             self._file = self.path.open("ab" if go_on else "wb")
             if not go_on:
-                header = StringIO()
-                csv.writer(header, lineterminator="\n").writerow(self.columns)
-                self._write(header.getvalue())
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
+                self._write([self.columns])
 
-    def _write(self, line: str) -> None:
-        if self._file is None:
-            raise ValueError(f"{self.path} is closed")
-        self._file.write(line.encode())
+    def _write(self, rows: Iterable[Sequence[str]]) -> None:
+        """Write all rows at once."""
+        assert self._file is not None
+        lines = StringIO()
+        csv.writer(lines, lineterminator="\n").writerows(rows)
+        self._file.write(lines.getvalue().encode())
         self._file.flush()
 
     def _cut(self, last_step: int) -> None:
         """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""
         check_columns(self.path, self.columns)
-        kept = self.path.with_name(self.path.name + ".part")
-        with (
-            open(self.path, encoding="utf-8", errors="replace", newline="") as old,
-            open(kept, "w", encoding="utf-8", newline="") as new,
-        ):
+        with open(self.path, "rb") as old, replaced(self.path) as new:
             new.write(old.readline())
             for line in old:
-                if not line.endswith("\n") or not _is_row_until(line, last_step):
+                if not line.endswith(b"\n") or not _is_row_until(line, last_step):
                     break
-                self.kept_until = int(line.split(",", 1)[0])
+                self.kept_until = int(line.split(b",", 1)[0])
                 new.write(line)
-            new.flush()
-            os.fsync(new.fileno())
-        os.replace(kept, self.path)
 
 
 def check_columns(path: Path, columns: Sequence[str]) -> None:
@@ -175,9 +155,9 @@ def check_columns(path: Path, columns: Sequence[str]) -> None:
             )
 
 
-def _is_row_until(line: str, last_step: int) -> bool:
+def _is_row_until(line: bytes, last_step: int) -> bool:
     try:
-        return int(line.split(",", 1)[0]) <= last_step
+        return int(line.split(b",", 1)[0]) <= last_step
     except ValueError:
         return False
 

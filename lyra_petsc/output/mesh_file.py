@@ -15,8 +15,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.hdf5 import NewFile, write_collective
-from lyra_petsc.output.stored import SUM, check_sum
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import SUM, StoredMesh, check_sum
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 
@@ -53,8 +52,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     """
 
     def work() -> None:
-        if mesh is None:
-            raise ValueError("rank 0 needs the mesh")
+        assert mesh is not None
         datasets = _arrays(mesh)
         names: dict[str, dict[str, int | float | str]] = {"mesh": {"vt": int(mesh.has_uv)}}
         for number, (name, group) in enumerate(mesh.groups.items()):
@@ -101,8 +99,7 @@ def check_same_mesh(
     file = Path(folder) / MESH_FILE
 
     def work() -> None:
-        if mesh is None:
-            raise ValueError("rank 0 needs the mesh")
+        assert mesh is not None
         try:
             difference = _difference(StoredMesh(file.parent), mesh, set(groups))
         except InputError as error:

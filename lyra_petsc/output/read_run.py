@@ -21,9 +21,7 @@ from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.self_contained import check_file, check_folder, check_name
-from lyra_petsc.output.stored import read_stored
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, check_name, read_stored
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
@@ -46,7 +44,7 @@ NAMES = frozenset({"obstacle"})
 RECENT = 0.05
 """Seconds; clocks of file systems are coarser than those of processors."""
 
-COLUMNS = {"velocity": (3,), "displacement": (3,)}
+COLUMNS: dict[str, tuple[int, ...]] = {"velocity": (3,), "displacement": (3,)}
 """Shape of a row of the fields that are vectors."""
 
 
@@ -81,7 +79,7 @@ class StoredRun:
         # else it may change again at the same time of the file system's clock
         written = self._stamp[0][0] * 1e-9 if self._stamp[0] else 0.0
         self._settled = abs(wall.time() - written) > RECENT
-        self._states: list[StoredState] = announced_states(self.folder)
+        self._states: list[AnnouncedState] = announced_states(self.folder)
         self.times: Array = np.array([state.time for state in self._states])
         first = self._states[0].fields
         # a run that was resumed with other fields has them in some states only
@@ -178,10 +176,10 @@ class StoredRun:
             raise InputError(
                 f"no field {name!r}, {what}; a scene's output.fields names them", file=self.folder
             )
-        places = [state.fields[name] for state in self._states]
-        rows = self.rest if self.field_on(name) == "vertex" else self.triangles
-        columns = self._states[0].tensors.get(name, COLUMNS.get(name, ()))
-        return StateArrays(self.folder, name, places, (len(rows), *columns))
+        first = self._states[0].fields[name]
+        places = [state.fields[name].place for state in self._states]
+        rows = self.rest if first.on == "vertex" else self.triangles
+        return StateArrays(self.folder, name, places, (len(rows), *first.columns))
 
     def field_units(self, name: str) -> str:
         """Unit of a field, as in ``N/m``; ``1`` for plain numbers."""
@@ -193,7 +191,7 @@ class StoredRun:
 
     def field_on(self, name: str) -> str:
         """``vertex`` or ``triangle``: what the rows of a field belong to, in the order of the mesh file."""
-        return self._states[0].on[name]
+        return self._states[0].fields[name].on
 
     def at(self, time: float) -> int:
         """Number of the state nearest to a time [s]."""
@@ -297,7 +295,16 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 
 @dataclass(frozen=True)
-class StoredState:
+class AnnouncedField:
+    """Where an array of a state is, what its rows belong to (``vertex``, ``triangle``), and their shape."""
+
+    place: Place
+    on: str
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class AnnouncedState:
     """A written state.
 
     Attributes
@@ -306,22 +313,16 @@ class StoredState:
         [s], or the load factor of a static analysis.
     position : tuple of str
         Where the positions are.
-    fields : mapping of str to tuple of str
-        Where what else the state holds is.
-    on : mapping of str to str
-        ``vertex`` or ``triangle``: what the rows of each field belong to.
-    tensors : mapping of str to tuple of int
-        Shape of a row of those of the fields that are tensors.
+    fields : mapping of str to AnnouncedField
+        What else the state holds.
     """
 
     time: float
     position: Place
-    fields: Mapping[str, Place]
-    on: Mapping[str, str]
-    tensors: Mapping[str, tuple[int, ...]]
+    fields: Mapping[str, AnnouncedField]
 
 
-def announced_states(folder: Path) -> list[StoredState]:
+def announced_states(folder: Path) -> list[AnnouncedState]:
     """The states of a run in the order of time.
 
     Raises
@@ -343,7 +344,7 @@ def announced_states(folder: Path) -> list[StoredState]:
     if not states:
         raise InputError("no state is written yet", file=folder)
     for state in states:
-        for name, _ in (state.position, *state.fields.values()):
+        for name, _ in (state.position, *(field.place for field in state.fields.values())):
             check_name(name, path)
     return states
 
@@ -358,29 +359,28 @@ def _absent(folder: Path) -> str:
     return f"is not the folder of a run (no {XDMF_FILE})"
 
 
-def _state(grid: Element) -> StoredState:
+def _state(grid: Element) -> AnnouncedState:
     time, geometry = grid.find("Time"), grid.find("Geometry")
     if time is None or geometry is None:
         raise ValueError
-    fields = {a.attrib["Name"]: a for a in grid.iterfind("Attribute") if a.get("Name") != "rest"}
     seconds = float(time.attrib["Value"])
     if not math.isfinite(seconds):
         raise ValueError
-    return StoredState(
-        seconds,
-        _place(geometry),
-        {name: _place(field) for name, field in fields.items()},
-        {name: "triangle" if field.get("Center") == "Cell" else "vertex" for name, field in fields.items()},
-        {name: _row_of_tensor(fields[name]) for name in TENSORS & fields.keys()},
+    attributes = {each.attrib["Name"]: each for each in grid.iterfind("Attribute")}
+    fields = {name: _field(name, each) for name, each in attributes.items() if name != "rest"}
+    return AnnouncedState(seconds, _place(geometry), fields)
+
+
+def _field(name: str, element: Element) -> AnnouncedField:
+    columns = COLUMNS.get(name, ())
+    if name in TENSORS:
+        item = element.find("DataItem")
+        columns = (int(item.attrib["Dimensions"].split()[-1]) if item is not None else 0,)
+        if columns[0] not in COMPONENTS:
+            raise ValueError
+    return AnnouncedField(
+        _place(element), "triangle" if element.get("Center") == "Cell" else "vertex", columns
     )
-
-
-def _row_of_tensor(element: Element) -> tuple[int]:
-    item = element.find("DataItem")
-    width = int(item.attrib["Dimensions"].split()[-1]) if item is not None else 0
-    if width not in COMPONENTS:
-        raise ValueError
-    return (width,)
 
 
 def _place(element: Element) -> Place:

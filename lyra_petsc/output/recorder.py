@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -125,9 +126,9 @@ class Recorder:
         if problem.start is not None:
             problem.start = self._first_positions(folder, otherwise=problem.start)
         self._open(folder, simulation.step_number)
-        kept, last = self._history.kept_until, simulation.step_number
-        if kept != last:
-            simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
+        history, last = self._opened["history.csv"], simulation.step_number
+        if (kept := history.kept_until) != last:
+            simulation.notes.append(f"{history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._last_state = int(checkpoint.scalars["last_state"])
 
@@ -235,13 +236,10 @@ class Recorder:
             vtkhdf=self._simulation.scene.output.vtkhdf,
             background=self._background,
         )
-        opened = {
+        self._opened = {
             name: History(folder / name, columns, self._comm, resume_after=resume_after)
             for name, columns in self._tables().items()
         }
-        self._history = opened["history.csv"]
-        self._probes, self._reactions = opened.get("probes.csv"), opened.get("reactions.csv")
-        self._obstacles = opened.get("obstacles.csv")
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -271,48 +269,41 @@ class Recorder:
         """A row of each table; whether a checkpoint is due, by rank 0's clock."""
         budget = self._simulation.budget
         history: dict[str, float | str] = {
-            "step": report.step,
-            "time": report.time,
-            "dt": report.dt,
-            "newton_iterations": report.newton_iterations,
-            "linear_iterations": report.linear_iterations,
-            "rejected": report.rejected,
+            **asdict(report),
             "kinetic_energy": budget.kinetic,
             "membrane_energy": budget.membrane,
             "bending_energy": budget.bending,
             "potential_energy": budget.potential,
             "external_work": budget.external_work,
             "dissipation": budget.dissipation,
-            "residual": report.residual,
-            "wall_seconds": report.wall_seconds,
             **self._simulation.ledger.columns(),
         }
-        rows: list[tuple[History, list[dict[str, float | str]]]] = [(self._history, [history])]
-        if self._probes is not None:
-            rows.append((self._probes, [self._vectors(report, self._probe_means())]))
-        if self._reactions is not None:
-            pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
-            forces = {f"handle{n}": force for n, force in enumerate(pulls)}
-            moments = self._simulation.ledger.handle_moments().items()
-            turning = {f"handle{n}_m{axis}": float(m[i]) for n, m in moments for i, axis in enumerate("xyz")}
-            rows.append((self._reactions, [{**self._vectors(report, forces), **turning}]))
-        if self._obstacles is not None:
-            names = list(self._simulation.scene.obstacles or {})
-            pushes = self._simulation.ledger.obstacle_forces(len(names))
-            rows.append((self._obstacles, [_push(report, *each) for each in zip(names, pushes, strict=True)]))
+        rows, ledger = {"history.csv": [history]}, self._simulation.ledger
+        if "probes.csv" in self._opened:
+            means = {f"{name}_": mean for name, mean in self._probe_means().items()}
+            rows["probes.csv"] = [self._vectors(report, means)]
+        if "reactions.csv" in self._opened:
+            pulls = ledger.handle_forces(len(self._simulation.scene.handles))
+            forces = {f"handle{n}_": force for n, force in enumerate(pulls)}
+            moments = {f"handle{n}_m": moment for n, moment in ledger.handle_moments().items()}
+            rows["reactions.csv"] = [self._vectors(report, forces | moments)]
+        if names := list(self._simulation.scene.obstacles or {}):
+            pushes = zip(names, ledger.obstacle_forces(len(names)), strict=True)
+            rows["obstacles.csv"] = [_push(report, *each) for each in pushes]
 
         def work() -> bool:
-            for table, lines in rows:
-                table.append(*lines)
+            for name, lines in rows.items():
+                self._opened[name].append(*lines)
             return self._due()
 
         return bool(on_root(self._comm, work))
 
     @staticmethod
     def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float | str]:
+        """A row with the components of vectors, each named by the vector and the axis."""
         row: dict[str, float | str] = {"step": report.step, "time": report.time}
         for name, vector in vectors.items():
-            row |= {f"{name}_{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
+            row |= {f"{name}{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
         return row
 
     def _probe_means(self) -> dict[str, Array]:
@@ -344,8 +335,7 @@ class Recorder:
                 simulation.step_number,
                 simulation.time,
                 problem.system.x[: problem.points.n_vertices],
-                {field.name: value for field, value in values.items() if field.on == "vertex"},
-                {field.name: value for field, value in values.items() if field.on == "triangle"},
+                {field.name: (field.on, value) for field, value in values.items()},
                 beside=[checkpoint],  # what is announced is not written again after a kill
             )
         self._last_state = simulation.step_number
@@ -411,9 +401,8 @@ class Recorder:
     def close(self) -> None:
         """Close the tables; for one rank. Errors of what is still being written are raised by `settle`."""
         self._background.close()
-        for table in (self._history, self._probes, self._reactions, self._obstacles):
-            if table is not None:
-                table.close()
+        for table in self._opened.values():
+            table.close()
 
 
 def _push(report: StepReport, name: str, push: Array) -> dict[str, float | str]:

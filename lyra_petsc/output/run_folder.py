@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.self_contained import check_folder, open_own
+from lyra_petsc.output.stored import check_folder, open_own
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -35,15 +35,11 @@ RESULT = re.compile(
 )
 
 
-def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = None) -> list[Path]:
-    """The checkpoints of a run that exist, newest first; with ``comm`` as rank 0 sees them."""
-
-    def work() -> list[Path]:
-        # a kill between the two replacements of a write leaves the newest under NEXT
-        files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
-        return [file for file in files if file.is_file()]
-
-    return work() if comm is None else on_root(comm, work)
+def checkpoint_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """The checkpoints of a run that exist, newest first."""
+    # a kill between the two replacements of a write leaves the newest under NEXT
+    files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
+    return [file for file in files if file.is_file()]
 
 
 def present(name: str, folder: Path) -> list[Path]:

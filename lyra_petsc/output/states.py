@@ -24,15 +24,13 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text
+from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text, writing
 from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import OutsideFolderError
-from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
+from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import (
-    MESH_FILE,
     XDMF_FILE,
     GrowingXdmf,
     StoredField,
@@ -53,7 +51,8 @@ MORE = 0.1
 
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
-Fields = Mapping[str, NDArray[Any]]
+Fields = Mapping[str, tuple[str, NDArray[Any]]]
+"""By their names: what their rows belong to (``vertex`` or ``triangle``), and this rank's rows."""
 
 
 class StateWriter:
@@ -99,13 +98,13 @@ class StateWriter:
     ) -> None:
         self.folder = Path(folder)
         self.vertices = vertices
-        self.triangles = triangles
+        self._orders = {"vertex": vertices} | ({} if triangles is None else {"triangle": triangles})
         self.n_triangles = n_triangles
         self._room: _PreallocatedFile | None = None
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
         self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
         self._in_vtk = 0
-        self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
+        self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
         if vtkhdf:
@@ -119,18 +118,12 @@ class StateWriter:
     def _comm(self) -> MPI.Comm:
         return self.vertices.comm
 
-    @property
-    def count(self) -> int:
-        """Number of the next state."""
-        return self._next
-
     def write(
         self,
         step: int,
         time: float,
         position: Array,
-        vertex_fields: Fields | None = None,
-        triangle_fields: Fields | None = None,
+        fields: Fields,
         beside: Sequence[NewFile] = (),
     ) -> int:
         """Write and announce one state; collective. Returns its number.
@@ -143,9 +136,9 @@ class StateWriter:
             [s].
         position : (n_owned, 3) float64
             Current positions of this rank's vertices [m].
-        vertex_fields, triangle_fields : mapping of str to (n_owned, ...) array
-            Further fields on this rank's vertices and triangles: floats or integers, the same
-            names, types and trailing shapes on every rank.
+        fields : mapping of str to (str, (n_owned, ...) array)
+            Further fields on ``vertex`` or ``triangle``, on this rank's: floats or integers, the same names,
+            types and trailing shapes on every rank.
         beside : sequence of NewFile
             Files that are there, too, when the state is announced.
 
@@ -155,20 +148,16 @@ class StateWriter:
             On every rank; the states announced before stand. With a background, of the state before.
         """
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
-        slabs |= {name: self.vertices.to_slab(rows) for name, rows in (vertex_fields or {}).items()}
-        fields = self._describe(slabs, "vertex", self.vertices)
-        if triangle_fields:
-            if self.triangles is None:
-                raise ValueError("fields on triangles need the order of the triangles")
-            on_triangles = {name: self.triangles.to_slab(rows) for name, rows in triangle_fields.items()}
-            fields += self._describe(on_triangles, "triangle", self.triangles)
-            slabs |= on_triangles
-
+        slabs |= {name: self._orders[on].to_slab(rows) for name, (on, rows) in fields.items()}
+        described = tuple(
+            StoredField(name, on, (self._orders[on].n_global, *slabs[name].shape[1:]), slabs[name].dtype.name)
+            for name, (on, _) in fields.items()
+        )
         number = self._next
         room = self._room
-        if room is None or room.fields != fields or number >= room.first + len(room.places):
-            room = self._room = self._lay_out(slabs, fields)
-        state = WrittenState(number, int(step), float(time), room.path.name, fields)
+        if room is None or room.fields != described or number >= room.first + len(room.places):
+            room = self._room = self._lay_out(slabs, described)
+        state = WrittenState(number, int(step), float(time), room.path.name, described)
         written = partial(room.say_written, state, check_sums(slabs.values(), self._comm))
         datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
         places = room.places[number - room.first].tolist()
@@ -188,12 +177,12 @@ class StateWriter:
         if self._vtkhdf:
             on_root(self._comm, lambda: self._announce_to_vtk(late=True))
 
-    def _lay_out(self, slabs: Fields, fields: tuple[StoredField, ...]) -> _PreallocatedFile:
+    def _lay_out(
+        self, slabs: Mapping[str, NDArray[Any]], fields: tuple[StoredField, ...]
+    ) -> _PreallocatedFile:
         """A file with room for the next states; collective."""
         first, names = self._next, list(slabs)
-        on = {"position": "vertex"} | {field.name: field.on for field in fields}
-        n_of = {"vertex": self.vertices.n_global, "triangle": self.n_triangles}
-        rows = [n_of[on[name]] for name in names]
+        rows = [self.vertices.n_global, *(field.shape[0] for field in fields)]
         widths = [slab.itemsize * int(np.prod(slab.shape[1:], dtype=int)) for slab in slabs.values()]
         size = sum(n * width for n, width in zip(rows, widths, strict=True))
         slots = max(1, min(max(first, FEWEST), MOST, LARGEST // max(size, 1)))
@@ -204,7 +193,7 @@ class StateWriter:
             f"{TABLE}/sums": np.empty((0, len(names)), np.uint64),
         }
         planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
-        told = json.dumps([[name, on[name]] for name in names])
+        told = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
         attributes: Attributes = {TABLE: {"first": first, "columns": told}}
 
         def work() -> list[int]:
@@ -222,14 +211,6 @@ class StateWriter:
 
         places = np.array(on_root(self._comm, work), dtype=np.int64)
         return _PreallocatedFile(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
-
-    @staticmethod
-    def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[StoredField, ...]:
-        return tuple(
-            StoredField(name, on, (order.n_global, *slab.shape[1:]), slab.dtype.name)
-            for name, slab in slabs.items()
-            if name != "position"
-        )
 
     def _announce(self, state: WrittenState) -> None:
         """Announce a state (rank 0)."""
@@ -252,7 +233,7 @@ class StateWriter:
         new = len(self._states) - self._in_vtk
         if new == 0 or not (late or new >= MORE * self._in_vtk):
             return
-        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles, MESH_FILE)
+        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles)
         self._in_vtk = len(self._states)
 
     def _truncate(self, last_step: int) -> tuple[int, frozenset[str]]:
@@ -299,12 +280,9 @@ class _PreallocatedFile:
     def say_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
         """Write a state's row of the table (rank 0)."""
         entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
-        try:
-            with open(self.path, "r+b", buffering=0) as file:
-                for place, entry in zip(self.table.tolist(), entries, strict=True):
-                    os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
+        with writing(self.path), open(self.path, "r+b", buffering=0) as file:
+            for place, entry in zip(self.table.tolist(), entries, strict=True):
+                os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
 
 
 def _forget(path: Path, last_step: int) -> None:
@@ -445,7 +423,7 @@ def write_failure(
         )
         written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
     write_collective([NewFile(folder / FAILURE_DATA, datasets, attributes)], vertices.comm)
-    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(written)
+    document = TimeSeries(vertices.n_global, n_triangles).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
 
 

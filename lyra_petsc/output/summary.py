@@ -15,7 +15,7 @@ import numpy as np
 import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason, replace_text
-from lyra_petsc.output.self_contained import import_h5py
+from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -70,50 +70,16 @@ def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise InputError(f"is damaged: {reason(error)}; {REMEDY}", file=path) from None
     if not isinstance(content, dict):
         raise InputError(f"is damaged: no mapping; {REMEDY}", file=path)
-    for key, kind in KINDS.items():
-        if key in content and not _is(content[key], kind):
-            raise InputError(f"is damaged, holds what no run writes; {REMEDY}", file=path, key=key)
+    from pydantic import ValidationError
+
+    from lyra_petsc.output.summary_entries import Summary
+
+    try:
+        Summary.model_validate(content, strict=True)
+    except ValidationError as error:
+        key = str(error.errors()[0]["loc"][0])
+        raise InputError(f"is damaged, holds what no run writes; {REMEDY}", file=path, key=key) from None
     return content
-
-
-KINDS: dict[str, Any] = {
-    "title": (str, None),
-    "outcome": str,
-    "ranks": int,
-    "sizes": {...: int},
-    "terms": [str],
-    "linear_solver": str,
-    "versions": {...: str},
-    "petsc_options": {...: (str, None)},
-    "unused_petsc_options": [str],
-    "integrator": str,
-    "time": float,
-    "estimated_error": (float, None),
-    "steps": int,
-    "wall_seconds": {...: float},
-    "notes": [str],
-    "resumed": [{"step": int, "time": float, "ranks": int, "changes": [{"key": str}]}],
-    "failure": {"advice": [str]},
-}
-"""What the entries of a run's summary are: a type, one of several, a list or a mapping (``...``: of any
-names) of these. Entries may be missing, in mappings of names, too, where nothing reads them unasked."""
-
-
-def _is(value: Any, kind: Any) -> bool:
-    if isinstance(kind, tuple):
-        return any(_is(value, one) for one in kind)
-    if isinstance(kind, list):
-        return isinstance(value, list) and all(_is(entry, kind[0]) for entry in value)
-    if isinstance(kind, dict):
-        if not isinstance(value, dict):
-            return False
-        if ... in kind:
-            return all(_is(entry, kind[...]) for entry in value.values())
-        return all(_is(value[key], of_key) for key, of_key in kind.items() if key in value)
-    if kind is None:
-        return value is None
-    numbers = (int, float) if kind is float else kind
-    return isinstance(value, numbers) and not isinstance(value, bool)
 
 
 def versions() -> dict[str, str]:

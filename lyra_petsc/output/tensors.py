@@ -19,7 +19,7 @@ COMPONENTS = {6: ("uu", "uv", "uw", "vv", "vw", "ww"), 3: ("uu", "vv", "uv")}
 """Names of the components by their number: of six, and of three in older folders."""
 
 _VTK_ORDER = [0, 3, 5, 1, 4, 2]
-VTK_COLUMNS = (((0, 4), (0, 4)), ((1, 2), (3, 5)), ((3, 5), (1, 2)))
+VTK_COLUMNS = ((np.s_[0:5:4], np.s_[0:5:4]), (np.s_[1:3], np.s_[3:6:2]), (np.s_[3:6:2], np.s_[1:3]))
 """The same in pairs of columns, VTK's and XDMF's, each pair ascending."""
 
 _IN_PLANE = [0, 3, 1]

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, replace_bytes
-from lyra_petsc.output.self_contained import import_h5py
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.agreement import HDF5_ERRORS, replace_bytes, writing
+from lyra_petsc.output.stored import StoredMesh, import_h5py
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
-from lyra_petsc.output.xdmf import WrittenState, group_name
+from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
 CELLS_FILE = "cells.h5"
@@ -59,9 +58,7 @@ def write_cells(folder: Path) -> None:
             file[name] = array
 
 
-def write_vtkhdf(
-    folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int, mesh_file: str
-) -> None:
+def write_vtkhdf(folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int) -> None:
     """Write ``states.vtkhdf`` for these states. Call on one rank.
 
     A field that some states lack is NaN there (0 if it is of whole numbers).
@@ -72,8 +69,6 @@ def write_vtkhdf(
         With ``cells.h5`` and the files of the states.
     states : sequence of WrittenState
     n_vertices, n_triangles : int
-    mesh_file : str
-        Name of the file with ``/mesh/rest``.
 
     Raises
     ------
@@ -91,7 +86,7 @@ def write_vtkhdf(
         real = np.dtype(np.float64)
         positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
         _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
-        rest = {0: (mesh_file, "mesh/rest")}
+        rest = {0: (MESH_FILE, "mesh/rest")}
         _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
         add_offsets(root, "vertex", "rest", len(states), 0)
         # each name once: as the newest state has it
@@ -162,26 +157,15 @@ def _virtual(
     Tensors of six components get VTK's order.
     """
     h5py = import_h5py()
-    stored = h5py.h5t.py_create(kind, logical=True)
-    space, target = (h5py.h5s.create_simple(shape) for _ in range(2))
-    source = h5py.h5s.create_simple((rows, *shape[1:]))
-    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    if kind.kind == "f":
-        plan.set_fill_value(np.array(np.nan, dtype=kind))
+    layout = h5py.VirtualLayout(shape, kind)
     for i, (file, dataset) in places.items():
-        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else [(None, None)]:
-            _select(target, i * rows, rows, shape, ours)
-            _select(source, 0, rows, shape, theirs)
-            plan.set_virtual(target, file.encode(), dataset.encode(), source)
-    h5py.h5d.create(root.id, name.encode(), stored, space, plan)
-
-
-def _select(space: Any, first: int, rows: int, shape: tuple[int, ...], pair: tuple[int, int] | None) -> None:
-    """Select rows from ``first`` on, with all columns or a pair of them."""
-    if pair is None:
-        space.select_hyperslab((first,) + (0,) * (len(shape) - 1), (rows, *shape[1:]))
-    else:
-        space.select_hyperslab((first, pair[0]), (rows, 2), (1, pair[1] - pair[0]))
+        source = h5py.VirtualSource(file, dataset, (rows, *shape[1:]))
+        here = slice(i * rows, (i + 1) * rows)
+        if not is_tensor(shape):
+            layout[here] = source
+        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else ():
+            layout[here, ours] = source[:, theirs]
+    root.create_virtual_dataset(name, layout, np.nan if kind.kind == "f" else None)
 
 
 @contextmanager
@@ -190,11 +174,9 @@ def _replaced(path: Path) -> Iterator[Any]:
 
     One on disk takes the process down if it cannot grow while it is closed.
     """
-    try:
-        with import_h5py().File("unnamed", "w", driver="core", backing_store=False) as file:
-            yield file
-            file.flush()
-            content = bytes(file.id.get_file_image())
-    except HDF5_ERRORS as error:
-        raise cannot_write(path, error) from error
+    in_memory = {"driver": "core", "backing_store": False}
+    with writing(path, HDF5_ERRORS), import_h5py().File("unnamed", "w", **in_memory) as file:
+        yield file
+        file.flush()
+        content = bytes(file.id.get_file_image())
     replace_bytes(path, content)

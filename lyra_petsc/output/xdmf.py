@@ -19,7 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import cannot_write, replaced
 
 XDMF_FILE = "states.xdmf"
 MESH_FILE = "mesh.h5"
@@ -96,18 +96,16 @@ class TimeSeries:
     ----------
     n_vertices, n_triangles : int
         Rows of positions and of triangles.
-    mesh_file : str
-        Name of the file with ``/mesh/triangles`` and ``/mesh/rest``, relative to the XDMF file.
     """
 
-    def __init__(self, n_vertices: int, n_triangles: int, mesh_file: str) -> None:
+    def __init__(self, n_vertices: int, n_triangles: int) -> None:
         self._n_vertices = n_vertices
-        triangles = _item((n_triangles, 3), "int64", f"{mesh_file}:/mesh/triangles")
+        triangles = _item((n_triangles, 3), "int64", f"{MESH_FILE}:/mesh/triangles")
         self._before = (
             f'   <Topology TopologyType="Triangle" NumberOfElements="{n_triangles}">{triangles}</Topology>\n'
         )
         rest = StoredField("rest", "vertex", (n_vertices, 3), "float64")
-        self._after = _attribute(rest, f"{mesh_file}:/mesh/rest")
+        self._after = _attribute(rest, f"{MESH_FILE}:/mesh/rest")
 
     def text(self, states: Sequence[WrittenState]) -> str:
         """The whole document, states in the order given."""
@@ -210,25 +208,17 @@ class GrowingXdmf:
 
     def _make(self, pieces: list[bytes], copied: int) -> None:
         """The first ``copied`` bytes of the file and these pieces, with new room, under its name."""
-        part = self.path.with_name(self.path.name + ".part")
-        try:
-            with open(part, "wb") as new:
-                if copied:
-                    with open(self.path, "rb") as old:
-                        while new.tell() < copied:
-                            new.write(old.read(min(copied - new.tell(), MOST_ROOM)))
-                new.writelines(pieces)
-                new.write(b" " * _pad(new.tell()))
-                seam = new.tell()
-                new.write(SEAM)
-                new.write(b" " * min(max(seam // 8, LEAST_ROOM), MOST_ROOM) + ROOM_END)
-                size = new.tell()
-                new.flush()
-                os.fsync(new.fileno())
-            os.replace(part, self.path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise cannot_write(self.path, error) from error
+        with replaced(self.path) as new:
+            if copied:
+                with open(self.path, "rb") as old:
+                    while new.tell() < copied:
+                        new.write(old.read(min(copied - new.tell(), MOST_ROOM)))
+            new.writelines(pieces)
+            new.write(b" " * _pad(new.tell()))
+            seam = new.tell()
+            new.write(SEAM)
+            new.write(b" " * min(max(seam // 8, LEAST_ROOM), MOST_ROOM) + ROOM_END)
+            size = new.tell()
         self._seam, self._size = seam, size
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import Self
@@ -11,14 +11,19 @@ from typing_extensions import Self
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, when
 from lyra_petsc.scene.values import (
+    ANY_AXES,
     FINITE,
+    Direction,
     Index,
     JsonSchema,
     Name,
     NonNegative,
     Number,
     Positive,
+    axes,
+    block_of,
     file_beside,
+    list_of,
     number,
     problem,
     shown,
@@ -42,33 +47,23 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return (number(value),)
 
 
-def _known(value: Any) -> Any:
-    if not isinstance(value, dict) or not value:
-        raise problem(f"must be a block of keys of the scene, not {shown(value)}")
-    return value
-
-
-def _some(value: Any) -> Any:
-    if not isinstance(value, (list, tuple)) or not value:
-        raise problem("must be a list of measurements; put '- ' before the entry")
-    return list(value)
-
-
 Table = Annotated[
     Path, file_beside("table", ".csv", ".txt"), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})
 ]
-Direction = Literal["x", "y", "z"]
 _PAIR = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
-_AXES = {"type": "array", "items": {"enum": ["x", "y", "z"]}, "minItems": 1, "uniqueItems": True}
 _NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]}
 
 
-def _axes(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, (list, tuple)) or not value or any(a not in ("x", "y", "z") for a in value):
-        raise problem(f"must be a list of x, y, z, not {shown(value)}")
-    if len(set(value)) < len(value):
+def _each_once(value: Any) -> tuple[str, ...]:
+    chosen = axes(value)
+    if len(set(chosen)) < len(chosen):
         raise problem(f"must hold each of x, y, z once, not {shown(value)}")
-    return tuple(value)
+    return chosen
+
+
+_Axes = Annotated[
+    tuple[Direction, ...], BeforeValidator(_each_once), JsonSchema(ANY_AXES | {"uniqueItems": True})
+]
 
 
 class Parameter(Block):
@@ -165,7 +160,7 @@ class Quantity(Block):
     overhang: Overhang | None = None
     drape: DrapeCoefficient | None = None
     force: Index | None = None
-    axes: Annotated[tuple[Direction, ...], BeforeValidator(_axes), JsonSchema(_AXES)] | None = None
+    axes: _Axes | None = None
     at: Positive | None = None
 
 
@@ -210,7 +205,7 @@ class Fit(Block):
         What was measured.
     """
 
-    parameters: Annotated[dict[Name, Parameter], BeforeValidator(_known)]
+    parameters: Annotated[dict[Name, Parameter], block_of("keys of the scene", least=1)]
     measurements: Annotated[
-        list[Measurement], BeforeValidator(_some), Field(json_schema_extra={"minItems": 1})
+        list[Measurement], list_of(" of measurements", least=1), Field(json_schema_extra={"minItems": 1})
     ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +49,12 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
     data = _read(path, text)
     if not isinstance(data, dict):
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
-    try:
+    with _of_finite_depth(path):
         data = plain(data)
         if path.name == STORED and (path.parent / BESIDE_STORED).exists():
             for block in _without_model(data):
                 block["bending_model"] = "hinge"
         overridden = apply_overrides(data, overrides)
-    except RecursionError:
-        raise InputError("is nested too deeply, or refers to itself", file=path) from None
     return _checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
 
 
@@ -121,12 +120,18 @@ def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
 def _changed(
     given: Mapping[str, Any], changes: Mapping[str, Any], source: Path | None, directory: Path
 ) -> Scene:
-    try:
+    with _of_finite_depth(source):
         data = plain(given)
         apply_changes(data, changes)
-    except RecursionError:
-        raise InputError("is nested too deeply, or refers to itself", file=source) from None
     return _checked(data, source, directory)
+
+
+@contextmanager
+def _of_finite_depth(file: Path | None) -> Iterator[None]:
+    try:
+        yield
+    except RecursionError:
+        raise InputError("is nested too deeply, or refers to itself", file=file) from None
 
 
 def _checked(
@@ -137,10 +142,8 @@ def _checked(
     *,
     meshes_needed: bool = True,
 ) -> Scene:
-    try:
+    with _of_finite_depth(source):
         scene = checked(Scene, data, file=source, overridden=overridden, context={"directory": directory})
-    except RecursionError:
-        raise InputError("is nested too deeply, or refers to itself", file=source) from None
     if meshes_needed:
         for key, mesh in scene.mesh_files.items():
             _check_mesh_file(mesh, dotted(key, data), source)

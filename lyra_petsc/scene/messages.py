@@ -88,7 +88,8 @@ def _words(kind: str, message: str, value: Any, context: dict[str, Any]) -> str:
     if kind == "missing":
         return "missing"
     if kind == "literal_error":
-        return f"must be {context['expected']}, not {shown(value)}"
+        known = context["expected"].replace("'", "").replace(" or ", ", ")
+        return f"must be one of {known}, not {shown(value)}"
     if kind == "list_type":
         return f"must be a list, not {shown(value)}"
     if kind == "recursion_loop":

@@ -9,6 +9,9 @@ does not do. ``texture`` is for its window only and has no counterpart.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -267,40 +270,34 @@ def _read_material(path: Path) -> ClothTable:
     return ClothTable(tables.density, c11, c12, c22, c33, (at_0, at_45, at_90))
 
 
-class ObjLabels:
-    """Vertex counts and vertex labels (``nl`` lines) of a scene's .obj files, read when asked for."""
+@dataclass
+class ObjVertices:
+    """Vertices of an .obj file.
 
-    def __init__(self, files: list[Path]) -> None:
-        self.files = files
-        self._lines: dict[int, list[list[str]]] = {}
+    Attributes
+    ----------
+    count : int
+    labels : dict of str to set of int
+        Vertices that bear a label (``nl`` lines, each after its vertex).
+    textured : bool
+        Whether ``vt`` lines give the rest shape.
+    """
 
-    def first_vertex(self, cloth: int) -> int:
-        """Number of the cloth's first vertex when all are numbered consecutively."""
-        return sum(1 for earlier in range(cloth) for words in self._words(earlier) if words[0] == "v")
+    count: int = 0
+    labels: dict[str, set[int]] = field(default_factory=dict)
+    textured: bool = False
 
-    def labelled(self, cloth: int, label: int) -> list[int]:
-        """Numbers of the cloth's vertices that bear ``label``; a label follows its vertex."""
-        vertex = self.first_vertex(cloth) - 1
-        found: list[int] = []
-        for words in self._words(cloth):
-            if words[0] == "v":
-                vertex += 1
-            elif words[0] == "nl" and words[1:2] == [str(label)]:
-                found.append(vertex)
-        return sorted({vertex for vertex in found if vertex >= 0})
 
-    def has_texture_coordinates(self, cloth: int) -> bool:
-        """Whether the cloth's rest shape is given by ``vt`` lines."""
-        return any(words[0] == "vt" for words in self._words(cloth))
-
-    def _words(self, cloth: int) -> list[list[str]]:
-        if cloth not in self._lines:
-            split = (
-                line.split(maxsplit=2)[:2]
-                for line in read_text(self.files[cloth], largest=math.inf).splitlines()
-            )
-            self._lines[cloth] = [words for words in split if words and words[0] in ("v", "nl", "vt")]
-        return self._lines[cloth]
+def read_vertices(file: Path) -> ObjVertices:
+    """The vertices of an .obj file and their labels; raises as `read_text`."""
+    found = ObjVertices()
+    for line in read_text(file, largest=math.inf).splitlines():
+        word, *label = line.split(maxsplit=2)[:2] or [""]
+        found.count += word == "v"
+        found.textured |= word == "vt"
+        if word == "nl" and label and found.count:
+            found.labels.setdefault(label[0], set()).add(found.count - 1)
+    return found
 
 
 def import_original(data: Any, path: Path) -> dict[str, Any]:
@@ -319,7 +316,8 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
         Unknown keys, values out of range, files that do not exist.
     """
     scene = checked(OriginalScene, data, file=path)
-    labels = ObjLabels([_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)])
+    files = [_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)]
+    vertices = cache(lambda cloth: read_vertices(files[cloth]))  # read when asked for
     several = len(scene.cloths) > 1
     ours: dict[str, Any] = {
         "title": path.stem,
@@ -336,7 +334,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     if scene.wind.density > 0 or scene.wind.drag > 0:
         ours["wind"] = {**scene.wind.model_dump(), "velocity": list(scene.wind.velocity)}
     for i, cloth in enumerate(scene.cloths):
-        if cloth.transform.scale != 1.0 and labels.has_texture_coordinates(i):
+        if cloth.transform.scale != 1.0 and vertices(i).textured:
             raise InputError(
                 "scales the material coordinates (vt) as well, which is not there yet; scale the mesh file",
                 file=path,
@@ -344,15 +342,13 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
             )
         name = {"name": f"cloth{i}"} if several else {}
         group = {"group": f"cloth{i}"} if several else {}
-        ours["mesh"].append(
-            {"file": str(labels.files[i]), "transform": cloth.transform.in_our_keys(), **name}
-        )
+        ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.in_our_keys(), **name})
         ours["material"].append({**_material(cloth.materials[0], i, path), **group})
     ours["motions"] = {
         f"motion{i}": _the_shortest_way([_keyframe(keyframe) for keyframe in keyframes])
         for i, keyframes in enumerate(scene.motions)
     }
-    ours["handles"] = [_handle(handle, i, labels, path) for i, handle in enumerate(scene.handles)]
+    ours["handles"] = [_handle(handle, i, vertices, path) for i, handle in enumerate(scene.handles)]
     return ours
 
 
@@ -405,17 +401,18 @@ def _the_shortest_way(keyframes: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return keyframes
 
 
-def _handle(handle: OriginalHandle, i: int, labels: ObjLabels, path: Path) -> dict[str, Any]:
-    key = f"handles[{i}]"
+def _handle(
+    handle: OriginalHandle, i: int, vertices: Callable[[int], ObjVertices], path: Path
+) -> dict[str, Any]:
+    nodes = handle.nodes
     if handle.label != -1:
-        nodes = labels.labelled(handle.cloth, handle.label)
+        nodes = sorted(vertices(handle.cloth).labels.get(str(handle.label), ()))
         if not nodes:
-            raise InputError(f"no vertex has label {handle.label}", file=path, key=f"{key}.label")
-    else:
-        offset = labels.first_vertex(handle.cloth)
-        nodes = [offset + node for node in handle.nodes]
+            raise InputError(f"no vertex has label {handle.label}", file=path, key=f"handles[{i}].label")
+    # all are numbered consecutively
+    first = sum(vertices(earlier).count for earlier in range(handle.cloth))
     block: dict[str, Any] = {
-        "nodes": nodes,
+        "nodes": [first + node for node in nodes],
         "from": handle.start_time,
         "until": handle.end_time,
         "fade": handle.fade_time,

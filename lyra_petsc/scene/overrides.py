@@ -113,23 +113,20 @@ def _step(
         if not part.isdecimal() or len(part) > 9 or int(part) > len(target):
             many = f"[0] to [{len(target)}]" if target else "[0]"
             raise InputError(f"{cut(dotted(walked))} is a list; give an index, {many}", key=option)
-        index = int(part)
-        if index == len(target):
+        place: Any = int(part)
+        if place == len(target):
             target.append(None)
-        walked.append(index)
-        if not rest:
-            target[index] = value
-        elif target[index] is None:
-            target[index] = [] if rest[0].isdecimal() else {}
-        return target[index]
-    if not isinstance(target, dict):
+    elif isinstance(target, dict):
+        place = part
+        target.setdefault(place)
+    else:
         raise InputError(f"{cut(dotted(walked))} holds a single value, no keys", key=option)
-    walked.append(part)
+    walked.append(place)
     if not rest:
-        target[part] = value
-    elif target.get(part) is None:
-        target[part] = [] if rest[0].isdecimal() else {}
-    return target[part]
+        target[place] = value
+    elif target[place] is None:
+        target[place] = [] if rest[0].isdecimal() else {}
+    return target[place]
 
 
 def _found_here(value: Any, key: str) -> Any:

@@ -34,12 +34,15 @@ from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, holds, one_of, some, when
 from lyra_petsc.scene.values import (
+    ANY_AXES,
+    AXES,
     INDEX,
     VECTOR,
     Angle,
     Axis,
     Bending,
     Count,
+    Direction,
     Flag,
     Fraction,
     Index,
@@ -59,7 +62,10 @@ from lyra_petsc.scene.values import (
     Until,
     Vec3,
     Vector,
+    axes,
+    block_of,
     file_beside,
+    list_of,
     number,
     path_beside,
     problem,
@@ -68,6 +74,9 @@ from lyra_petsc.scene.values import (
 )
 
 MESH_SUFFIXES = (".geo", ".msh", ".obj")
+
+_BY_KIND = Discriminator(lambda value: "[block]" if isinstance(value, (dict, Block)) else "[plain]")
+"""Of what may be a block instead of numbers or a word; messages leave out the tags."""
 
 
 class Rotation(Block):
@@ -230,17 +239,6 @@ class PlateStiffness(Block):
         return self
 
 
-def _one_word_of(words: Any) -> BeforeValidator:
-    known = get_args(words)
-
-    def check(value: Any) -> Any:
-        if value is not None and value not in known:
-            raise problem(f"must be one of {', '.join(known)}, not {shown(value)}")
-        return value
-
-    return BeforeValidator(check)
-
-
 BendingModel = Literal["hinge", "midedge"]
 MembraneLaw = Literal["stvk", "measured", "neo-hookean"]
 
@@ -345,14 +343,10 @@ class LawCurves(Block):
     shear: Curve
 
 
-_AnyLaw = Annotated[
-    Annotated[MembraneLaw, _one_word_of(MembraneLaw), Tag("[name]")] | Annotated[LawCurves, Tag("[curves]")],
-    Discriminator(lambda value: "[curves]" if isinstance(value, (dict, LawCurves)) else "[name]"),
-]
+_AnyLaw = Annotated[Annotated[MembraneLaw, Tag("[plain]")] | Annotated[LawCurves, Tag("[block]")], _BY_KIND]
 _BY_CURVES = given(law={"type": "object"})
 _AnyBending = Annotated[
-    Annotated[Bending, Tag("[number]")] | Annotated[PlateStiffness, Tag("[plate]")],
-    Discriminator(lambda value: "[plate]" if isinstance(value, (dict, PlateStiffness)) else "[number]"),
+    Annotated[Bending, Tag("[plain]")] | Annotated[PlateStiffness, Tag("[block]")], _BY_KIND
 ]
 
 # the ways to give a material's numbers: the keys of each, and those it needs
@@ -521,7 +515,7 @@ class Material(Block):
     density: Positive | None = None
     membrane: MembraneStiffness | None = None
     bending: _AnyBending | None = None
-    bending_model: Annotated[BendingModel | None, _one_word_of(BendingModel)] = None
+    bending_model: BendingModel | None = None
     law: _AnyLaw = "stvk"
     young: Positive | None = None
     poisson: Poisson | None = None
@@ -559,9 +553,6 @@ class Material(Block):
         return cloth
 
 
-Direction = Literal["x", "y", "z"]
-AXES: tuple[Direction, ...] = ("x", "y", "z")
-_AXES = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
 _ALL_AXES = {
     "anyOf": [
         {"type": "null"},
@@ -602,12 +593,6 @@ class UniformWind(Block):
     drag: NonNegative = 0.0
 
 
-def _vertex_list(value: Any) -> Any:
-    if not isinstance(value, (list, tuple)) or not value:
-        raise problem(f"must be a list of vertex numbers, not {shown(value)}")
-    return list(value)
-
-
 _VERTICES = {"type": "array", "items": INDEX.schema, "minItems": 1, "uniqueItems": True}
 _BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
 
@@ -626,7 +611,7 @@ class VertexChoice(Block):
     """
 
     group: Name | None = None
-    nodes: Annotated[list[Index], BeforeValidator(_vertex_list), JsonSchema(_VERTICES)] | None = None
+    nodes: Annotated[list[Index], list_of(" of vertex numbers", least=1), JsonSchema(_VERTICES)] | None = None
     box: Annotated[tuple[Vec3, Vec3], JsonSchema(_BOX)] | None = None
 
     @field_validator("nodes")
@@ -715,7 +700,7 @@ class Handle(Selector):
         ),
     )
 
-    axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
+    axes: Annotated[tuple[Direction, ...], JsonSchema(ANY_AXES)] = AXES
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
@@ -738,9 +723,8 @@ class Handle(Selector):
     @field_validator("axes", mode="before")
     @classmethod
     def _axes(cls, value: Any) -> Any:
-        if not isinstance(value, (list, tuple)) or not value or any(axis not in AXES for axis in value):
-            raise problem(f"must be a list of x, y, z, not {shown(value)}")
-        return tuple(axis for axis in AXES if axis in value)
+        chosen = axes(value)
+        return tuple(axis for axis in AXES if axis in chosen)
 
     _in_order = model_validator(mode="after")(_ends_later)
 
@@ -771,15 +755,7 @@ class Keyframe(Block):
     velocity: Vector | None = None
 
 
-def _many(value: Any) -> Any:
-    if isinstance(value, dict):
-        raise problem("must be a list; put '- ' before the entry")
-    if not isinstance(value, (list, tuple)):
-        raise problem(f"must be a list, not {shown(value)}")
-    return list(value)
-
-
-Keyframes = Annotated[list[Keyframe], BeforeValidator(_many), Field(json_schema_extra={"minItems": 1})]
+Keyframes = Annotated[list[Keyframe], list_of(), Field(json_schema_extra={"minItems": 1})]
 
 
 class Friction(Block):
@@ -804,8 +780,7 @@ class Friction(Block):
 
 
 _AnyFriction = Annotated[
-    Annotated[NonNegative, Tag("[number]")] | Annotated[Friction, Tag("[coefficients]")],
-    Discriminator(lambda value: "[coefficients]" if isinstance(value, (dict, Friction)) else "[number]"),
+    Annotated[NonNegative, Tag("[plain]")] | Annotated[Friction, Tag("[block]")], _BY_KIND
 ]
 
 
@@ -971,10 +946,8 @@ class Obstacle(Block):
     inside: Flag = False
     motion: (
         Annotated[
-            Annotated[Name, Tag("[name]")] | Annotated[Keyframes, Tag("[keyframes]")],
-            Discriminator(
-                lambda value: "[keyframes]" if isinstance(value, (dict, list, tuple)) else "[name]"
-            ),
+            Annotated[Name, Tag("[plain]")] | Annotated[Keyframes, Tag("[list]")],
+            Discriminator(lambda value: "[list]" if isinstance(value, (dict, list, tuple)) else "[plain]"),
         ]
         | None
     ) = None
@@ -1147,11 +1120,11 @@ class Time(Block):
     )
     sometimes_filled = frozenset({"end", "step"})
 
-    analysis: Annotated[Analysis, _one_word_of(Analysis)] = "dynamic"
+    analysis: Analysis = "dynamic"
     end: Positive
     step: StepLength
     tolerance: Positive | None = None
-    integrator: Annotated[Integrator | None, _one_word_of(Integrator)] = None
+    integrator: Integrator | None = None
     spectral_radius: Fraction | None = None
 
     @property
@@ -1364,12 +1337,6 @@ def _one_or_many(value: Any) -> Any:
     return [value]
 
 
-def _named(value: Any) -> Any:
-    if not isinstance(value, dict):
-        raise problem(f"must be a block of names, not {shown(value)}")
-    return value
-
-
 class Scene(Block):
     """The whole input of a run.
 
@@ -1438,15 +1405,15 @@ class Scene(Block):
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
     gravity: Vector | None = None
     wind: UniformWind | None = None
-    handles: Annotated[list[Handle], BeforeValidator(_many)] = Field(default_factory=list)
-    motions: Annotated[dict[Name, Keyframes], BeforeValidator(_named)] = Field(default_factory=dict)
+    handles: Annotated[list[Handle], list_of()] = Field(default_factory=list)
+    motions: Annotated[dict[Name, Keyframes], block_of("names")] = Field(default_factory=dict)
     contact: Contact | None = None
-    obstacles: Annotated[dict[Name, Obstacle], BeforeValidator(_named)] | None = None
-    loads: Annotated[list[AppliedLoad], BeforeValidator(_many)] = Field(default_factory=list)
+    obstacles: Annotated[dict[Name, Obstacle], block_of("names")] | None = None
+    loads: Annotated[list[AppliedLoad], list_of()] = Field(default_factory=list)
     initial: Initial | None = None
     time: Time
     output: Output = Field(default_factory=Output)
-    probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
+    probes: Annotated[dict[Name, Selector], block_of("names")] = Field(default_factory=dict)
     solver: Solver = Field(default_factory=Solver)
     render: Render | None = None
     fit: Fit | None = None

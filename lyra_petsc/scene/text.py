@@ -29,28 +29,37 @@ def read_text(path: Path, *, largest: float = LARGEST_SCENE, remedy: str = "") -
     Raises
     ------
     InputError
-        Missing, a directory, unreadable, larger than ``largest`` bytes, not UTF-8, or empty.
+        As `read_bytes`; not UTF-8.
     """
     try:
-        if path.is_dir():
-            raise InputError("is a directory, not a file", file=path)
-        if not path.exists():
-            raise InputError("no such file", file=path)
+        return read_bytes(path, largest=largest, remedy=remedy).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", file=path) from None
+
+
+def read_bytes(path: Path, *, largest: float = math.inf, remedy: str = "") -> bytes:
+    """The content of a file.
+
+    Raises
+    ------
+    InputError
+        Missing, a directory, unreadable, larger than ``largest`` bytes, or empty.
+    """
+    try:
         if not path.is_file():
-            raise InputError("is not a regular file", file=path)
+            what = "is a directory, not a file" if path.is_dir() else "is not a regular file"
+            raise InputError(what if path.exists() else "no such file", file=path)
         size = path.stat().st_size
         if size > largest:
             words = f"holds {size} bytes; at most {largest} are read"
             raise InputError(f"{words}; {remedy}" if remedy else words, file=path)
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 text (byte {error.start})", file=path) from None
+        content = path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else None
         raise InputError(f"cannot be read: {reason or error}", file=path) from None
-    if not text.strip():
+    if not content.strip():
         raise InputError("is empty", file=path)
-    return text
+    return content
 
 
 def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any:

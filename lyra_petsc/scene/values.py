@@ -22,6 +22,8 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from lyra_petsc.scene.rules import Condition, holds
 
 Vec3 = tuple[float, float, float]
+Direction = Literal["x", "y", "z"]
+AXES: tuple[Direction, ...] = ("x", "y", "z")
 
 # Largest vertex number that every index type downstream can hold.
 LARGEST_INDEX = 2**31 - 2
@@ -104,6 +106,37 @@ def _reads_as_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def list_of(what: str = "", *, least: int = 0) -> BeforeValidator:
+    """Checks a list of at least so many entries; ``what`` follows the word list in the message."""
+
+    def check(value: Any) -> list[Any]:
+        if not isinstance(value, (list, tuple)) or len(value) < least:
+            block = isinstance(value, dict)
+            hint = "; put '- ' before the entry" if block else f", not {shown(value)}"
+            raise problem(f"must be a list{what}{hint}")
+        return list(value)
+
+    return BeforeValidator(check)
+
+
+def block_of(what: str, *, least: int = 0) -> BeforeValidator:
+    """Checks a block of at least so many keys."""
+
+    def check(value: Any) -> dict[Any, Any]:
+        if not isinstance(value, dict) or len(value) < least:
+            raise problem(f"must be a block of {what}, not {shown(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def axes(value: Any) -> tuple[Any, ...]:
+    """``value`` as a tuple of "x", "y", "z", at least one."""
+    if not isinstance(value, (list, tuple)) or not value or any(axis not in AXES for axis in value):
+        raise problem(f"must be a list of x, y, z, not {shown(value)}")
+    return tuple(value)
 
 
 def _until(value: Any) -> float:
@@ -196,47 +229,43 @@ class Value(JsonSchema):
         return core_schema.no_info_plain_validator_function(self.check)
 
 
-def _real(allowed: str, **bounds: float) -> Value:
-    """A number within bounds, named by their words in JSON Schema; ``allowed`` says them to the user."""
-    schema = FINITE | bounds
-    if "exclusiveMinimum" in bounds:
-        del schema["minimum"]
+def _obeying(schema: Condition, convert: Callable[[Any], Any], *allowed: tuple[Condition, str]) -> Value:
+    """A value whose numbers obey conditions, each with the message for where it does not hold."""
 
-    def check(value: Any) -> float:
-        result = number(value)
-        if not holds(schema, result):
-            raise problem(f"must be {allowed}, not {shown(value)}")
+    def check(value: Any) -> Any:
+        result = convert(value)
+        for condition, message in allowed:
+            if not all(holds(condition, one) for one in (result if isinstance(result, tuple) else [result])):
+                raise problem(message.replace("VALUE", shown(value)))
         return result
 
     return Value(schema, check)
 
 
+def _real(allowed: str, **bounds: float) -> Value:
+    """A number within bounds, named by their words in JSON Schema; ``allowed`` says them to the user."""
+    schema = FINITE | bounds
+    if "exclusiveMinimum" in bounds:
+        del schema["minimum"]
+    return _obeying(schema, number, (bounds, f"must be {allowed}, not VALUE"))
+
+
 def _one_or_three(*allowed: tuple[Condition, str]) -> Value:
-    """A number or three, each obeying conditions that come with the message for where they do not hold."""
     schema = FINITE | allowed[-1][0]
+    return _obeying({"anyOf": [schema, _triple(schema)]}, _number_or_vector, *allowed)
 
-    def check(value: Any) -> float | Vec3:
-        result = vector(value) if isinstance(value, (list, tuple)) else number(value)
-        for condition, message in allowed:
-            if not all(
-                holds(condition, entry) for entry in (result if isinstance(result, tuple) else [result])
-            ):
-                raise problem(message.replace("VALUE", shown(value)))
-        return result
 
-    return Value({"anyOf": [schema, _triple(schema)]}, check)
+def _number_or_vector(value: Any) -> float | Vec3:
+    return vector(value) if isinstance(value, (list, tuple)) else number(value)
 
 
 def _whole(lowest: int, highest: int) -> Value:
-    def check(value: Any) -> int:
-        value = integer(value)
-        if value < lowest:
-            raise problem(f"must be a whole number >= {lowest}, not {shown(value)}")
-        if value > highest:
-            raise problem(f"must be a whole number <= {highest}, not {shown(value)}")
-        return int(value)
-
-    return Value({"type": "integer", "minimum": lowest, "maximum": highest}, check)
+    return _obeying(
+        {"type": "integer", "minimum": lowest, "maximum": highest},
+        integer,
+        ({"minimum": lowest}, f"must be a whole number >= {lowest}, not VALUE"),
+        ({"maximum": highest}, f"must be a whole number <= {highest}, not VALUE"),
+    )
 
 
 def _triple(of: Condition) -> Condition:
@@ -246,6 +275,7 @@ def _triple(of: Condition) -> Condition:
 # what JSON Schema can say of the values; .inf is a number to YAML
 FINITE: Condition = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
 VECTOR = _triple(FINITE)
+ANY_AXES: Condition = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
 _ANY_NAME: Condition = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
 _NONZERO = {"not": {"const": 0}}, "must not be 0"
 _ABOVE_ZERO = {"exclusiveMinimum": 0}, "must be > 0, not VALUE"

@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import html
 import os
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lyra_petsc.errors import LyraError, in_python
+from lyra_petsc.errors import in_python
 from lyra_petsc.extras import require
 from lyra_petsc.output.read_run import StoredRun
 
@@ -20,11 +18,9 @@ if TYPE_CHECKING:
 
     from lyra_petsc.api.runs import OnStep
     from lyra_petsc.api.scenes import SceneLike
-    from lyra_petsc.stepping.simulation import StepReport
 
 SIZE = "640x360"
 """Pixels of pictures and films."""
-REDRAW_SECONDS = 0.3
 TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 
 
@@ -191,74 +187,7 @@ def run(
         The run could not go on; what was written stands.
     """
     from lyra_petsc.api.runs import run as simulate
-    from lyra_petsc.api.scenes import load
 
     with in_python():
-        bar = None
-        if in_notebook() if progress is None else progress:
-            scene = load(scene)
-            bar = NotebookProgress(1.0 if scene.time.static else scene.time.end)
-
-        def step(report: StepReport) -> None:
-            if bar is not None:
-                bar.update(report.step, report.time)
-            if on_step is not None:
-                on_step(report)
-
-        try:
-            options = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
-            done = simulate(scene, out, **options, on_step=step, comm=comm)
-        except (LyraError, KeyboardInterrupt):
-            if bar is not None:
-                bar.end("stopped")
-            raise
-        if bar is not None:
-            bar.end(f"done: {done.folder}")
-        return Run(done.folder)
-
-
-def in_notebook() -> bool:
-    """Whether this is a notebook's kernel (and rank 0 of it)."""
-    ipython = sys.modules.get("IPython")
-    shell = ipython.get_ipython() if ipython is not None else None
-    return type(shell).__name__ == "ZMQInteractiveShell"
-
-
-class NotebookProgress:
-    """A bar below the cell.
-
-    Parameters
-    ----------
-    end : float
-        Time at the end [s], or load factor.
-    """
-
-    def __init__(self, end: float) -> None:
-        self._end, self._words, self._share = end, "set-up and first step", 0.0
-        self._shown = -REDRAW_SECONDS
-        from IPython.display import display
-
-        self._handle = display(self, display_id=True)
-
-    def update(self, step: int, time_reached: float) -> None:
-        """A step was accepted."""
-        self._share = min(time_reached / self._end, 1.0) if self._end > 0.0 else 1.0
-        self._words = f"step {step}, t = {time_reached:.4g} of {self._end:.4g}"
-        if time.monotonic() - self._shown >= REDRAW_SECONDS:
-            self._show()
-
-    def end(self, words: str) -> None:
-        """No step follows."""
-        self._words += f", {words}"
-        self._show()
-
-    def _show(self) -> None:
-        self._shown = time.monotonic()
-        if self._handle is not None:
-            self._handle.update(self)
-
-    def _repr_html_(self) -> str:
-        return f'<progress max="1" value="{self._share:.4f}"></progress> {html.escape(self._words)}'
-
-    def __repr__(self) -> str:
-        return f"{self._share:.0%} {self._words}"
+        how: dict[str, Any] = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
+        return Run(simulate(scene, out, **how, on_step=on_step, comm=comm, progress=progress))

@@ -24,6 +24,8 @@ class ActiveTerms:
     ----------
     elastic, viscous, loads : list of Term
         By kind.
+    following : list of Load
+        Those that follow the shape.
     sheet, constraints, moving, pushing, limiting, near, edged : list of Elastic
         Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
         those of them that work by forces, those that limit the length of Newton's steps, those whose stencils
@@ -38,6 +40,7 @@ class ActiveTerms:
         self.elastic = [term for term in terms if isinstance(term, Elastic)]
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
+        self.following = [load for load in self.loads if load.follows]
         roles = {term: term.registration.role for term in self.elastic}
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]

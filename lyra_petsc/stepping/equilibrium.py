@@ -124,7 +124,7 @@ class Equilibrium:
         # factors tell at once how far the first load would lead
         self._sufficed = ANY if stepper.linear.factors else 0.0
         self._extrapolation = Extrapolation(system.points.comm)
-        self._follows = bool(system.active.viscous) or any(load.follows for load in system.active.loads)
+        self._follows = bool(system.active.viscous or system.active.following)
         system.applied.factor = 0.0
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
@@ -263,7 +263,7 @@ class Equilibrium:
 
     def _known(self, before: float, factor: float) -> FollowingLoads | None:
         """Pressures as they change from the present shape, if there are any."""
-        pressures = [load for load in self._system.active.loads if load.follows]
+        pressures = self._system.active.following
         if not pressures:
             return None
         from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else

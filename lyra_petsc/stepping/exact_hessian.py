@@ -29,8 +29,8 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
             term.add_gradient(np.zeros_like(x), term.freeze(step), against)
             out -= against
 
-    following = [load for load in active.loads if load.follows]
-    loads = FollowingLoads([*following, *active.viscous], system.x, force_of, system.applied.factor)
+    following = [*active.following, *active.viscous]
+    loads = FollowingLoads(following, system.x, force_of, system.applied.factor)
     loads.add_hessian(1.0, rows.pattern, values)
     if len(prescribed.beside.changing):
         rows.constrain(values, prescribed.mask, prescribed.beside)

@@ -55,7 +55,8 @@ class Objective:
         n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.reach
         x, vs = of.evaluate_at(v)
         change = v - of.history
-        parts, square = [0.5 * sigma * float(np.sum(of.mass[:, None] * change * change))], 0.0
+        squares = np.einsum("ij,ij->i", change, change)
+        parts, square = [0.5 * sigma * float(np.vdot(of.mass, squares))], 0.0
         for term in of.active.elastic:
             if not term.n_elements:
                 continue

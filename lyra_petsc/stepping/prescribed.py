@@ -20,10 +20,10 @@ class Prescribed:
         Prescribed unknowns.
     free : (n_owned, 3) bool
         The others.
-    counted : (n_owned, 3) bool
-        Those whose forces a residual is measured by: the same, also while vertices are held.
     at : (m,) int
         Which of all owned unknowns, row by row, are prescribed.
+    not_counted : (k,) int
+        Those whose forces a residual is not measured by: the same, but not while vertices are held.
     goal : (m,)
         Positions [m] of the prescribed unknowns at the end of the step.
     velocity : (m,)
@@ -38,7 +38,7 @@ class Prescribed:
         own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
         own.ravel()[discretisation.layout.padding] = True
         self._set(own)
-        self.counted = self.free
+        self.not_counted = self.at
         self.goal = self.velocity = np.zeros(len(self.at))
 
     def _set(self, own: Mask) -> None:
@@ -79,7 +79,7 @@ class Prescribed:
             own = self.held.mask(t0, t1, layout.n_owned)
             own.ravel()[layout.padding] = True
             self._set(own)
-            self.counted = self.free
+            self.not_counted = self.at
         self.goal = self._positions(t1)
         return changed
 

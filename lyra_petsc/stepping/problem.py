@@ -27,7 +27,8 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.schema import AXES, Scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import AXES
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
 from lyra_petsc.stepping.near_pairs import nearest_pair

@@ -162,9 +162,8 @@ class Examination:
             float(term.energies(x, system.active.frozen[term]).sum()) for term in system.active.elastic
         )
         force = system.applied.now.copy()
-        for load in system.active.loads:
-            if load.follows:
-                force += system.applied.factor * self._change(load, x, len(way))
+        for load in system.active.following:
+            force += system.applied.factor * self._change(load, x, len(way))
         return float(system.points.summed(stored - float(np.vdot(force, way)))[0])
 
     def _change(self, load: Load, x: Array, n: int) -> Array:

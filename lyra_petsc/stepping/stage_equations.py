@@ -757,7 +757,9 @@ class StageEquations:
 
     def _counted(self, name: str, part: Array) -> tuple[str, Array]:
         """A part of F, whose square goes into `largest_force`."""
-        self._squares.append(float(np.einsum("ij,ij,ij", part, part, self.prescribed.counted)))
+        counted = part.copy()
+        np.put(counted, self.prescribed.not_counted, 0.0)
+        self._squares.append(float(np.vdot(counted, counted)))
         return name, part
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:

@@ -33,7 +33,8 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.materials.library import is_isotropic
-from lyra_petsc.scene.schema import AXES, Scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.membrane import Membrane
@@ -123,9 +124,9 @@ class MidEdge(Elastic):
         self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
         rest = data["rest"] if data["rest"].any() else FLAT
-        tilt = tilt_of(data)
-        self._constants = data["stiffness"], rest, tilt, data["limit"], NO_FRICTION
-        self._shapes: Remembered[Array] | None = None
+        self._tilt = tilt_of(data)
+        self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
+        self._shapes: Remembered[tuple[Array, ...]] | None = None
         self._shapes_of: Frames | None = None
         self._at_end: Frames | None = None  # which have followed already
         self._membrane: Membrane | None = None  # of the same triangles
@@ -210,7 +211,7 @@ class MidEdge(Elastic):
         number, sign = edges[chosen], self.elements.data["sign"][chosen]
         y = x + along
         y.ravel()[places] = x.ravel()[places]  # unknowns as they were
-        before, after = self._computed(x, frozen)[number], self._computed(y, frozen)[number]
+        before, after = self._directors(x, frozen)[number], self._directors(y, frozen)[number]
         corners, moved = x[self.stencil[chosen]], way[self.stencil[chosen]]
         angle, normal, square, e = _angles(corners, before[:, :, :3])
         turned, _, left, _ = _angles(y[self.stencil[chosen]], after[:, :, :3])
@@ -220,7 +221,7 @@ class MidEdge(Elastic):
             expected = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
             expected += np.sum(before[:, :, 3:6] * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
             turn = np.remainder(turned - angle + np.pi, 2.0 * np.pi) - np.pi
-        weight = np.minimum(np.minimum(square, left) / self._constants[3][chosen], 1.0)[:, None]
+        weight = np.minimum(np.minimum(square, left) / self._constants[2][chosen], 1.0)[:, None]
         weight = np.where(np.isfinite(turn) & np.isfinite(expected), weight, 0.0)
 
         def mean(values: Array) -> Array:
@@ -237,7 +238,7 @@ class MidEdge(Elastic):
         tangent = self._tangents(x)
         base = some_perpendicular(tangent)
         self.frames = Frames(tangent, base)
-        mean = mean_directors(x, self.stencil, self.of_edges.of_triangles, len(tangent), self._constants[2])
+        mean = mean_directors(x, self.stencil, self.of_edges.of_triangles, len(tangent), self._tilt)
         angle = np.arctan2(np.sum(np.cross(tangent, base) * mean, axis=1), np.sum(base * mean, axis=1))
         return np.asarray(self.of_edges.length * np.nan_to_num(angle))
 
@@ -282,17 +283,25 @@ class MidEdge(Elastic):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def shape(self, x: Array, frames: Frames) -> Array:
-        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 6)."""
+    def bent(self, x: Array, frames: Frames) -> tuple[Array, Array]:
+        """Directors and what goes with them (n, 6), as by ``midedge_shape.directors``, and their tangents
+        (E, 4), as by ``midedge_shape.tangents``.
+        """
         if self._shapes is None or self._shapes_of is not frames:
             self._shapes_of = frames
             self._shapes = Remembered(lambda at: self._computed(at, frames))
-        return self._shapes(x)
+        shape, tangent = self._shapes(x)
+        return shape, tangent
 
     def forget(self) -> None:
         self._shapes = self._shapes_of = None
 
-    def _computed(self, x: Array, frames: Frames) -> Array:
+    def _computed(self, x: Array, frames: Frames) -> tuple[Array, Array]:
+        shape, tangent = self._directors(x, frames), np.empty((self.n_elements, 4))
+        tangents(x, self.stencil, self.of_edges.of_triangles, shape, self._tilt, tangent)
+        return shape, tangent
+
+    def _directors(self, x: Array, frames: Frames) -> Array:
         angle = x.ravel()[self.of_edges.places]
         angle /= self.of_edges.length
         # all at once: NumPy's are several at a time where the processor can
@@ -307,15 +316,14 @@ class MidEdge(Elastic):
     def all_energies(self, x: Array, frozen: Frames, n: int) -> Array:
         """Energy [J] of the first n triangles of this rank, (n,)."""
         out = np.empty(n)
-        edges, shape = self.of_edges.of_triangles, self.shape(x, frozen)
-        midedge_energy.energies(x, self.stencil, edges, shape, *self._constants, out)
+        midedge_energy.energies(self.bent(x, frozen)[1], *self._constants, out)
         return out
 
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
-        data, shape = self.elements.data, self.shape(x, frozen)
+        sign, bent = self.elements.data["sign"], self.bent(x, frozen)
         numbers = self.stencil, self.of_edges.of_triangles, self.edges
         constants = *self._constants, self.of_edges.length
-        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, out)
+        midedge_energy.add_gradient(x, *numbers, sign, *bent, *constants, out)
 
     def add_hessian(
         self,
@@ -327,10 +335,10 @@ class MidEdge(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        data, shape = self.elements.data, self.shape(x, frozen)
-        numbers = self.of_edges.of_triangles, data["sign"], shape
+        sign, bent = self.elements.data["sign"], self.bent(x, frozen)
         constants = *self._constants, self.of_edges.length
         at = offsets[f"{self.name} vertices"], offsets[self.name]
+        numbers = self.of_edges.of_triangles, sign, *bent
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
     def largest_turn(self, way: Array) -> float:
@@ -345,8 +353,7 @@ class MidEdge(Elastic):
 
         The angle of a crease at rest is no curvature.
         """
-        found, tilt = np.empty((self.n_elements, 3)), self._constants[2]
-        tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), tilt, found)
+        found, tilt = self.bent(x, frozen)[1][:, :3].copy(), self._tilt
         if len(tilt):
             smooth = tilt[..., 0] > np.cos(CREASED)
             found[smooth] += tilt[..., 1][smooth] / tilt[..., 0][smooth]

@@ -20,8 +20,8 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
 
-Where ``rest``, T̄, is empty all of it is 0. Angles are those from the rest shape's: ``tilt`` is as for
-``midedge_shape.tangents``. With friction, ``friction`` (E, 2) has for each triangle a factor
+``tangent`` (E, 4) is as of ``midedge_shape.tangents``, ``shape`` as of ``directors``. Where ``rest``, T̄, is
+empty all of it is 0. With friction, ``friction`` (E, 2) has for each triangle a factor
 c and an energy [J]: by the latter the energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact
 Hessian; without, it is empty.
 """
@@ -35,17 +35,21 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_corners, fetch
-from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
+from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
-from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of, turned_back
+from lyra_petsc.terms.midedge_shape import (
+    BATCH,
+    derivatives,
+    fading_tangent,
+    got,
+    load_edges,
+    plain_derivatives,
+    put,
+    row,
+)
 
 AHEAD = 4
 """Triangles by which blocks are fetched before they are added to: each takes longer than other elements."""
-
-BATCH = 16
-"""Triangles that are computed together, several at a time where the processor can, but for those that fade or
-have an angle beyond 45°. Number i of each stands in a row of its own, so that a compiler sees what it may do
-at once: in arrays of elements, looked up by numbers of points, it cannot know that they do not overlap."""
 
 
 @kernel(inline="always")
@@ -92,159 +96,26 @@ def _twice(own, others):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _put(batch, at, i, numbers):  # type: ignore[no-untyped-def]
-    """Rows from ``at`` on of triangle i of a batch become three numbers."""
-    batch[Index(BATCH * at) + i] = numbers[0]
-    batch[Index(BATCH * at + BATCH) + i] = numbers[1]
-    batch[Index(BATCH * at + 2 * BATCH) + i] = numbers[2]
-
-
-@kernel(inline="always")
-def _got(batch, at, i):  # type: ignore[no-untyped-def]
-    return (
-        batch[Index(BATCH * at) + i],
-        batch[Index(BATCH * at + BATCH) + i],
-        batch[Index(BATCH * at + 2 * BATCH) + i],
-    )
+def _more(friction, e):  # type: ignore[no-untyped-def]
+    """Twice the energy that friction adds to that of triangle e."""
+    return 2.0 * friction[e, 1] if friction.shape[0] > 0 else 0.0
 
 
 @kernel()
-def _load(x, stencil, edges, shape, tilt, first, batch):  # type: ignore[no-untyped-def]
-    """Into rows 0 to 26 of a batch e_i, directors, γ_i of triangles from ``first`` on; the last fills it.
-
-    Directors are those that ``turned_back`` makes of them.
-    """
-    last = stencil.shape[0] - 1
-    for number in range(BATCH):
-        e, i = min(first + number, last), Index(number)
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
-        _put(batch, 0, i, e0)
-        _put(batch, 3, i, e1)
-        _put(batch, 6, i, e2)
-        _put(batch, 9, i, turned_back(shape, edges, tilt, e, 0, e0))
-        _put(batch, 12, i, turned_back(shape, edges, tilt, e, 1, e1))
-        _put(batch, 15, i, turned_back(shape, edges, tilt, e, 2, e2))
-        _put(batch, 18, i, row(shape, edges[e, 0], 3))
-        _put(batch, 21, i, row(shape, edges[e, 1], 3))
-        _put(batch, 24, i, row(shape, edges[e, 2], 3))
-
-
-@kernel(inline="always")
-def _plain(d, e, normal):  # type: ignore[no-untyped-def]
-    """``tangent_of`` up to 45°, and whether it is."""
-    height, side = dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
-    t = side / height
-    slope = 1.0 + t * t
-    bend = 2.0 * t * slope
-    return (t, slope, bend, t, slope, bend), abs(side) < height
-
-
-@kernel()
-def _compute_tangents(batch):  # type: ignore[no-untyped-def]
-    """Into rows 27 to 29 of a batch T up to 45°, and into the next |N|², 0 where an angle is beyond."""
-    for number in range(BATCH):
-        i = Index(number)
-        e0, e1, e2 = _got(batch, 0, i), _got(batch, 3, i), _got(batch, 6, i)
-        normal = cross(e1, e2)
-        one, fits0 = _plain(_got(batch, 9, i), e0, normal)
-        two, fits1 = _plain(_got(batch, 12, i), e1, normal)
-        three, fits2 = _plain(_got(batch, 15, i), e2, normal)
-        _put(batch, 27, i, (one[0], two[0], three[0]))
-        batch[Index(BATCH * 30) + i] = dot(normal, normal) if fits0 & fits1 & fits2 else 0.0
-
-
-@kernel()
-def energies(x, stencil, edges, shape, stiffness, rest, tilt, limit, friction, out):  # type: ignore[no-untyped-def]
+def energies(tangent, stiffness, rest, limit, friction, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) triangles; infinite where an edge is too far from its frame."""
-    batch = np.empty(31 * BATCH)
     for e in range(out.shape[0]):
-        i = Index(e % BATCH)
-        if i == 0:
-            _load(x, stencil, edges, shape, tilt, e, batch)
-            _compute_tangents(batch)
-        square = batch[Index(BATCH * 30) + i]
-        k, bar = _six(stiffness, e), _at_rest(rest, e)
-        if square > 0.0 and square >= limit[e]:
-            t0, t1, t2 = _got(batch, 27, i)
-            out[e] = 0.5 * _twice(_own(k, bar, t0, t1, t2), _others(k, bar, t0, t1, t2))
-            if friction.shape[0] > 0:
-                out[e] += friction[e, 1]
-            continue
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+        t0, t1, t2, square = tangent[e, 0], tangent[e, 1], tangent[e, 2], tangent[e, 3]
         if square <= GONE * limit[e]:
             out[e] = 0.0
             continue
-        t0, _, _, s0, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)
-        t1, _, _, s1, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)
-        t2, _, _, s2, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)
-        out[e] = 0.5 * _twice(_own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2))
-        if friction.shape[0] > 0:
-            out[e] += friction[e, 1]
+        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        s0, s1, s2 = fading_tangent(t0), fading_tangent(t1), fading_tangent(t2)
+        out[e] = 0.5 * (_twice(_own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2)) + _more(friction, e))
         if square < limit[e]:
             out[e] *= fade(square, limit[e])[0]
         if not out[e] < np.inf:
             out[e] = np.inf
-
-
-@kernel()
-def add_gradient(  # type: ignore[no-untyped-def]
-    x, stencil, edges, places, sign, shape, stiffness, rest, tilt, limit, friction, length, out
-):
-    """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
-    flat, batch = out.reshape(-1), np.empty(31 * BATCH)
-    for e in range(stencil.shape[0]):
-        at = Index(e % BATCH)
-        if at == 0:
-            _load(x, stencil, edges, shape, tilt, e, batch)
-            _compute_tangents(batch)
-        e0, e1, e2 = _got(batch, 0, at), _got(batch, 3, at), _got(batch, 6, at)
-        normal, square = cross(e1, e2), batch[Index(BATCH * 30) + at]
-        if square > GONE * limit[e]:
-            t0, t1, t2 = s0, s1, s2 = _got(batch, 27, at)
-            a0, a1, a2 = b0, b1, b2 = 1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2
-        else:
-            square = dot(normal, normal)
-            if square <= GONE * limit[e]:
-                continue
-            t0, a0, _, s0, b0, _ = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)
-            t1, a1, _, s1, b1, _ = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)
-            t2, a2, _, s2, b2, _ = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)
-        k, bar = _six(stiffness, e), _at_rest(rest, e)
-        own, others = _own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2)
-        p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
-        if square < limit[e]:
-            weight, slope, _ = fade(square, limit[e])
-            energy = slope * (_twice(own, others) + _more(friction, e))  # 2 · ½
-            p0, p1, p2 = weight * p0, weight * p1, weight * p2
-            for c, edge in ((0, e0), (1, e1), (2, e2)):
-                turned = cross(normal, edge)
-                for i in range(3):
-                    out[stencil[e, c], i] += energy * turned[i]
-        q0, q1, q2 = p0 / math.sqrt(dot(e0, e0)), p1 / math.sqrt(dot(e1, e1)), p2 / math.sqrt(dot(e2, e2))
-        pull = (
-            q0 * e0[0] + q1 * e1[0] + q2 * e2[0],
-            q0 * e0[1] + q1 * e1[1] + q2 * e2[1],
-            q0 * e0[2] + q1 * e1[2] + q2 * e2[2],
-        )
-        n = scaled(1.0 / square, normal)  # over 2A
-        w0, w1, w2 = -dot(e0, pull), -dot(e1, pull), -dot(e2, pull)
-        g0, g1, g2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
-        for i in range(3):
-            r0, r1, r2 = p0 * g0[i], p1 * g1[i], p2 * g2[i]
-            out[stencil[e, 0], i] += w0 * n[i] + r1 - r2
-            out[stencil[e, 1], i] += w1 * n[i] + r2 - r0
-            out[stencil[e, 2], i] += w2 * n[i] + r0 - r1
-        flat[places[e, 0]] += sign[e, 0] * p0 / length[edges[e, 0]]
-        flat[places[e, 1]] += sign[e, 1] * p1 / length[edges[e, 1]]
-        flat[places[e, 2]] += sign[e, 2] * p2 / length[edges[e, 2]]
-
-
-@kernel(inline="always")
-def _more(friction, e):  # type: ignore[no-untyped-def]
-    """Twice the energy that friction adds to that of triangle e."""
-    return 2.0 * friction[e, 1] if friction.shape[0] > 0 else 0.0
 
 
 @kernel(inline="always")
@@ -260,6 +131,125 @@ def _weighted(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
         a * u[1] + b * v[1] + c * w[1],
         a * u[2] + b * v[2] + c * w[2],
     )
+
+
+@kernel(inline="always")
+def _friction(friction, e):  # type: ignore[no-untyped-def]
+    """c of triangle e."""
+    return friction[e, 0] if friction.shape[0] > 0 else 0.0
+
+
+@kernel()
+def _load(  # type: ignore[no-untyped-def]
+    edges, sign, shape, tangent, stiffness, rest, friction, length, first, batch
+):
+    """Into rows 9 to 36 of a batch γ_i, T, K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c."""
+    last = edges.shape[0] - 1
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
+        put(batch, 9, i, row(shape, edges[e, 0], 3))
+        put(batch, 12, i, row(shape, edges[e, 1], 3))
+        put(batch, 15, i, row(shape, edges[e, 2], 3))
+        put(batch, 18, i, row(tangent, e, 0))
+        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        put(batch, 21, i, (k[0], k[1], k[2]))
+        put(batch, 24, i, (k[3], k[4], k[5]))
+        put(batch, 27, i, (bar[0], bar[1], bar[2]))
+        put(batch, 30, i, (bar[3], bar[4], bar[5]))
+        q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
+        put(batch, 33, i, (q0, q1, sign[e, 2] / length[edges[e, 2]]))
+        batch[Index(BATCH * 36) + i] = _friction(friction, e)
+
+
+@kernel(inline="always")
+def _loaded(batch, i):  # type: ignore[no-untyped-def]
+    """What was loaded of triangle i: e_i, N, |N|², T and their derivatives up to 45°, γ_i, K, T̄ with S̄,
+    ∂φ/∂(unknown) times s, friction's c.
+    """
+    e0, e1, e2 = got(batch, 0, i), got(batch, 3, i), got(batch, 6, i)
+    normal = cross(e1, e2)
+    spins, tangent = (got(batch, 9, i), got(batch, 12, i), got(batch, 15, i)), got(batch, 18, i)
+    slopes = plain_derivatives(tangent[0]), plain_derivatives(tangent[1]), plain_derivatives(tangent[2])
+    (k0, k1, k2), (k3, k4, k5) = got(batch, 21, i), got(batch, 24, i)
+    (u0, u1, u2), (u3, u4, u5) = got(batch, 27, i), got(batch, 30, i)
+    k, rest, q = (k0, k1, k2, k3, k4, k5), (u0, u1, u2, u3, u4, u5), got(batch, 33, i)
+    c = batch[Index(BATCH * 36) + i]
+    return e0, e1, e2, normal, dot(normal, normal), tangent, slopes, spins, k, rest, q, c
+
+
+@kernel(inline="always")
+def _pulls(k, rest, tangent, slopes):  # type: ignore[no-untyped-def]
+    """p of a triangle, and what they are made of: as of `_own` and `_others`."""
+    t0, t1, t2 = tangent
+    (a0, _, s0, b0, _), (a1, _, s1, b1, _), (a2, _, s2, b2, _) = slopes
+    own, others = _own(k, rest, t0, t1, t2), _others(k, rest, s0, s1, s2)
+    p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
+    return (p0, p1, p2), own, others
+
+
+@kernel(inline="always")
+def _forces(e0, e1, e2, normal, square, spins, pulls):  # type: ignore[no-untyped-def]
+    """Σ_i p_i ∂α_i of the corners 1 and 2; of all three it is 0."""
+    (p0, p1, p2), (g0, g1, g2) = pulls, spins
+    n = scaled(1.0 / square, normal)  # over 2A
+    q0, q1, q2 = p0 / math.sqrt(dot(e0, e0)), p1 / math.sqrt(dot(e1, e1)), p2 / math.sqrt(dot(e2, e2))
+    pull = _weighted(q0, e0, q1, e1, q2, e2)
+    return (
+        _along(-dot(e1, pull), n, _weighted(p2, g2, -p0, g0, 0.0, g1)),
+        _along(-dot(e2, pull), n, _weighted(p0, g0, -p1, g1, 0.0, g2)),
+    )
+
+
+@kernel()
+def _compute_forces(batch):  # type: ignore[no-untyped-def]
+    """Into rows 37 to 45 of a batch the gradients at the corners 1 and 2 and of the edges' unknowns, as if no
+    angle were beyond 45°.
+    """
+    for number in range(BATCH):
+        i = Index(number)
+        e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, q, _ = _loaded(batch, i)
+        pulls, _, _ = _pulls(k, rest, tangent, slopes)
+        one, two = _forces(e0, e1, e2, normal, square, spins, pulls)
+        put(batch, 37, i, one)
+        put(batch, 40, i, two)
+        put(batch, 43, i, (q[0] * pulls[0], q[1] * pulls[1], q[2] * pulls[2]))
+
+
+@kernel()
+def add_gradient(  # type: ignore[no-untyped-def]
+    x, stencil, edges, places, sign, shape, tangent, stiffness, rest, limit, friction, length, out
+):
+    """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
+    flat, batch = out.reshape(-1), np.empty(46 * BATCH)
+    for e in range(stencil.shape[0]):
+        i = Index(e % BATCH)
+        if i == 0:
+            load_edges(x, stencil, e, batch)
+            _load(edges, sign, shape, tangent, stiffness, rest, friction, length, e, batch)
+            _compute_forces(batch)
+        t0, t1, t2, square = tangent[e, 0], tangent[e, 1], tangent[e, 2], tangent[e, 3]
+        if max(abs(t0), abs(t1), abs(t2)) < 1.0 and square >= limit[e]:
+            one, two, moments = got(batch, 37, i), got(batch, 40, i), got(batch, 43, i)
+        else:
+            if square <= GONE * limit[e]:
+                continue
+            slopes = derivatives(t0), derivatives(t1), derivatives(t2)
+            e0, e1, e2, normal, _, _, _, spins, k, bar, q, _ = _loaded(batch, i)
+            (p0, p1, p2), own, others = _pulls(k, bar, (t0, t1, t2), slopes)
+            weight, slope = 1.0, 0.0
+            if square < limit[e]:
+                weight, slope, _ = fade(square, limit[e])
+                slope *= _twice(own, others) + _more(friction, e)  # 2 · ½
+            p0, p1, p2 = weight * p0, weight * p1, weight * p2
+            one, two = _forces(e0, e1, e2, normal, square, spins, (p0, p1, p2))
+            one = _along(slope, cross(normal, e1), one)
+            two = _along(slope, cross(normal, e2), two)
+            moments = q[0] * p0, q[1] * p1, q[2] * p2
+        for j in range(3):
+            out[stencil[e, 0], j] -= one[j] + two[j]
+            out[stencil[e, 1], j] += one[j]
+            out[stencil[e, 2], j] += two[j]
+            flat[places[e, j]] += moments[j]
 
 
 @kernel(inline="always")
@@ -401,18 +391,17 @@ def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _hessian(e0, e1, e2, normal, square, tangents, spins, k, rest, sliding, q, exact):  # type: ignore[no-untyped-def]
+def _hessian(e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, sliding, q, exact):  # type: ignore[no-untyped-def]
     """Of one triangle: blocks of the corners 11, 12, 22, couplings of the corners 1 and 2 with the edges,
     those of edges with edges; and what `_faded` is made of.
 
-    Of its edges and normal, of tangents as by ``tangent_of``, γ, K, T̄ with S̄, and friction's c; q is
+    Of its edges and normal, of T and their ``derivatives``, γ, K, T̄ with S̄, and friction's c; q is
     ∂φ/∂(unknown) times s.
     """
     inverse = 1.0 / math.sqrt(square)  # 1 / 2A
     n = scaled(inverse, normal)
-    (t0, a0, c0, s0, b0, d0), (t1, a1, c1, s1, b1, d1), (t2, a2, c2, s2, b2, d2) = tangents
-    own, others = _own(k, rest, t0, t1, t2), _others(k, rest, s0, s1, s2)
-    p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
+    (a0, c0, _, b0, d0), (a1, c1, _, b1, d1), (a2, c2, _, b2, d2) = slopes
+    (p0, p1, p2), own, others = _pulls(k, rest, tangent, slopes)
     # ∇α_i
     s00, s11, s22 = dot(e0, e0), dot(e1, e1), dot(e2, e2)
     s01, s02, s12 = dot(e0, e1), dot(e0, e2), dot(e1, e2)
@@ -467,70 +456,37 @@ def _hessian(e0, e1, e2, normal, square, tangents, spins, k, rest, sliding, q, e
 
 @kernel(inline="always")
 def _put_nine(batch, at, i, numbers):  # type: ignore[no-untyped-def]
-    _put(batch, at, i, (numbers[0], numbers[1], numbers[2]))
-    _put(batch, at + 3, i, (numbers[3], numbers[4], numbers[5]))
-    _put(batch, at + 6, i, (numbers[6], numbers[7], numbers[8]))
+    put(batch, at, i, (numbers[0], numbers[1], numbers[2]))
+    put(batch, at + 3, i, (numbers[3], numbers[4], numbers[5]))
+    put(batch, at + 6, i, (numbers[6], numbers[7], numbers[8]))
 
 
 @kernel(inline="always")
 def _got_nine(batch, at, i):  # type: ignore[no-untyped-def]
-    a, b, c = _got(batch, at, i), _got(batch, at + 3, i), _got(batch, at + 6, i)
+    a, b, c = got(batch, at, i), got(batch, at + 3, i), got(batch, at + 6, i)
     return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
-
-
-@kernel(inline="always")
-def _friction(friction, e):  # type: ignore[no-untyped-def]
-    """c of triangle e."""
-    return friction[e, 0] if friction.shape[0] > 0 else 0.0
-
-
-@kernel()
-def _load_constants(edges, sign, stiffness, rest, friction, length, first, batch):  # type: ignore[no-untyped-def]
-    """Into rows 27 to 42 of a batch K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c."""
-    last = edges.shape[0] - 1
-    for number in range(BATCH):
-        e, i = min(first + number, last), Index(number)
-        k, bar = _six(stiffness, e), _at_rest(rest, e)
-        _put(batch, 27, i, (k[0], k[1], k[2]))
-        _put(batch, 30, i, (k[3], k[4], k[5]))
-        _put(batch, 33, i, (bar[0], bar[1], bar[2]))
-        _put(batch, 36, i, (bar[3], bar[4], bar[5]))
-        q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
-        _put(batch, 39, i, (q0, q1, sign[e, 2] / length[edges[e, 2]]))
-        batch[Index(BATCH * 42) + i] = _friction(friction, e)
 
 
 @kernel()
 def _compute(exact, batch):  # type: ignore[no-untyped-def]
-    """The Hessians of a batch, several at a time, where no angle is beyond 45°; |n|², or 0 elsewhere."""
+    """The Hessians of a batch, several at a time, as if no angle were beyond 45°."""
     for number in range(BATCH):
         i = Index(number)
-        e0, e1, e2 = _got(batch, 0, i), _got(batch, 3, i), _got(batch, 6, i)
-        normal = cross(e1, e2)
-        square = dot(normal, normal)
-        one, fits0 = _plain(_got(batch, 9, i), e0, normal)
-        two, fits1 = _plain(_got(batch, 12, i), e1, normal)
-        three, fits2 = _plain(_got(batch, 15, i), e2, normal)
-        spins = _got(batch, 18, i), _got(batch, 21, i), _got(batch, 24, i)
-        (k0, k1, k2), (k3, k4, k5) = _got(batch, 27, i), _got(batch, 30, i)
-        (u0, u1, u2), (u3, u4, u5) = _got(batch, 33, i), _got(batch, 36, i)
-        k, rest, q = (k0, k1, k2, k3, k4, k5), (u0, u1, u2, u3, u4, u5), _got(batch, 39, i)
-        c = batch[Index(BATCH * 42) + i]
+        e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, q, c = _loaded(batch, i)
         (blocks, first, second, numbers), _ = _hessian(
-            e0, e1, e2, normal, square, (one, two, three), spins, k, rest, c, q, exact
+            e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, c, q, exact
         )
-        _put_nine(batch, 43, i, blocks[0])
-        _put_nine(batch, 52, i, blocks[1])
-        _put_nine(batch, 61, i, blocks[2])
-        _put(batch, 70, i, first[0])
-        _put(batch, 73, i, first[1])
-        _put(batch, 76, i, first[2])
-        _put(batch, 79, i, second[0])
-        _put(batch, 82, i, second[1])
-        _put(batch, 85, i, second[2])
-        _put(batch, 88, i, (numbers[0], numbers[1], numbers[2]))
-        _put(batch, 91, i, (numbers[3], numbers[4], numbers[5]))
-        batch[Index(BATCH * 94) + i] = square if fits0 & fits1 & fits2 else 0.0
+        _put_nine(batch, 37, i, blocks[0])
+        _put_nine(batch, 46, i, blocks[1])
+        _put_nine(batch, 55, i, blocks[2])
+        put(batch, 64, i, first[0])
+        put(batch, 67, i, first[1])
+        put(batch, 70, i, first[2])
+        put(batch, 73, i, second[0])
+        put(batch, 76, i, second[1])
+        put(batch, 79, i, second[2])
+        put(batch, 82, i, (numbers[0], numbers[1], numbers[2]))
+        put(batch, 85, i, (numbers[3], numbers[4], numbers[5]))
 
 
 @kernel()
@@ -541,9 +497,9 @@ def add_hessian(  # type: ignore[no-untyped-def]
     edges,
     sign,
     shape,
+    tangent,
     stiffness,
     rest,
-    tilt,
     limit,
     friction,
     length,
@@ -557,39 +513,32 @@ def add_hessian(  # type: ignore[no-untyped-def]
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
-    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.empty(95 * BATCH)
+    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.empty(88 * BATCH)
     for e in range(stencil.shape[0]):
         _fetch_ahead(e, corners, offsets, values)
         i = Index(e % BATCH)
         if i == 0:
-            _load(x, stencil, edges, shape, tilt, e, batch)
-            _load_constants(edges, sign, stiffness, rest, friction, length, e, batch)
+            load_edges(x, stencil, e, batch)
+            _load(edges, sign, shape, tangent, stiffness, rest, friction, length, e, batch)
             _compute(exact, batch)
-        square = batch[Index(BATCH * 94) + i]
-        if square > 0.0 and square >= limit[e]:
-            b11, b12, b22 = _got_nine(batch, 43, i), _got_nine(batch, 52, i), _got_nine(batch, 61, i)
-            one = _got(batch, 70, i), _got(batch, 73, i), _got(batch, 76, i)
-            two = _got(batch, 79, i), _got(batch, 82, i), _got(batch, 85, i)
-            h00, h01, h02 = _got(batch, 88, i)
-            h11, h12, h22 = _got(batch, 91, i)
+        t0, t1, t2, square = tangent[e, 0], tangent[e, 1], tangent[e, 2], tangent[e, 3]
+        if max(abs(t0), abs(t1), abs(t2)) < 1.0 and square >= limit[e]:
+            b11, b12, b22 = _got_nine(batch, 37, i), _got_nine(batch, 46, i), _got_nine(batch, 55, i)
+            one = got(batch, 64, i), got(batch, 67, i), got(batch, 70, i)
+            two = got(batch, 73, i), got(batch, 76, i), got(batch, 79, i)
+            h00, h01, h02 = got(batch, 82, i)
+            h11, h12, h22 = got(batch, 85, i)
         else:
-            x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-            e0, e1, e2, normal, square = edges_of(x0, x1, x2)
             if square <= GONE * limit[e]:
                 continue
-            tangents = (
-                tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal),
-                tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal),
-                tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal),
-            )
-            spins = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
-            k, bar, q = _six(stiffness, e), _at_rest(rest, e), _got(batch, 39, i)
-            c = _friction(friction, e)
+            slopes = derivatives(t0), derivatives(t1), derivatives(t2)
+            e0, e1, e2, normal, _, _, _, spins, k, bar, q, c = _loaded(batch, i)
             hessian, (energy, pulls, g1, g2) = _hessian(
-                e0, e1, e2, normal, square, tangents, spins, k, bar, c, q, exact
+                e0, e1, e2, normal, square, (t0, t1, t2), slopes, spins, k, bar, c, q, exact
             )
             if square < limit[e]:
                 energy += 0.5 * _more(friction, e)
+                x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
                 hessian = _faded(
                     x0, x1, x2, normal, square, limit[e], energy, exact, pulls, g1, g2, q, hessian
                 )

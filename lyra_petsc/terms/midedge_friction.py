@@ -42,10 +42,13 @@ class Sliding(NamedTuple):
         r_y/r where they slide, else 1.
     friction : (E, 2)
         As ``midedge_energy`` takes it.
+    tangent : (E, 4)
+        As of ``midedge_shape.tangents``.
     """
 
     part: Array
     friction: Array
+    tangent: Array
 
 
 class MidEdgeFriction(Elastic):
@@ -92,35 +95,32 @@ class MidEdgeFriction(Elastic):
         return Sliding(*self._slides(x))
 
     def _computed(self, x: Array, frames: Frames) -> Sliding:
-        half, data = np.empty(self.n_elements), self.elements.data
-        constants = data["stiffness"], self.bent, self._tilt, np.zeros(self.n_elements), NO_FRICTION
-        shape = self._sheet.shape(x, frames)
-        midedge_energy.energies(x, self.stencil, self._edges, shape, *constants, half)
+        half, data, tangent = np.empty(self.n_elements), self.elements.data, np.empty((self.n_elements, 4))
+        tangents(x, self.stencil, self._edges, self._sheet.bent(x, frames)[0], self._tilt, tangent)
+        constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
+        midedge_energy.energies(tangent, *constants, half)
         reach, size = data["reach"], np.sqrt(2.0 * np.maximum(half, 0.0))
         far = np.maximum(size, reach)  # those that stick have no more than their form
         more = np.where(size > reach, 0.5 * reach * (far - reach), 0.0)
         bend = np.where(size > reach, -1.0 / (reach * far), 0.0)
-        return Sliding(reach / far, np.column_stack([bend, more]))
+        return Sliding(reach / far, np.column_stack([bend, more]), tangent)
 
     def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
+        """Tangents of directors, and K, T̄, limits and friction."""
         data = self.elements.data
         stiffness = data["stiffness"] * sliding.part[:, None]
-        return stiffness, self.bent, self._tilt, data["limit"], sliding.friction
+        return sliding.tangent, stiffness, self.bent, data["limit"], sliding.friction
 
     def energies(self, x: Array, frozen: Frames) -> Array:
-        out, shape = np.empty(self.n_owned), self._sheet.shape(x, frozen)
-        constants = self._constants(self._sliding(x, frozen))
-        midedge_energy.energies(x, self.stencil, self._edges, shape, *constants, out)
+        out = np.empty(self.n_owned)
+        midedge_energy.energies(*self._constants(self._sliding(x, frozen)), out)
         return out
 
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
-        data, shape = self.elements.data, self._sheet.shape(x, frozen)
-        numbers, constants = (
-            (self.stencil, self._edges, self.edges),
-            self._constants(self._sliding(x, frozen)),
-        )
-        length = self._sheet.of_edges.length
-        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, length, out)
+        sign, shape = self.elements.data["sign"], self._sheet.bent(x, frozen)[0]
+        numbers, length = (self.stencil, self._edges, self.edges), self._sheet.of_edges.length
+        constants = *self._constants(self._sliding(x, frozen)), length
+        midedge_energy.add_gradient(x, *numbers, sign, shape, *constants, out)
 
     def add_hessian(
         self,
@@ -132,10 +132,9 @@ class MidEdgeFriction(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        data, shape = self.elements.data, self._sheet.shape(x, frozen)
-        length = self._sheet.of_edges.length
-        constants = *self._constants(self._sliding(x, frozen)), length
-        numbers = self._edges, data["sign"], shape
+        sign, shape = self.elements.data["sign"], self._sheet.bent(x, frozen)[0]
+        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
+        numbers = self._edges, sign, shape
         at = offsets[f"{self.name} vertices"], offsets[self.name]
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
@@ -150,8 +149,8 @@ class MidEdgeFriction(Elastic):
 
     def _bent_at(self, x: Array, frames: Frames) -> Array:
         """What ``bent`` is to be where the step ends at x."""
-        found, part = np.empty((self.n_elements, 3)), self._sliding(x, frames).part[:, None]
-        tangents(x, self.stencil, self._edges, self._sheet.shape(x, frames), self._tilt, found)
+        sliding = self._sliding(x, frames)
+        found, part = sliding.tangent[:, :3], sliding.part[:, None]
         return np.where((part < 1.0) & np.isfinite(found), found - part * (found - self.bent), self.bent)
 
     def _become(self, bent: Array) -> None:

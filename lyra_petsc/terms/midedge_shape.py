@@ -39,6 +39,11 @@ LEFT = 0.75 * math.pi
 QUADRATIC, CUBIC = -(3.0 + 4.0 * LEFT) / LEFT**2, (2.0 + 2.0 * LEFT) / LEFT**3
 """Of S as a polynomial of the angle beyond 45°, which ends at 180° with its derivative."""
 
+BATCH = 16
+"""Triangles that are computed together, several at a time where the processor can, but for those that fade or
+have an angle beyond 45°. Number i of each stands in a row of its own, so that a compiler sees what it may do
+at once: in arrays of elements, looked up by numbers of points, it cannot know that they do not overlap."""
+
 FARTHEST = -0.8
 """Cosine of the angle by which an edge may turn from its frame: at −1 there is no smallest rotation."""
 
@@ -172,36 +177,48 @@ def edges_of(x0, x1, x2):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
-    """The director of edge i of triangle e, turned about the edge by −ᾱ."""
-    d = row(shape, edges[e, i], 0)
-    if tilt.shape[0] == 0:
-        return d
-    side, c, s = cross(edge, d), tilt[e, i, 0], -tilt[e, i, 1] / math.sqrt(dot(edge, edge))
-    return c * d[0] + s * side[0], c * d[1] + s * side[1], c * d[2] + s * side[2]
+def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
+    """T at α of a director on an edge of a triangle with this normal N; NaN without one of them."""
+    height, side = _height_and_side(d, e, normal)
+    if abs(side) < height:
+        return side / height
+    return _beyond(side, height)
 
 
 @kernel(inline="always")
-def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
-    """T, T', T'', S, S', S'' at α of a director on an edge of a triangle with this normal N."""
-    height, side = dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
-    if abs(side) < height:
-        t = side / height
-        slope = 1.0 + t * t
-        bend = 2.0 * t * slope
-        return t, slope, bend, t, slope, bend
-    return _beyond(side, height)
+def _height_and_side(d, e, normal):  # type: ignore[no-untyped-def]
+    return dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
 
 
 @kernel()
 def _beyond(side, height):  # type: ignore[no-untyped-def]
-    """The same beyond 45°; NaN without a director or a normal."""
+    """T beyond 45°."""
     if side == 0.0 and height == 0.0:
-        return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
-    sign = math.copysign(1.0, side)
-    x = math.atan2(abs(side), height) - 0.25 * math.pi
+        return np.nan
+    return math.copysign(1.0 + 2.0 * (math.atan2(abs(side), height) - 0.25 * math.pi), side)
+
+
+@kernel(inline="always")
+def derivatives(t):  # type: ignore[no-untyped-def]
+    """T', T'', S, S', S'' at the angle at which T is t."""
+    if abs(t) < 1.0:
+        return plain_derivatives(t)
+    return _derivatives_beyond(t)
+
+
+@kernel(inline="always")
+def plain_derivatives(t):  # type: ignore[no-untyped-def]
+    """The same up to 45°."""
+    slope = 1.0 + t * t
+    bend = 2.0 * t * slope
+    return slope, bend, t, slope, bend
+
+
+@kernel()
+def _derivatives_beyond(t):  # type: ignore[no-untyped-def]
+    x = 0.5 * (abs(t) - 1.0)
     slope, bend = 2.0 + x * (2.0 * QUADRATIC + x * 3.0 * CUBIC), 2.0 * QUADRATIC + 6.0 * CUBIC * x
-    return sign * (1.0 + 2.0 * x), 2.0, 0.0, sign * _fading(x), slope, sign * bend
+    return 2.0, 0.0, math.copysign(_fading(x), t), slope, math.copysign(1.0, t) * bend
 
 
 @kernel(inline="always")
@@ -225,15 +242,96 @@ def tangents_at(angle: Array) -> Array:
     return np.copysign(np.where(size < 0.25 * np.pi, np.tan(size), beyond), angle)
 
 
+@kernel(inline="always")
+def put(batch, at, i, numbers):  # type: ignore[no-untyped-def]
+    """Rows from ``at`` on of triangle i of a batch become three numbers."""
+    batch[Index(BATCH * at) + i] = numbers[0]
+    batch[Index(BATCH * at + BATCH) + i] = numbers[1]
+    batch[Index(BATCH * at + 2 * BATCH) + i] = numbers[2]
+
+
+@kernel(inline="always")
+def got(batch, at, i):  # type: ignore[no-untyped-def]
+    """Three numbers of triangle i of a batch, in rows from ``at`` on."""
+    return (
+        batch[Index(BATCH * at) + i],
+        batch[Index(BATCH * at + BATCH) + i],
+        batch[Index(BATCH * at + 2 * BATCH) + i],
+    )
+
+
+@kernel()
+def load_edges(x, stencil, first, batch):  # type: ignore[no-untyped-def]
+    """Into rows 0 to 8 of a batch e_i of triangles from ``first`` on; the last fills it."""
+    last = stencil.shape[0] - 1
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        put(batch, 0, i, minus(x2, x1))
+        put(batch, 3, i, minus(x0, x2))
+        put(batch, 6, i, minus(x1, x0))
+
+
+@kernel(inline="always")
+def _turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
+    """The director of edge i of triangle e, turned about the edge by −ᾱ."""
+    d = row(shape, edges[e, i], 0)
+    if tilt.shape[0] == 0:
+        return d
+    side, c, s = cross(edge, d), tilt[e, i, 0], -tilt[e, i, 1] / math.sqrt(dot(edge, edge))
+    return c * d[0] + s * side[0], c * d[1] + s * side[1], c * d[2] + s * side[2]
+
+
+@kernel()
+def _load_directors(edges, shape, tilt, first, batch):  # type: ignore[no-untyped-def]
+    """Into rows 9 to 17 of a batch the directors of the edges in rows 0 to 8."""
+    last = edges.shape[0] - 1
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
+        put(batch, 9, i, _turned_back(shape, edges, tilt, e, 0, got(batch, 0, i)))
+        put(batch, 12, i, _turned_back(shape, edges, tilt, e, 1, got(batch, 3, i)))
+        put(batch, 15, i, _turned_back(shape, edges, tilt, e, 2, got(batch, 6, i)))
+
+
+@kernel(inline="always")
+def _plain_tangent(d, e, normal):  # type: ignore[no-untyped-def]
+    """T up to 45°, else 2."""
+    height, side = _height_and_side(d, e, normal)
+    return side / height if abs(side) < height else 2.0
+
+
+@kernel()
+def _compute_tangents(batch):  # type: ignore[no-untyped-def]
+    """Into rows 18 to 20 of a batch T, or 2 beyond 45°, and into row 21 |N|²."""
+    for number in range(BATCH):
+        i = Index(number)
+        e0, e1, e2 = got(batch, 0, i), got(batch, 3, i), got(batch, 6, i)
+        normal = cross(e1, e2)
+        one = _plain_tangent(got(batch, 9, i), e0, normal)
+        two = _plain_tangent(got(batch, 12, i), e1, normal)
+        three = _plain_tangent(got(batch, 15, i), e2, normal)
+        put(batch, 18, i, (one, two, three))
+        batch[Index(BATCH * 21) + i] = dot(normal, normal)
+
+
 @kernel()
 def tangents(x, stencil, edges, shape, tilt, out):  # type: ignore[no-untyped-def]
-    """T of triangles (E, 3) into out (E, 3), of α_i − ᾱ_i by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
+    """T of triangles (E, 3) and |N|² into out (E, 4), of α_i − ᾱ_i by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
 
     It may be empty, as those of sheets that are flat at rest.
     """
-    for e in range(stencil.shape[0]):
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        e0, e1, e2, normal, _ = edges_of(x0, x1, x2)
-        out[e, 0] = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)[0]
-        out[e, 1] = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)[0]
-        out[e, 2] = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)[0]
+    batch = np.empty(22 * BATCH)
+    for e in range(out.shape[0]):
+        i = Index(e % BATCH)
+        if i == 0:
+            load_edges(x, stencil, e, batch)
+            _load_directors(edges, shape, tilt, e, batch)
+            _compute_tangents(batch)
+        t0, t1, t2 = got(batch, 18, i)
+        if not max(t0, t1, t2) < 2.0:
+            e0, e1, e2 = got(batch, 0, i), got(batch, 3, i), got(batch, 6, i)
+            normal = cross(e1, e2)
+            t0 = tangent_of(got(batch, 9, i), e0, normal)
+            t1 = tangent_of(got(batch, 12, i), e1, normal)
+            t2 = tangent_of(got(batch, 15, i), e2, normal)
+        out[e, 0], out[e, 1], out[e, 2], out[e, 3] = t0, t1, t2, batch[Index(BATCH * 21) + i]

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import measures
-from cases import BENDING_MESHES, PLAIN_MESHES
+from cases import BENDING_MESHES, METHODS, PLAIN_MESHES, square_number
 from peers import parse
 from processes import WORKER, Failed, Limits
-from tables import document
+from tables import document, growth
 
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
@@ -171,32 +171,23 @@ class Bench:
         replace_text(self._folder / "bench.md", document(self.results))
 
     def go(self) -> None:
-        asked, results = self._asked, self.results
-        self._warm_up()
+        asked = self._asked
+        few = Limits(1, 1.0, 600.0)
+        for plain, method in itertools.product(self._plain, METHODS):  # no row pays for compiling
+            self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few, plain)
         for vertices in asked.vertices:
-            for method in measures.METHODS:
-                for ranks in asked.ranks:
-                    self._add("rows", self._row(vertices, method, ranks))
-                    if asked.plain:
-                        self._add("rows", self._row(vertices, method, ranks, plain=self._plain))
+            for method, ranks, plain in itertools.product(METHODS, asked.ranks, self._plain):
+                self._add("rows", self._row(vertices, method, ranks, plain=plain))
             for name, command in asked.peers:
-                self._peer(vertices, name, command)
+                what, given = f"{vertices} vertices, peer {name}", (name, command, vertices)
+                self._measure("rows", what, measures.peer_row, *given, self._folder, asked.limits)
         self._growth()
         if asked.presets is not None:
             self._presets()
-        if asked.bending is not None:
-            self._bending()
-        if asked.against is not None:
-            self._against()
-        if asked.contact:
-            self._contact()
+        self._beside()
         if not asked.only_rows:
-            self._meshes()
-            self._weak()
-            self._apart()
+            self._scaling()
             self._rest()
-        for row in results["rows"]:
-            results["versions"] |= row.get("versions", {})
         self.save()
 
     def _add(self, where: str, found: Any) -> None:
@@ -205,93 +196,66 @@ class Bench:
             self.results["versions"] |= found.get("versions", {})
             self.save()
 
+    def _measure(self, where: str, what: str, work: Callable[..., Any], *given: Any) -> None:
+        self._add(where, self._attempt(what, work, *given))
+
     @property
-    def _plain(self) -> str:
-        """A folder for the kernels in plain numba."""
-        return str((self._folder / "plain").resolve())
+    def _plain(self) -> Sequence[str]:
+        """Folders for the kernels: the usual one, and that of plain numba where it is asked for."""
+        return ["", str((self._folder / "plain").resolve())] if self._asked.plain else [""]
 
-    def _warm_up(self) -> None:
-        """Fill numba's cache, that no row pays for compiling."""
-        few = Limits(1, 1.0, 600.0)
-        for plain in ("", self._plain) if self._asked.plain else ("",):
-            for method in measures.METHODS:
-                self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few, plain)
+    def _beside(self) -> None:
+        """Bending models, this program and another checkout's, contact: what was asked for of them."""
+        asked, petsc, folder, limits = self._asked, self._petsc, self._folder, self._asked.limits
+        methods, each = METHODS, itertools.product
+        for kind, method, ranks, n in each(asked.bending or (), methods, asked.ranks, asked.vertices):
+            what = f"{n} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
+            self._measure("bending", what, measures.bending, kind, n, method, ranks, petsc, folder, limits)
+        for ranks, n, kind, method in each(asked.ranks, asked.vertices, PLAIN_MESHES, methods):
+            if asked.against is not None:
+                what = f"{n} vertices, {kind}, {method}, {ranks} rank(s), here and in {asked.against}"
+                given = kind, n, method, ranks, petsc, folder, limits, asked.against
+                self._measure("against", what, measures.against, *given)
+        for n, ranks in each(asked.vertices, asked.ranks) if asked.contact else ():
+            given = n, ranks, petsc, limits, asked.settle, asked.scenes
+            self._measure("contact", f"{n} vertices in contact, {ranks} rank(s)", measures.contact, *given)
 
-    def _peer(self, vertices: int, name: str, command: str) -> None:
-        what, given = f"{vertices} vertices, peer {name}", (name, command, vertices)
-        self._add("rows", self._attempt(what, measures.peer_row, *given, self._folder, self._asked.limits))
-
-    def _meshes(self) -> None:
-        asked = self._asked
-        for vertices in asked.vertices:
-            what = f"{vertices} vertices, other meshes, {asked.ranks[0]} rank(s)"
-            given = vertices, asked.ranks[0], self._petsc, self._folder, asked.limits
-            self._add("meshes", self._attempt(what, measures.meshes, *given))
-
-    def _bending(self) -> None:
-        asked = self._asked
-        for kind, method, ranks, vertices in itertools.product(
-            asked.bending, measures.METHODS, asked.ranks, asked.vertices
-        ):
-            what = f"{vertices} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
-            given = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits
-            self._add("bending", self._attempt(what, measures.bending, *given))
-
-    def _against(self) -> None:
-        asked = self._asked
-        for ranks, vertices, kind, method in itertools.product(
-            asked.ranks, asked.vertices, PLAIN_MESHES, measures.METHODS
-        ):
-            what = f"{vertices} vertices, {kind}, {method}, {ranks} rank(s), here and in {asked.against}"
-            given = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits, asked.against
-            self._add("against", self._attempt(what, measures.against, *given))
-
-    def _contact(self) -> None:
-        asked = self._asked
-        for vertices, ranks in itertools.product(asked.vertices, asked.ranks):
-            what = f"{vertices} vertices in contact, {ranks} rank(s)"
-            given = vertices, ranks, self._petsc, asked.limits, asked.settle, asked.scenes
-            self._add("contact", self._attempt(what, measures.contact, *given))
+    def _scaling(self) -> None:
+        """Other meshes, weak scaling, sheets at once."""
+        asked, petsc, limits = self._asked, self._petsc, self._asked.limits
+        first, most = asked.ranks[0], max(asked.vertices)
+        for n in asked.vertices:
+            what = f"{n} vertices, other meshes, {first} rank(s)"
+            self._measure("meshes", what, measures.meshes, n, first, petsc, self._folder, limits)
+        for ranks in asked.ranks if asked.weak else []:
+            self._add("weak", self._row(ranks * asked.weak, METHODS[0], ranks))
+        for ranks in (ranks for ranks in asked.ranks if ranks > 1):
+            what = f"{ranks} sheets of {most // ranks} vertices at once"
+            self._measure("apart", what, measures.apart, most, ranks, petsc, limits)
 
     def _growth(self) -> None:
         known = measures.first_method(self.results["rows"])
         rows = list(known)
         for vertices in self._asked.growth:
-            if measures.square_number(vertices) in [row["vertices"] for row in known]:
+            if square_number(vertices) in [row["vertices"] for row in known]:
                 continue
-            found = self._row(vertices, measures.METHODS[0], 1)
+            found = self._row(vertices, METHODS[0], 1)
             self._add("growth_rows", found)
             rows += [found] if found else []
-            self.results["growth"] = measures.growth(rows)
-        self.results["growth"] = measures.growth(rows)
+            self.results["growth"] = growth(rows)
+        self.results["growth"] = growth(rows)
         self.save()
 
-    def _weak(self) -> None:
-        asked = self._asked
-        for ranks in asked.ranks if asked.weak else []:
-            self._add("weak", self._row(ranks * asked.weak, measures.METHODS[0], ranks))
-
-    def _apart(self) -> None:
-        asked = self._asked
-        vertices = max(asked.vertices)
-        for ranks in (ranks for ranks in asked.ranks if ranks > 1):
-            what = f"{ranks} sheets of {vertices // ranks} vertices at once"
-            self._add(
-                "apart", self._attempt(what, measures.apart, vertices, ranks, self._petsc, asked.limits)
-            )
-
     def _presets(self) -> None:
-        for name in self._asked.presets:
-            for title, changes in measures.PROBLEM_CLASSES.items():
-                for vertices in self._asked.vertices:
-                    failures = len(self.results["failures"])
-                    found = self._row(
-                        vertices, measures.METHODS[0], 1, measures.preset_options(name), **changes
-                    )
-                    if found is None:
-                        failed = self.results["failures"][failures].rpartition(": ")[2]
-                        found = {"vertices": measures.square_number(vertices), "problem": failed}
-                    self._add("presets", found | {"preset": name, "problem_class": title})
+        asked = self._asked
+        classes = measures.PROBLEM_CLASSES
+        for name, title, vertices in itertools.product(asked.presets, classes, asked.vertices):
+            failures = len(self.results["failures"])
+            found = self._row(vertices, METHODS[0], 1, measures.preset_options(name), **classes[title])
+            if found is None:
+                failed = self.results["failures"][failures].rpartition(": ")[2]
+                found = {"vertices": square_number(vertices), "problem": failed}
+            self._add("presets", found | {"preset": name, "problem_class": title})
 
     def _rest(self) -> None:
         asked, folder, petsc, limits = self._asked, self._folder, self._petsc, self._asked.limits

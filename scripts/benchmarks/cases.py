@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+from lyra_petsc.experiments.meshes import rectangle_script
+
 CLOTH = "gray-interlock"
 DAMPING = 0.03  # s
 GRAVITY = [0.0, 0.0, -9.81]  # m/s²
@@ -94,16 +96,7 @@ def square_script(vertices: int, ratio: float) -> str:
     # of equilateral triangles of edge h there is a vertex for each √3/2 h²; h grows with the height
     lower = math.sqrt(2.0 / (math.sqrt(3.0) * ratio * vertices))
     sizes = (lower, lower, ratio * lower, ratio * lower)
-    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
-    lines = ['SetFactory("Built-in");']
-    lines += [
-        f"Point({n}) = {{{x}, {y}, 0, {size:.9g}}};"
-        for n, ((x, y), size) in enumerate(zip(corners, sizes, strict=True), 1)
-    ]
-    lines += [f"Line({n}) = {{{n}, {n % 4 + 1}}};" for n in range(1, 5)]
-    lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};"]
-    lines += ['Physical Surface("sheet") = {1};', 'Physical Point("held") = {3, 4};']
-    return "\n".join(lines) + "\n"
+    return rectangle_script(1.0, 1.0, sizes) + 'Physical Point("held") = {3, 4};\n'
 
 
 def small_sheet() -> dict[str, Any]:

@@ -25,14 +25,11 @@ from cases import (
 )
 from peers import measure_peer
 from processes import HERE, Limits, measure, run
-from tables import growth
 
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.experiments.study.study_report import processor
 from lyra_petsc.linear.presets import PRESETS
-
-__all__ = ["METHODS", "growth", "square_number"]
 
 WARM_UP = 3
 """Steps of a row before the first one that is measured."""

@@ -50,8 +50,7 @@ OPTIONS = {
     "snes_stol": "Relative increment at which a step stops, likewise.",
     "snes_convergence_test": "Refused: `solver` has the tolerances.",
     "ksp_rtol": "Relative tolerance of linear solves; without it 1e-2, and down to 1e-6 where Newton is "
-    "slow; "
-    "`semi-implicit`: 1e-6.",
+    "slow; `semi-implicit`: 1e-6.",
     "ksp_max_it": "Iterations of a linear solve (5000).",
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
@@ -72,9 +71,8 @@ OPTIONS = {
     "`semi-implicit` would decide by its iterations.",
     "contact_monitor": "Print contacts, smallest gap, stiffest contact, step limit and friction at each "
     "Newton iterate.",
-    "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
-    "without any of "
-    "these `average`; with `contact` bisection of space.",
+    "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; without "
+    "any of these `average`; with `contact` bisection of space.",
 }
 """What the program does with options that it reads, sets defaults for, or refuses."""
 
@@ -123,9 +121,8 @@ def scene_page() -> str:
     parts = [
         "# Keys of a scene",
         MADE,
-        "SI units. A key that is left out has its default, or its term is off; an empty key counts as "
-        "left out. "
-        "Unknown keys are refused. `lyra-petsc check --schema` prints the same for editors "
+        "SI units. A key that is left out has its default, or its term is off; an empty key counts as left "
+        "out. Unknown keys are refused. `lyra-petsc check --schema` prints the same for editors "
         "([how](../howto/editor.md)), `--set KEY.PATH=VALUE` changes a key for one run.",
         *(_block_section(block, where) for block, where in _blocks()),
         "## Names of `material.cloth`",
@@ -229,11 +226,9 @@ def petsc_page() -> str:
         "# PETSc options",
         MADE,
         "Every option of PETSc's TS, SNES, KSP, PC, Mat and Vec has its usual name, without a prefix: "
-        "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones win in: the program's defaults, the "
-        "scene's `petsc:` "
-        "block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc run SCENE -help` lists all "
-        "that PETSc has. "
-        "Options that nothing used are named in a warning at the end.",
+        "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones win in: the program's defaults, the scene's "
+        "`petsc:` block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc run SCENE -help` lists "
+        "all that PETSc has. Options that nothing used are named in a warning at the end.",
         "The program itself has to do with these:",
         "\n".join(rows),
         "## Named linear solvers",
@@ -258,9 +253,8 @@ def commands_page() -> str:
         "# Commands",
         MADE,
         "`mpirun -n P lyra-petsc VERB [ARGUMENTS] [--our options] [-petsc options]`; in a checkout also "
-        "`bash scripts/lyra.sh VERB …` or `.venv/bin/python -m lyra_petsc VERB …`. Options with two "
-        "dashes are "
-        "ours, those with one go to PETSc.",
+        "`bash scripts/lyra.sh VERB …` or `.venv/bin/python -m lyra_petsc VERB …`. Options with two dashes "
+        "are ours, those with one go to PETSc.",
     ]
     for name in sorted(verbs.commands):
         command = verbs.commands[name]

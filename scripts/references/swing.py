@@ -27,6 +27,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_banded
 
 Array = NDArray[np.float64]
 
@@ -91,13 +92,13 @@ def energy(x: Array, v: Array, c11: float) -> float:
     return float(kinetic + 0.5 * c11 * h * (strain**2).sum() + GRAVITY * mass @ x[:, 1])
 
 
-def swing(n: int, c11: float, times: tuple[float, ...] = TIMES, cfl: float = 0.5) -> dict[str, Any]:
+def swing(n: int, c11: float, cfl: float = 0.5) -> dict[str, Any]:
     """Free end (x, z) [m] of n bars at the times, with the smallest tension and the drift of the energy."""
     x = np.column_stack([np.linspace(0.0, LENGTH, n + 1), np.zeros(n + 1)])
     v = np.zeros_like(x)
     longest = cfl * (LENGTH / n) / np.sqrt(c11 / DENSITY)
     ends, least, t = [], np.inf, 0.0
-    for end in times:
+    for end in TIMES:
         steps = int(np.ceil((end - t) / longest))
         least = min(least, advance(x, v, c11, (end - t) / steps, steps))
         t = end
@@ -105,57 +106,36 @@ def swing(n: int, c11: float, times: tuple[float, ...] = TIMES, cfl: float = 0.5
     return {"edge": np.array(ends), "tension": least, "drift": energy(x, v, c11)}
 
 
-@njit(cache=False)
-def links(state, mass):  # type: ignore[no-untyped-def]
+def links(state: Array, mass: Array) -> Array:
     """Rates of angles and angular velocities of n rigid links; angle 0 is along x, positive upwards."""
     n = len(mass)
-    h = LENGTH / n
+    h, inverse = LENGTH / n, 1.0 / mass
     angle, rate = state[:n], state[n:]
-    c, s = np.cos(angle), np.sin(angle)
+    along = np.stack([np.cos(angle), np.sin(angle)])
     # (a_i − a_{i−1})·e_i = −h ω_i² with m_i a_i = T_{i+1} e_{i+1} − T_i e_i + m_i g: tridiagonal in T
-    lower, diagonal, upper, right = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    for i in range(n):
-        inverse, before = 1.0 / mass[i], 0.0
-        right[i] = h * rate[i] ** 2
-        if i > 0:
-            before = 1.0 / mass[i - 1]
-            lower[i] = -before * (c[i] * c[i - 1] + s[i] * s[i - 1])
-        else:
-            right[i] -= GRAVITY * s[i]  # the held end does not fall
-        diagonal[i] = inverse + before
-        if i + 1 < n:
-            upper[i] = -inverse * (c[i] * c[i + 1] + s[i] * s[i + 1])
-    tension = right
-    for i in range(1, n):
-        factor = lower[i] / diagonal[i - 1]
-        diagonal[i] -= factor * upper[i - 1]
-        tension[i] -= factor * tension[i - 1]
-    tension[n - 1] /= diagonal[n - 1]
-    for i in range(n - 2, -1, -1):
-        tension[i] = (tension[i] - upper[i] * tension[i + 1]) / diagonal[i]
-    out = np.empty(2 * n)
-    out[:n] = rate
-    ax = az = 0.0
-    for i in range(n):
-        tx, tz = -tension[i] * c[i], -tension[i] * s[i]
-        if i + 1 < n:
-            tx, tz = tx + tension[i + 1] * c[i + 1], tz + tension[i + 1] * s[i + 1]
-        bx, bz = tx / mass[i], tz / mass[i] - GRAVITY
-        out[n + i] = ((bz - az) * c[i] - (bx - ax) * s[i]) / h
-        ax, az = bx, bz
-    return out
+    beside = -inverse[:-1] * (along[:, 1:] * along[:, :-1]).sum(axis=0)
+    matrix = np.stack(
+        [np.append(0.0, beside), inverse + np.append(0.0, inverse[:-1]), np.append(beside, 0.0)]
+    )
+    right = h * rate**2
+    right[0] -= GRAVITY * along[1, 0]  # the held end does not fall
+    pull = solve_banded((1, 1), matrix, right) * along
+    acceleration = inverse * np.diff(pull, axis=1, append=0.0)
+    acceleration[1] -= GRAVITY
+    x, z = np.diff(acceleration, axis=1, prepend=0.0)
+    return np.concatenate([rate, (z * along[0] - x * along[1]) / h])
 
 
-def rigid(n: int, times: tuple[float, ...] = TIMES) -> Array:
+def rigid(n: int) -> Array:
     """Free end (x, z) [m] of n rigid links at the times."""
     mass = np.full(n, DENSITY * LENGTH / n)
     mass[-1] *= 0.5
     solution = solve_ivp(
         lambda t, y: links(y, mass),
-        (0.0, times[-1]),
+        (0.0, TIMES[-1]),
         np.zeros(2 * n),
         method="DOP853",
-        t_eval=times,
+        t_eval=TIMES,
         rtol=1e-10,
         atol=1e-12,
     )

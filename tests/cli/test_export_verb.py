@@ -44,16 +44,16 @@ def test_a_mistake_is_one_line(tmp_path: Path, words: list[str], said: str, rank
 
 SLOW = """
 import sys, time
-from lyra_petsc.show.export import formats
+from lyra_petsc.show import export
 from lyra_petsc.cli.app import run_command_line
 
-write = formats.write_obj
+write = export.write_obj
 
 def slowly(states, folder, name):
     write(states, folder, name)
     time.sleep(60)
 
-formats.write_obj = slowly
+export.write_obj = slowly
 sys.exit(run_command_line(sys.argv))
 """
 

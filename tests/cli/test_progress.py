@@ -67,12 +67,13 @@ def test_a_message_between_steps_comes_through_as_it_is():
         assert "step [1] retried" in stream.getvalue()
 
 
-def test_other_ranks_are_silent():
-    stream = Terminal()
-    assert run(stream, 0.5, comm=SECOND) == ""
-    Progress(SECOND, 1.0, stream=stream).say("hello")
-    closing_table(SECOND, {"solve": 1.0}, "runs/flag", "done", stream=stream)
-    assert stream.getvalue() == ""
+def test_other_ranks_are_silent(capsys):
+    for stream in (io.StringIO(), Terminal()):
+        assert run(stream, 0.5, comm=SECOND) == ""
+        Progress(SECOND, 1.0, stream=stream).say("hello")
+        assert stream.getvalue() == ""
+    closing_table(SECOND, {"solve": 1.0}, "runs/flag", "done")
+    assert capsys.readouterr().out == ""
 
 
 def test_time_left_is_told_after_some_steps_and_forgets_the_first():
@@ -97,13 +98,10 @@ def test_time_left_on_resume_counts_from_where_it_goes_on():
     assert lines[-1].endswith("1:40 left")
 
 
-@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()], ids=["file", "terminal"])
-def test_closing_table(stream):
+def test_closing_table(capsys):
     folder = "runs/" + "a-long-name-" * 12
-    closing_table(
-        FIRST, {"mesh": 0.5, "solve": 1.5, "other": 0.001}, folder, "done: 4 s in 100 steps", stream=stream
-    )
-    text = stream.getvalue()
+    closing_table(FIRST, {"mesh": 0.5, "solve": 1.5, "other": 0.001}, folder, "done: 4 s in 100 steps")
+    text = capsys.readouterr().out
     assert "25%" in text
     assert "75%" in text
     assert "2.00 s" in text

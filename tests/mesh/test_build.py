@@ -157,7 +157,7 @@ def test_slivers_and_small_triangles_pass(tmp_path: Path, aspect: float, offset:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (MeshSource(file=Path("/nowhere/flag.msh")), "no such mesh file"),
+        (MeshSource(file=Path("/nowhere/flag.msh")), "no such file"),
         (MeshSource(grid=grid(), transform=Transform(translate=(1e200, 0, 0))), "start shape"),
     ],
 )
@@ -169,5 +169,5 @@ def test_sources_refused(source: MeshSource, message: str) -> None:
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.msh").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
+    with pytest.raises(InputError, match="is a directory"):
         mesh_of(tmp_path / "folder.msh")

@@ -11,6 +11,7 @@ from mesh_sources import Transform, mesh_of, obj_mesh, rest_areas, turn
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.measures import rest_matrices
+from lyra_petsc.output.mesh_file import vertex_uv
 
 pytestmark = pytest.mark.quick
 
@@ -50,13 +51,13 @@ def test_vt_are_the_rest_shape_whatever_the_transform(tmp_path: Path, faces: str
     assert rest_areas(mesh).tolist() == [2, 2]
     assert mesh.has_uv
     assert mesh.flat_rest.all()
-    assert not mesh.has_seams
+    assert vertex_uv(mesh) is not None
 
 
 def test_seam_gives_corners_their_own_material_coordinates(tmp_path: Path) -> None:
     text = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 5 0\nvt 6 1\nvt 5 1\n" + "f 1/1 2/2 3/3\nf 1/4 3/5 4/6\n"
     mesh = obj_mesh(tmp_path, text, Transform(scale=2.0))
-    assert mesh.has_seams
+    assert vertex_uv(mesh) is None
     assert mesh.triangle_uv.tolist() == [[[0, 0], [1, 0], [1, 1]], [[5, 0], [6, 1], [5, 1]]]
     assert mesh.rest.tolist() == mesh.positions.tolist()
     assert mesh.flat_rest.all()
@@ -64,7 +65,7 @@ def test_seam_gives_corners_their_own_material_coordinates(tmp_path: Path) -> No
 
 def test_repeated_equal_vt_are_no_seam(tmp_path: Path) -> None:
     text = SQUARE + VT + "vt 0 0\n" + "f 1/1 2/2 3/3\nf 1/5 3/3 4/4\n"
-    assert not obj_mesh(tmp_path, text).has_seams
+    assert vertex_uv(obj_mesh(tmp_path, text)) is not None
 
 
 def test_mirrored_vt_keep_areas_and_give_positive_matrices(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from physics import CLOTH, grid, scene_of
 
 from lyra_petsc.output import recorder as module
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.output.self_contained import import_h5py
+from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene

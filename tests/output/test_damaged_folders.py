@@ -14,7 +14,7 @@ from lyra_petsc.output.checkpoint import CHECKPOINT, PREVIOUS, checkpoint_file, 
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.self_contained import import_h5py
+from lyra_petsc.output.stored import import_h5py
 
 pytestmark = pytest.mark.quick
 

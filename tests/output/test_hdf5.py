@@ -9,7 +9,7 @@ from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output import hdf5
 from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import import_h5py
+from lyra_petsc.output.stored import import_h5py
 
 pytestmark = pytest.mark.parallel(3)
 

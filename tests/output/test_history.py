@@ -1,7 +1,6 @@
 import math
 
 import pytest
-from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.history import HISTORY_COLUMNS, History, vector_columns
@@ -33,14 +32,6 @@ def test_rows_are_on_disk_at_once_and_exact(comm, shared_tmp):
         written(comm, path)
         == "step,time,tip_x,tip_y,tip_z\n1,0.30000000000000004,1e-300,-2,3.141592653589793\n"
     )
-
-
-def test_a_missing_or_unknown_column_is_refused(shared_tmp):
-    history = History(shared_tmp / f"{MPI.COMM_WORLD.rank}.csv", ("step", "time"), MPI.COMM_SELF)
-    with pytest.raises(ValueError, match="time"):
-        history.append({"step": 2})
-    with pytest.raises(ValueError, match="energy"):
-        history.append({"step": 2, "time": 0.1, "energy": 0.0})
 
 
 def test_resume_cuts_after_the_step_and_drops_a_torn_row(comm, shared_tmp):

@@ -8,7 +8,7 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh, TriangleSurface
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh
 from lyra_petsc.output.xdmf import MESH_FILE
 
 pytestmark = pytest.mark.parallel(3)

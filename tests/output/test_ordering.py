@@ -27,21 +27,3 @@ def test_there_and_back(comm, owners, n_global, shape, dtype):
     expected = whole[comm.rank * n_global // comm.size : (comm.rank + 1) * n_global // comm.size]
     np.testing.assert_array_equal(slab, expected)
     np.testing.assert_array_equal(plan.from_slab(slab), whole[original])
-
-
-def test_rows_that_are_no_permutation_are_refused_on_every_rank(comm):
-    mine = np.arange(comm.rank, 10, comm.size)
-    with pytest.raises(ValueError, match="exactly once"):
-        FileOrder(comm, np.where(mine == 3, 4, mine), 10)
-    with pytest.raises(ValueError, match="outside"):
-        FileOrder(comm, np.where(mine == 0, 10, mine), 10)
-    with pytest.raises(ValueError, match="exactly once"):
-        FileOrder(comm, mine, 11)
-
-
-def test_an_array_of_another_length_is_refused(comm):
-    plan = FileOrder(comm, np.arange(comm.rank, 10, comm.size), 10)
-    with pytest.raises(ValueError, match="owned rows"):
-        plan.to_slab(np.zeros(11))
-    with pytest.raises(ValueError, match="slab"):
-        plan.from_slab(np.zeros(11))

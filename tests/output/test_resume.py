@@ -24,8 +24,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import Interrupted
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
-from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.stored import import_h5py
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),

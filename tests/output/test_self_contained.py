@@ -19,8 +19,7 @@ from lyra_petsc.experiments.study.comparison import read_here
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import choose
-from lyra_petsc.output.self_contained import open_own
-from lyra_petsc.output.stored import open_stored
+from lyra_petsc.output.stored import open_own, open_stored
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 POSITION = "states/000001/position"

@@ -10,8 +10,8 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output import hdf5, xdmf
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import StateWriter, stored_states
+from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.output.xdmf import XDMF_FILE
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -47,10 +47,11 @@ class Run:
             step,
             0.1 * step,
             position(step)[self.vertices],
-            {"velocity": -position(step)[self.vertices], "mass": np.arange(5.0)[self.vertices]},
             {
-                "rank": np.arange(3, dtype=np.int32)[self.triangles],
-                "green_strain": strain(step)[self.triangles],
+                "velocity": ("vertex", -position(step)[self.vertices]),
+                "mass": ("vertex", np.arange(5.0)[self.vertices]),
+                "rank": ("triangle", np.arange(3, dtype=np.int32)[self.triangles]),
+                "green_strain": ("triangle", strain(step)[self.triangles]),
             },
         )
 
@@ -181,7 +182,7 @@ def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp, run):
         (shared_tmp / XDMF_FILE).write_text("<Xdmf")
     comm.Barrier()
     resumed = Run(comm, shared_tmp, resume_after=5)
-    assert resumed.writer.count == 2
+    assert resumed.writer._next == 2
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.3]))
     assert [state.number for state in stored_states(shared_tmp)] == [0, 1]
     comm.Barrier()
@@ -202,7 +203,7 @@ def test_resume_passes_over_a_damaged_file(comm, shared_tmp, run):
     if comm.rank == 0:
         (shared_tmp / "states-0004.h5").write_bytes(b"")
     comm.Barrier()
-    assert Run(comm, shared_tmp, resume_after=9).writer.count == 10
+    assert Run(comm, shared_tmp, resume_after=9).writer._next == 10
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3, 0.8, 0.9]))
 
 
@@ -224,7 +225,7 @@ def test_an_older_folder_goes_on(comm, shared_tmp):
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     on_first(comm, lambda: [old_file(shared_tmp, i, 3 * i) for i in range(4)])
     resumed = Run(comm, shared_tmp, resume_after=6)
-    assert resumed.writer.count == 3
+    assert resumed.writer._next == 3
     resumed.write(8)
 
     def check():
@@ -277,7 +278,7 @@ def test_more_than_9999_states(comm, shared_tmp, run):
     run.writer._next = 9999
     assert [run.write(1), run.write(2)] == [9999, 10000]
     resumed = Run(comm, shared_tmp, resume_after=2)
-    assert resumed.writer.count == 10001
+    assert resumed.writer._next == 10001
     resumed.write(3)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3]))
 

@@ -16,7 +16,7 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.tensors import in_vtk_order, plane_components, six_components
 from lyra_petsc.output.xdmf import XDMF_FILE
-from lyra_petsc.show.export.export_run import export_run
+from lyra_petsc.show.export import export_run
 from lyra_petsc.show.render.colour_quantities import quantity
 
 NUMBERED = np.arange(6.0)[None]

@@ -33,7 +33,7 @@ from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
 from lyra_petsc.terms import midedge, midedge_energy
 from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import tangents, unit
+from lyra_petsc.terms.midedge_shape import BATCH, tangents, unit
 from lyra_petsc.terms.moment import Moment
 
 Array = NDArray[np.float64]
@@ -170,12 +170,11 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         x[:n] += random.normal(0.0, 0.05, (n, 3))
         x[term.stencil[7, 2]] = x[term.stencil[7, :2]].mean(axis=0) + 1e-4
         x.ravel()[term.of_edges.places] = directors_along_normals(term, x)
-        shape, length, weight = term.shape(x, term.frames), term.of_edges.length, np.ones(term.n_elements)
+        shape, tangent = term.bent(x, term.frames)
+        length, weight = term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
-        angle = np.empty((term.n_elements, 3))
-        tangents(x, term.stencil, term.of_edges.of_triangles, shape, midedge.UPRIGHT, angle)
-        assert 0.1 < np.mean(np.abs(angle) > 1.0) < 0.9
-        assert term.n_elements % midedge_energy.BATCH
+        assert 0.1 < np.mean(np.abs(tangent[:, :3]) > 1.0) < 0.9
+        assert term.n_elements % BATCH
 
         def computed(size: int) -> list[Array]:
             """Energies, gradient and Hessian of so many triangles at a time."""
@@ -184,13 +183,15 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 part = slice(first, first + size)
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
-                flat = midedge.FLAT, midedge.UPRIGHT
-                constants = data["stiffness"][part], *flat, data["limit"][part], midedge.NO_FRICTION
-                midedge_energy.energies(x, triangles, edges, shape, *constants, energies[part])
-                midedge_energy.add_gradient(x, triangles, edges, at, sign, shape, *constants, length, pull)
+                bent = np.empty((len(triangles), 4))
+                tangents(x, triangles, edges, shape, midedge.UPRIGHT, bent)
+                constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
+                midedge_energy.energies(bent, *constants, energies[part])
+                given = edges, at, sign, shape, bent, *constants, length
+                midedge_energy.add_gradient(x, triangles, *given, pull)
                 corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
                 numbers = *constants, length, weight[part], corners, mixed, values
-                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, shape, *numbers)
+                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, shape, bent, *numbers)
             return [energies, pull, values]
 
         for whole, apart in zip(computed(term.n_elements), computed(1), strict=True):
@@ -787,7 +788,7 @@ def test_a_moment_works_through_the_turn_of_directors() -> None:
         load.add_force(x, 0.0, 0.0, force)
 
         def shape(at: Array) -> Array:
-            return bending._computed(at, bending.frames)[:, :3]
+            return bending._directors(at, bending.frames)[:, :3]
 
         step = 1e-6
         rate = (shape(x + step * way) - shape(x - step * way)) / (2.0 * step)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
-from lyra_petsc.experiments.results import Line, View
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.experiments.results import Line, View, verdict_line, write_csv
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
-from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
+from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure
 
 OUTCOME_FILE = "outcome.json"
 
@@ -125,6 +122,7 @@ class Fabric(View[FabricOutcome]):
     """
 
     verb = "fabric"
+    entry = "test"
     pictures = "plots"
     columns = ("test", "quantity", "value", "scatter", "unit", "passed", "problem")
 
@@ -138,12 +136,7 @@ class Fabric(View[FabricOutcome]):
             yield f"  {number.quantity} = {_value(number)} {number.unit}", ""
         for name, verdict in outcome.verdicts.items():
             if name != "measured" or not verdict.passed:
-                word, style = ("passed", "") if verdict.passed else ("FAILED", "bold red")
-                yield f"  {name}: {word}: {verdict.words}", style
-
-    def summary(self, outcomes: Sequence[FabricOutcome]) -> list[Sequence[str]]:
-        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
-        return [("test", "verdict", "run time [s]"), *table]
+                yield verdict_line(verdict, f"{name}: ")
 
     def rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
         common = {"test": outcome.case.name, "passed": outcome.passed, "problem": outcome.record.stopped}
@@ -175,41 +168,33 @@ class Fabric(View[FabricOutcome]):
             report.heading(outcome.case.name)
             report.paragraph(f"{outcome.case.title}. Run time {seconds(outcome.seconds)}.")
             for name, verdict in outcome.verdicts.items():
-                word = "passed" if verdict.passed else "FAILED"
-                report.paragraph(f"{name}: {word}: {verdict.words}.")
+                report.paragraph(f"{name}: {verdict.line}.")
             if drawn:
                 for drawing in pictures(outcome):
                     report.figure(drawing)
 
     def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         for outcome in self._outcomes:
-            for curve in outcome.record.curves:
-                text = io.StringIO()
+            curves = outcome.record.curves
+            for number, curve in enumerate(curves, 1):
+                name = outcome.case.name + (f"-{number}" if len(curves) > 1 else "")
                 lines = [(curve.x_label, curve.y_label), *zip(curve.x, curve.y, strict=True)]
-                csv.writer(text, lineterminator="\n").writerows(lines)
-                replace_text(
-                    folder / f"{outcome.case.name}{_suffix(outcome.record, curve)}.csv", text.getvalue()
-                )
+                write_csv(folder / f"{name}.csv", lines)
         return super().close(report, folder, command)
-
-
-def _suffix(record: Record, curve: Curve) -> str:
-    return "" if len(record.curves) == 1 else f"-{record.curves.index(curve) + 1}"
 
 
 def pictures(outcome: FabricOutcome) -> list[Drawing]:
     """The curves and the shadow of a test."""
     record, name, found = outcome.record, outcome.case.name, []
     if record.curves:
-        lines = [Series(c.name, c.x, c.y) for c in record.curves]
         figure = empty_figure(0.8 * HEIGHT)
         axes = figure.add_subplot(xlabel=record.curves[0].x_label, ylabel=record.curves[0].y_label)
-        for number, line in enumerate(lines):
-            axes.plot(line.x, line.y, color=colour(number), label=line.name, lw=1.4, marker=".", ms=3)
+        for number, curve in enumerate(record.curves):
+            axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.4, marker=".", ms=3)
         axes.grid(True, color="#dfe3e8", lw=0.8)
         if all(label.endswith("[cm]") for label in (record.curves[0].x_label, record.curves[0].y_label)):
             axes.set_aspect("equal", adjustable="datalim")  # the shape of a strip
-        if len(lines) > 1:
+        if len(record.curves) > 1:
             axes.legend(fontsize=8)
         found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))
     if record.shadow:

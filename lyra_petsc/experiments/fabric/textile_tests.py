@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError, nearest
-from lyra_petsc.experiments.bench import Bench, Trial, problem_of
+from lyra_petsc.experiments.bench import Bench, problem_of
 from lyra_petsc.experiments.case import Launcher, Watch
 from lyra_petsc.experiments.drape import (
     CLOTH,
@@ -61,8 +61,9 @@ def _grid(width: float, height: float, nx: int, ny: int) -> dict[str, Any]:
     return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": "alternating"}}
 
 
-def _number(quantity: str, value: float, unit: str) -> Number:
-    return Number(quantity, float(value), unit)
+def _shape(name: str, line: Array) -> Curve:
+    """The middle line (n, 2) [m] of a strip."""
+    return Curve(name, "x [cm]", "z [cm]", *(1e2 * line).T.tolist())
 
 
 def _path(values: Sequence[float]) -> dict[str, Any]:
@@ -77,15 +78,8 @@ def _through(
 ) -> Iterator[Iterator[SteppedScene]]:
     """The simulation of a scene at each of these values but the first, also where it takes shorter steps."""
     factors = [k / (len(values) - 1) for k in range(1, len(values))]
-
-    def steps(trial: Trial) -> Iterator[SteppedScene]:
-        for factor in factors:
-            while trial.simulation.time < factor - 1e-9:
-                trial.step()
-            yield trial.simulation
-
     with bench.simulation(content | _path(values), land=factors[:-1]) as trial:
-        yield steps(trial)
+        yield trial.through(factors)
 
 
 def _to_and_fro(largest: float, steps: int, *, closed: bool) -> list[float]:
@@ -104,6 +98,13 @@ def _branches(x: Sequence[float], y: Sequence[float], steps: int) -> tuple[Any, 
     if up == down:
         rising = falling
     return (lambda at: np.interp(at, *rising)), (lambda at: np.interp(at, *falling))
+
+
+def _width_of_loop(record: Record, name: str, up: Any, down: Any, at: float, unit: str, known: float) -> None:
+    """Add the mean width of a loop at ±``at``, and the verdict on it."""
+    width = 0.5 * float((up(at) - down(at)) + (up(-at) - down(-at)))
+    record.numbers.append(Number(name, width, unit))
+    record.claim(name, width, known, 0.01)
 
 
 # -- KES-F 1 ---------------------------------------------------------------------------------------------
@@ -160,28 +161,19 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             forces.append(abs(simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
             if forces[-1] >= FULL_LOAD:
                 break
-    record.curves = [
-        Curve(
-            "tensile",
-            "strain [%]",
-            "force [gf/cm]",
-            [100.0 * e for e in strains],
-            [f / GF_PER_CM for f in forces],
-        )
-    ]
+    percent, told = [100.0 * e for e in strains], [f / GF_PER_CM for f in forces]
+    record.curves = [Curve("tensile", "strain [%]", "force [gf/cm]", percent, told)]
     if forces[-1] < FULL_LOAD:
-        record.numbers = [
-            _number(f"force at {100.0 * strains[-1]:.3g} % (less than 500)", forces[-1] / GF_PER_CM, "gf/cm")
-        ]
+        record.numbers = [Number(f"force at {percent[-1]:.3g} % (less than 500)", told[-1], "gf/cm")]
         return record
     emt = float(np.interp(FULL_LOAD, forces, strains))
     e = np.linspace(0.0, emt, 400)
     pulls = np.interp(e, strains, forces)
     work = float(0.5 * np.sum((pulls[1:] + pulls[:-1]) * np.diff(e)))
     record.numbers = [
-        _number("EMT", 100.0 * emt, "%"),
-        _number("WT", work / GF_PER_CM, "gf·cm/cm²"),
-        _number("LT", work / (0.5 * FULL_LOAD * emt), "1"),
+        Number("EMT", 100.0 * emt, "%"),
+        Number("WT", work / GF_PER_CM, "gf·cm/cm²"),
+        Number("LT", work / (0.5 * FULL_LOAD * emt), "1"),
     ]
     return record
 
@@ -234,14 +226,13 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     left = [f - pull * math.tan(math.radians(angle)) for f, angle in zip(told, angles, strict=True)]
     up, down = _branches(angles, left, rise)
     stiffness = 0.5 * sum((f(2.5 * s) - f(0.5 * s)) / (2.0 * s) for f, s in ((up, 1), (down, -1)))
-    record.numbers = [_number("G", stiffness, "gf/(cm·°)")]
+    record.numbers = [Number("G", stiffness, "gf/(cm·°)")]
     if shell.law != "measured" and not shell.curves:
         record.claim("G", stiffness, math.radians(shell.c33) / GF_PER_CM, 0.01)
     if rubs:
+        known = 2.0 * shell.friction_force / GF_PER_CM
         for name, at in (("2HG", 0.5), ("2HG5", 5.0)):
-            loop = 0.5 * ((up(at) - down(at)) + (up(-at) - down(-at)))
-            record.numbers.append(_number(name, loop, "gf/cm"))
-            record.claim(name, loop, 2.0 * shell.friction_force / GF_PER_CM, 0.01)
+            _width_of_loop(record, name, up, down, at, "gf/cm", known)
     return record
 
 
@@ -307,13 +298,12 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, told)]
     up, down = _branches(curvature, told, rise)
     stiffness = 0.5 * ((up(1.5) - up(0.5)) + (down(-0.5) - down(-1.5)))
-    record.numbers = [_number("B", stiffness, "gf·cm²/cm")]
+    record.numbers = [Number("B", stiffness, "gf·cm²/cm")]
     record.claim("B", stiffness, shell.plate[0] / (1e-4 * GF_PER_CM), 0.01)
     if limit > 0.0:
         for at in (0.5, 1.5):
-            loop = 0.5 * ((up(at) - down(at)) + (up(-at) - down(-at)))
-            record.numbers.append(_number(f"2HB at {at:g} cm⁻¹", loop, "gf·cm/cm"))
-            record.claim(f"2HB at {at:g} cm⁻¹", loop, 2.0 * limit / (1e-2 * GF_PER_CM), 0.01)
+            known = 2.0 * limit / (1e-2 * GF_PER_CM)
+            _width_of_loop(record, f"2HB at {at:g} cm⁻¹", up, down, at, "gf·cm/cm", known)
     return record
 
 
@@ -361,14 +351,12 @@ def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     half = 0.5 * lengths[-1]
     rigidity = weight * half**3
     record.numbers = [
-        _number("overhang", 1e2 * lengths[-1], "cm"),
-        _number("bending length c", 1e2 * half, "cm"),
-        _number("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
-        _number("B", 1e6 * rigidity, "µN·m"),
+        Number("overhang", 1e2 * lengths[-1], "cm"),
+        Number("bending length c", 1e2 * half, "cm"),
+        Number("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
+        Number("B", 1e6 * rigidity, "µN·m"),
     ]
-    record.curves = [
-        Curve("strip", "x [cm]", "z [cm]", (1e2 * line[:, 0]).tolist(), (1e2 * line[:, 1]).tolist())
-    ]
+    record.curves = [_shape("strip", line)]
     if not max(shell.friction_moment) > 0.0:
         record.claim("B", rigidity, known, 0.005)
     return record
@@ -482,20 +470,11 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         shapes.append(found)
     lengths = [loop_length(h, strip) for h, strip in zip(heights, strips, strict=True)]
     record.numbers = [
-        _number(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
+        Number(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
         for h, strip in zip(heights, strips, strict=True)
     ]
-    record.numbers.append(_number("bending length c, by Peirce's formula", 1e2 * lengths[1], "cm"))
-    record.curves = [
-        Curve(
-            f"{1e2 * strip:.3g} cm",
-            "x [cm]",
-            "z [cm]",
-            (1e2 * shape[:, 0]).tolist(),
-            (1e2 * shape[:, 1]).tolist(),
-        )
-        for strip, shape in zip(strips, shapes, strict=True)
-    ]
+    record.numbers.append(Number("bending length c, by Peirce's formula", 1e2 * lengths[1], "cm"))
+    record.curves = [_shape(f"{1e2 * s:.3g} cm", shape) for s, shape in zip(strips, shapes, strict=True)]
     if not max(shell.friction_moment) > 0.0:
         for strip, height in zip(strips, heights, strict=True):
             words = f"height of {1e2 * strip:.3g} cm, against the elastica"

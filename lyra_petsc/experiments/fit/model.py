@@ -42,9 +42,8 @@ Progress = Callable[[float], None]
 
 @dataclass
 class Evaluation:
-    """Values (m,) of the readings at some numbers (n,), and their derivatives (m, n) where asked for."""
+    """Values (m,) of the readings, and their derivatives (m, n) by the numbers where asked for."""
 
-    numbers: Array
     values: Array
     jacobian: Array | None = None
 
@@ -184,7 +183,7 @@ class Model:
             self.shape = shape if self.comm.rank == 0 else None
             if beside is not None:
                 beside.destroy()
-        return Evaluation(numbers, np.concatenate(values), np.concatenate(slopes) if slopes else None)
+        return Evaluation(np.concatenate(values), np.concatenate(slopes) if slopes else None)
 
     def _by_differences(self, numbers: Array, progress: Progress) -> Evaluation:
         """By central differences of whole runs."""
@@ -200,7 +199,7 @@ class Model:
                 pair.append(run.values)
             columns.append((pair[0] - pair[1]) / (2.0 * WHOLE_RUNS * size))
         found = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
-        return Evaluation(numbers, found.values, np.stack(columns, axis=1))
+        return Evaluation(found.values, np.stack(columns, axis=1))
 
 
 def _scaled(progress: Progress, done: int, count: int, part: float) -> None:
@@ -216,30 +215,20 @@ def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
     """
     names: dict[tuple[str, ...], str] = {}
     for key in keys:
-        if not all(map(_PART.fullmatch, key.split("."))):
-            raise InputError(
-                "is no key of a scene; write it as in handles[0].stiffness",
-                file=scene.source,
-                key=f"{at}.{key}",
-            )
-        if (other := names.setdefault(tuple(_parts(key)), key)) != key:
-            raise InputError(
-                f"is the number {other}; leave one of them out", file=scene.source, key=f"{at}.{key}"
-            )
-        root = key.split(".")[0].split("[")[0]
-        if root not in ROOTS:
-            raise InputError(
-                f"is no number that can be varied; those of {', '.join(ROOTS)} can",
-                file=scene.source,
-                key=f"{at}.{key}",
-            )
-        chosen = [part for part in key.replace("[", ".").split(".") if part in CHOICES]
-        if chosen:
-            raise InputError(
-                f"cannot be varied: nothing depends smoothly on what {chosen[0]} names",
-                file=scene.source,
-                key=f"{at}.{key}",
-            )
+        if words := _wrong(key, names):
+            raise InputError(words, file=scene.source, key=f"{at}.{key}")
+
+
+def _wrong(key: str, names: dict[tuple[str, ...], str]) -> str:
+    """Why a key is not to be varied beside those before it, which ``names`` has; empty if it may be."""
+    if not all(map(_PART.fullmatch, key.split("."))):
+        return "is no key of a scene; write it as in handles[0].stiffness"
+    if (other := names.setdefault(tuple(_parts(key)), key)) != key:
+        return f"is the number {other}; leave one of them out"
+    if key.split(".")[0].split("[")[0] not in ROOTS:
+        return f"is no number that can be varied; those of {', '.join(ROOTS)} can"
+    chosen = [part for part in key.replace("[", ".").split(".") if part in CHOICES]
+    return f"cannot be varied: nothing depends smoothly on what {chosen[0]} names" if chosen else ""
 
 
 def _parts(key: str) -> list[str]:

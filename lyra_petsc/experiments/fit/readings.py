@@ -8,14 +8,14 @@ from __future__ import annotations
 import csv
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
 from lyra_petsc.scene.schema import Scene
@@ -45,7 +45,6 @@ class Reading(ABC):
         [s], or load factor.
     parts : tuple of str
         Names of its values.
-    unit : str
     measured, uncertainty : (m,)
         NaN where nothing was measured.
     """
@@ -54,7 +53,6 @@ class Reading(ABC):
     name: str
     time: float
     parts: tuple[str, ...]
-    unit: str
     measured: Array = field(default_factory=lambda: np.empty(0))
     uncertainty: Array = field(default_factory=lambda: np.empty(0))
 
@@ -264,19 +262,14 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
     table = _Table(measurement.table)
     one = _made(scene, measurement, key, scene.time.end)
     table.refuse_others("time", "uncertainty", *(AXES if measurement.axes else one.parts))
-    names = ["time", *one.parts]
+    times, *columns = (table.numbers(name) for name in ("time", *one.parts))
+    sigmas = np.full(len(times), measurement.uncertainty)
     if measurement.uncertainty is None or "uncertainty" in table.names:
-        names.append("uncertainty")
-    columns = table.numbers(names)
+        sigmas = table.uncertainties()
     found = []
-    for row, time in enumerate(columns["time"]):
-        reading = _made(scene, measurement, key, float(time))
-        reading.measured = np.array([columns[part][row] for part in one.parts])
-        sigma = measurement.uncertainty
-        if sigma is None or "uncertainty" in columns:
-            sigma = _positive(table, row, float(columns["uncertainty"][row]))
-        reading.uncertainty = np.full(len(one.parts), sigma)
-        found.append(reading)
+    for time, sigma, *values in zip(times.tolist(), sigmas, *columns, strict=True):
+        found.append(_made(scene, measurement, key, time))
+        found[-1].measured, found[-1].uncertainty = np.array(values), np.full(len(values), sigma)
     return found
 
 
@@ -285,15 +278,15 @@ def _made(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
     names = tuple(AXES[axis] for axis in axes)
     if quantity.probe is not None:
         _probe(scene, quantity.probe, f"{key}.probe")
-        return Places(key, quantity.probe, time, names, "m", wanted=[(quantity.probe, axes)])
+        return Places(key, quantity.probe, time, names, wanted=[(quantity.probe, axes)])
     if quantity.overhang is not None:
         overhang: Overhang = quantity.overhang
         _probe(scene, overhang.edge, f"{key}.overhang.edge")
         _probe(scene, overhang.tip, f"{key}.overhang.tip")
         wanted: list[tuple[str | int, tuple[int, ...]]] = [(overhang.edge, ()), (overhang.tip, ())]
-        return HangingAngle(key, "overhang", time, ("degrees",), "°", wanted=wanted)
+        return HangingAngle(key, "overhang", time, ("degrees",), wanted=wanted)
     if quantity.drape is not None:
-        return Shadow(key, "drape", time, ("coefficient",), "", block=quantity.drape)
+        return Shadow(key, "drape", time, ("coefficient",), block=quantity.drape)
     assert quantity.force is not None
     if not quantity.force < len(scene.handles):
         raise InputError(
@@ -302,7 +295,7 @@ def _made(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
             file=scene.source,
             key=f"{key}.force",
         )
-    return HandleForce(key, f"handle {quantity.force}", time, names, "N", handle=quantity.force, axes=axes)
+    return HandleForce(key, f"handle {quantity.force}", time, names, handle=quantity.force, axes=axes)
 
 
 def _probe(scene: Scene, name: str, key: str) -> None:
@@ -361,46 +354,56 @@ class _Table:
             if name not in known:
                 raise InputError(f"unknown column {name!r}, {nearest(name, known)}", file=self.path)
 
-    def numbers(self, names: Sequence[str]) -> Mapping[str, Array]:
-        """Columns of numbers.
+    def words(self, name: str) -> list[str]:
+        """A column as it is written.
 
         Raises
         ------
         InputError
-            If one is missing, or holds something else.
+            If it is missing.
         """
-        return {name: self._numbers(name) for name in names}
-
-    def words(self, name: str) -> list[str]:
-        """A column as it is written."""
-        column = self._column(name)
-        return [row[column] for row in self.rows]
-
-    def _column(self, name: str) -> int:
         if name not in self.names:
             raise InputError(
                 f"has no column {name!r}; its columns are {', '.join(self.names)}", file=self.path
             )
-        return self.names.index(name)
+        column = self.names.index(name)
+        return [row[column] for row in self.rows]
 
-    def _numbers(self, name: str) -> Array:
-        found = []
-        for line, word in zip(self.lines, self.words(name), strict=True):
-            try:
-                found.append(float(word))
-                if not math.isfinite(found[-1]):
-                    raise ValueError
-            except ValueError:
-                raise InputError(
-                    f"line {line}: {name} must be a number, not {word!r}", file=self.path
-                ) from None
-        return np.array(found)
+    def numbers(self, name: str) -> Array:
+        """A column of numbers.
+
+        Raises
+        ------
+        InputError
+            If it is missing, or holds something else.
+        """
+        words = self.words(name)
+        found = np.array([_number(word) for word in words])
+        self.refuse(~np.isfinite(found), lambda row: f"{name} must be a number, not {words[row]!r}")
+        return found
+
+    def uncertainties(self) -> Array:
+        """The column of that name, whose numbers must be positive."""
+        found = self.numbers("uncertainty")
+        self.refuse(~(found > 0.0), lambda row: f"uncertainty must be > 0, not {found[row]:g}")
+        return found
+
+    def refuse(self, wrong: Mask, why: Callable[[int], str]) -> None:
+        """Refuse the first row of these, if there is one.
+
+        Raises
+        ------
+        InputError
+        """
+        for row in np.flatnonzero(wrong).tolist():
+            raise InputError(f"line {self.lines[row]}: {why(row)}", file=self.path)
 
 
-def _positive(table: _Table, row: int, sigma: float) -> float:
-    if not sigma > 0.0:
-        raise InputError(f"line {table.lines[row]}: uncertainty must be > 0, not {sigma:g}", file=table.path)
-    return sigma
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def _points(
@@ -410,17 +413,15 @@ def _points(
     names = [axis for axis in AXES if axis in table.names]
     if not names:
         raise InputError("has none of the columns x, y, z", file=table.path)
-    columns = table.numbers(names)
+    columns = np.column_stack([table.numbers(name) for name in names])
     whats: list[str | int] = []
     if "vertex" in table.names and "probe" in table.names:
         raise InputError("has columns 'vertex' and 'probe'; leave one out", file=table.path)
     if "vertex" in table.names:
-        for row, number in enumerate(table.numbers(["vertex"])["vertex"]):
-            if number != int(number):
-                raise InputError(
-                    f"line {table.lines[row]}: vertex must be a whole number, not {number:g}", file=table.path
-                )
-            whats.append(int(number))
+        numbers = table.numbers("vertex")
+        whole = np.rint(numbers)
+        table.refuse(numbers != whole, lambda row: f"vertex must be a whole number, not {numbers[row]:g}")
+        whats += whole.astype(int).tolist()
     elif "probe" in table.names:
         for name in table.words("probe"):
             _probe(scene, name, key)
@@ -432,7 +433,7 @@ def _points(
         )
     table.refuse_others("vertex", "probe", "time", "uncertainty", *AXES)
     if "uncertainty" in table.names:
-        sigmas = table.numbers(["uncertainty"])["uncertainty"]
+        sigmas = table.uncertainties()
     elif uncertainty is not None:
         sigmas = np.full(len(whats), uncertainty)
     else:
@@ -441,22 +442,13 @@ def _points(
     if "time" in table.names:
         if at is not None:
             raise InputError("has a column time; leave at out", file=table.path, key=key)
-        times = table.numbers(["time"])["time"]
+        times = table.numbers("time")
     found: list[Reading] = []
     axes = tuple(AXES.index(name) for name in names)
     for time in sorted(set(times.tolist())):
         rows = np.flatnonzero(times == time)
         parts = tuple(f"{whats[row]} {name}" for row in rows for name in names)
-        found.append(
-            Places(
-                key,
-                table.path.stem,
-                float(time),
-                parts,
-                "m",
-                np.array([columns[name][row] for row in rows for name in names]),
-                np.array([_positive(table, row, float(sigmas[row])) for row in rows for _ in names]),
-                wanted=[(whats[row], axes) for row in rows],
-            )
-        )
+        place = Places(key, table.path.stem, time, parts, wanted=[(whats[row], axes) for row in rows])
+        place.measured, place.uncertainty = columns[rows].ravel(), np.repeat(sigmas[rows], len(names))
+        found.append(place)
     return found

@@ -100,15 +100,12 @@ def force_along(
 
     def refined(which: Terms, panels: int, most: int) -> float | None:
         """The integral of these terms' forces, from so many panels on; None if it does not stand."""
-        if panels >= most:
-            return None
-        before = _integral(comm, which, n, x0, dx, panels, 5)
-        while panels < most:
-            panels *= 2
+        before, fine = math.nan, panels >= most
+        while not fine:
             now = _integral(comm, which, n, x0, dx, panels, 5)
             if abs(now - before) <= max(enough, EPSILON * abs(now)):
                 return now
-            before = now
+            before, fine, panels = now, panels >= most, 2 * panels
         return None
 
     value, followed = _integral(comm, smooth, n, x0, dx, 1, 2), True
@@ -130,20 +127,13 @@ def force_along(
 
 def _integral(comm: MPI.Comm, terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
     """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J] by Gauss's rule on equal panels; collective."""
-    return float(comm.allreduce(_panels(terms, n, x0, dx, panels, points)))
-
-
-def _panels(terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
-    """This rank's part of the integral by Gauss's rule on equal panels."""
-    if not terms:
-        return 0.0
     nodes, weights = np.polynomial.legendre.leggauss(points)  # type: ignore[no-untyped-call]
     value = 0.0
-    for panel in range(panels):
+    for panel in range(panels if terms else 0):
         for node, weight in zip(nodes, weights, strict=True):
             s = (panel + 0.5 * (1.0 + node)) / panels
             value += 0.5 * weight * float(np.vdot(gradient(terms, x0 + s * dx)[:n], dx[:n]))
-    return value / panels
+    return float(comm.allreduce(value / panels))
 
 
 def _widest_turn(terms: Terms, x0: Array, dx: Array) -> float:

@@ -221,18 +221,20 @@ KEPT = ("group", "damping", "warp_degrees", "rest_curvature")
 """Keys of a material that are no stiffness."""
 
 
-def changed(change: Callable[..., Content], **numbers: float) -> Maker:
-    """The scene of a case that is the base scene with one of the changes below."""
+def changed(*changes: Callable[..., Content], **numbers: Any) -> Maker:
+    """The scene of a case that is the base scene with these changes; ``numbers`` are for the last of them."""
 
     def scene(setting: Setting, bench: Bench) -> Content:
-        return change(setting.content(), **numbers)
+        content = setting.content()
+        for change in changes[:-1]:
+            content = change(content)
+        return changes[-1](content, **numbers) if changes else content
 
     return scene
 
 
-def as_it_is(setting: Setting, bench: Bench) -> Content:
-    """The base scene."""
-    return setting.content()
+as_it_is = changed()
+"""The base scene."""
 
 
 def materials(content: Content) -> list[dict[str, Any]]:

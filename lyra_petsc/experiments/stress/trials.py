@@ -438,7 +438,7 @@ class Stress(View[StressOutcome]):
         report.table(
             ["case", "what", "verdict"],
             [
-                [outcome.case.name, name, ("passed: " if verdict.passed else "FAILED: ") + verdict.words]
+                [outcome.case.name, name, verdict.line]
                 for outcome in run
                 for name, verdict in outcome.verdicts.items()
             ],

@@ -26,10 +26,8 @@ from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
-from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import stored_states
-from lyra_petsc.output.stored import open_stored
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
 SAME_TIME = 1e-6
@@ -302,18 +300,13 @@ def _nearest(places: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Arr
 
     corners = vertices[triangles]
     count = min(CANDIDATES, len(triangles))
-    _, near = cKDTree(corners.mean(axis=1)).query(places, k=count)
-    near = np.asarray(near).reshape(len(places), count)
-    best = np.full(len(places), np.inf)
-    chosen = np.zeros(len(places), dtype=np.int64)
-    weight = np.zeros((len(places), 3))
-    for candidate in near.T:
-        weights = barycentric(places, corners[candidate])
-        distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[candidate]) - places, axis=1)
-        nearer = distance < best
-        best[nearer], chosen[nearer] = distance[nearer], candidate[nearer]
-        weight[nearer] = weights[nearer]
-    return triangles[chosen], weight
+    _, found = cKDTree(corners.mean(axis=1)).query(places, k=count)
+    near = np.asarray(found).ravel()
+    points = np.repeat(places, count, axis=0)
+    weights = barycentric(points, corners[near])
+    distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[near]) - points, axis=1)
+    best = distance.reshape(-1, count).argmin(axis=1) + count * np.arange(len(places))
+    return triangles[near[best]], weights[best]
 
 
 def barycentric(places: Array, corners: Array) -> Array:

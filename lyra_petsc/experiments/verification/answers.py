@@ -20,7 +20,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Bench, problem_of
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
-from lyra_petsc.experiments.results import Line, View, aligned
+from lyra_petsc.experiments.results import Line, View, aligned, verdict_line
+from lyra_petsc.extras import remedy
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
@@ -333,6 +334,8 @@ def _rows_at(
                 rows.append(row)
         except (InputError, SolverError) as error:
             problem = problem_of(comm, error)
+        except ModuleNotFoundError as error:  # on all ranks
+            problem = remedy([str(error.name)])
     if not isinstance(measured, Generator):
         whole = time.perf_counter() - began
         for row in rows:
@@ -388,14 +391,8 @@ class Verification(View[VerificationOutcome]):
                 yield f"  {quantity}", ""
                 table = [headings(rows[0].unit), *map(cells, rows)]
                 yield from ((line, "") for line in aligned(table, words=0))
-            verdict = outcome.verdicts[quantity]
-            word, style = ("passed", "") if verdict.passed else ("FAILED", "bold red")
-            yield f"  {word}: {verdict.words}", style
+            yield verdict_line(outcome.verdicts[quantity])
         yield "", ""
-
-    def summary(self, outcomes: Sequence[VerificationOutcome]) -> list[Sequence[str]]:
-        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
-        return [("case", "verdict", "run time [s]"), *table]
 
     def rows(self, outcome: VerificationOutcome) -> Iterable[Mapping[str, Any]]:
         for row in outcome.rows:

@@ -5,29 +5,40 @@ Strips one cell wide are cantilevers clamped at x = 0, of length 1 m with B = 1 
 between two supports. One cell across keeps apart what a plate adds to a strip: wider strips resist with their
 membrane against the lateral curvature that hinges give them.
 
-Natural frequencies come from the assembled stiffness and the lumped masses, by subspace iteration. Unknowns
-of edges have no mass: the iteration, which solves with the stiffness for forces of inertia, lets them balance
-by themselves.
+Natural frequencies come from the assembled stiffness and the lumped masses, by Lanczos iterations that solve
+with the (shifted) stiffness. Unknowns of edges have no mass: forces of inertia let them balance by
+themselves.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array, Mask
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import SolverError
-from lyra_petsc.experiments.bench import Bench, Trial, direct_solver
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rectangle_script, sides
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.meshes import SIDES, irregular_rectangle, rectangle, rectangle_script, sides
 from lyra_petsc.experiments.verification.answers import grid, isotropic, scene
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
+from lyra_petsc.parallel import on_root
 from lyra_petsc.terms.term import Elastic
 
 KINDS = ("diagonal", "alternating", "criss-cross", "irregular", "gmsh")
+
+
+HELD = {"CCCC": (True, SIDES), "SSSS": (False, SIDES), "CFFF": (True, ("left",)), "FFFF": (True, ())}
+"""Whether edges of plates are clamped (C) or supported (S), and which; the others are free (F)."""
+
+
+def held(edges: str) -> list[dict[str, Any]]:
+    """The handles of a plate whose edges are named as in `HELD`."""
+    clamp, sides = HELD[edges]
+    return [{"group": side, "clamp": clamp} for side in sides]
 
 
 def flat_mesh(
@@ -125,15 +136,74 @@ def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]
     return scene(mesh, material, gravity=[0, 0, -G], handles=held)
 
 
-MORE_VECTORS = 8
-"""Vectors beside those asked for: the more, the fewer iterations."""
-
-MAX_ITERATIONS = 200
-TOLERANCE = 1e-11
-"""Relative change of the squared frequencies at which the iteration ends."""
+MORE = 8
+"""Vectors beside those asked for: one of an unstable state may be farther away than stable ones."""
 
 ROUND_OFF = 1e-6
 """Square over the shift below which a frequency is called zero."""
+
+
+@dataclass(frozen=True)
+class SmallMotions:
+    """K and M of a sheet about its present state, the same on every rank.
+
+    Attributes
+    ----------
+    stiffness : (n, n) scipy.sparse.csr_array
+        [N/m], of the coordinates of vertices and the unknowns of edges.
+    mass : (n,) float64
+        [kg]; 0 of edges.
+    free : (n,) int64
+        Unknowns that no handle prescribes at the present time.
+    vertices : (V, 3) int64
+        The unknowns of each vertex, in mesh order.
+    """
+
+    stiffness: Any
+    mass: Array
+    free: Ints
+    vertices: Ints
+
+    @property
+    def stiffness_of_free(self) -> Any:
+        """(m, m) csc"""
+        return self.stiffness[self.free][:, self.free].tocsc()
+
+    def displacements(self, force: Array) -> Array:
+        """Displacements (V, 3) [m] under small forces (V, 3) [N]."""
+        from scipy.sparse.linalg import spsolve
+
+        forces, found = np.zeros((2, len(self.mass)))
+        forces[self.vertices] = force
+        found[self.free] = spsolve(self.stiffness_of_free, forces[self.free])
+        return found[self.vertices]
+
+
+def small_motions(trial: Trial) -> SmallMotions:
+    """K of all elastic terms, and M, at the present state; collective."""
+    from scipy.sparse import csr_array, vstack
+
+    problem = trial.simulation.problem
+    system, points = problem.system, problem.points
+    rows, n = BlockRows(problem.pattern), points.n_owned
+    values = rows.zeros()
+    for term in problem.terms.values():
+        if isinstance(term, Elastic):
+            rows.add_stiffness(term, system.x, system.active.frozen[term], 0.0, 1.0, values)
+    matrix = AssembledMatrix(points, problem.pattern, "aij", prefix="verify_")
+    matrix.set(values)
+    mine = csr_array(matrix.mat.getValuesCSR()[::-1], shape=(3 * n, 3 * points.n_global))
+    matrix.destroy()
+    free = ~system.held.mask(trial.simulation.time, trial.simulation.time, n).ravel()
+    free[points.padding] = False
+    owned = mine, np.repeat(system.mass, 3), free, points.original
+    stiffness, mass, are_free, original = zip(*points.comm.allgather(owned), strict=True)
+    vertices = np.empty((points.n_vertices_global, 3), dtype=np.int64)
+    for first, numbers in zip(points.bounds, original, strict=False):
+        vertices[numbers] = 3 * (first + np.arange(len(numbers)))[:, None] + np.arange(3)
+    return SmallMotions(
+        vstack(stiffness, "csr"), np.concatenate(mass), np.flatnonzero(np.concatenate(are_free)), vertices
+    )
 
 
 def lowest_modes(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, Array]:
@@ -185,89 +255,31 @@ def lowest_squares(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array,
     SolverError
         If the iteration does not converge, or K + shift · M is not positive definite.
     """
-    problem = trial.simulation.problem
-    system, points = problem.system, problem.points
-    rows, n = BlockRows(problem.pattern), points.n_owned
-    values = rows.zeros()
-    for term in problem.terms.values():
-        if isinstance(term, Elastic):
-            rows.add_stiffness(term, system.x, system.active.frozen[term], 0.0, 1.0, values)
-    held = np.zeros((points.n_local, 3))
-    held[:n] = system.held.mask(trial.simulation.time, trial.simulation.time, n)
-    held.ravel()[points.padding] = 1.0
-    points.update_ghosts(held)
-    mask = held > 0.5
-    rows.add_diagonal(shift * system.mass, values)
-    rows.constrain(values, mask, rows.beside(mask))
-    matrix = AssembledMatrix(points, problem.pattern, "aij")
-    matrix.set(values)
-    solver = direct_solver(points.comm, matrix.mat, "verify_modes_")
-    mass = np.where(mask[:n], 0.0, system.mass[:, None]).ravel()
+    motions = small_motions(trial)
+    comm = trial.simulation.comm
+    squares, vectors = on_root(comm, lambda: _lowest(motions, count, shift))
+    shapes = np.zeros((count, len(motions.mass)))
+    shapes[:, motions.free] = vectors.T
+    return squares, shapes[:, motions.vertices]
+
+
+def _lowest(motions: SmallMotions, count: int, shift: float) -> tuple[Array, Array]:
+    """Lowest eigenvalues (count,) of K φ = λ M φ of the free unknowns, and the vectors (m, count)."""
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import ArpackError, eigsh
+
+    stiffness, mass = motions.stiffness_of_free, motions.mass[motions.free]
+    inertia = diags(mass, format="csc")
+    rank = np.count_nonzero(mass)
+    more = min(count + MORE, rank - 1)
+    first = np.random.default_rng(0).standard_normal(len(mass))  # the same whenever it is run
     try:
-        first = _first_vectors(trial, mask[: points.n_vertices], count)
-        squares, vectors = _subspace_iteration(solver, mass, first, count)
-    finally:
-        solver.destroy()
-        matrix.destroy()
-    shapes = [trial.gather(np.ascontiguousarray(vector).reshape(n, 3)) for vector in vectors.T]
-    return squares - shift, np.array(shapes)
-
-
-def _first_vectors(trial: Trial, held: Mask, count: int) -> Array:
-    """Random vectors (3 n_owned, m), the same on any number of ranks; zero where held, and on edges.
-
-    ``held`` is of the vertices (n_vertices, 3).
-    """
-    points = trial.simulation.problem.points
-    n_free = points.comm.allreduce(int(np.sum(~held)))
-    m = min(2 * count + MORE_VECTORS, n_free)
-    random = np.random.default_rng(0).standard_normal((points.n_vertices_global, 3, m))[points.original]
-    first = np.zeros((points.n_owned, 3, m))
-    first[: points.n_vertices] = np.where(held[:, :, None], 0.0, random)
-    return first.reshape(-1, m)
-
-
-def _subspace_iteration(solver: PETSc.KSP, mass: Array, x: Array, count: int) -> tuple[Array, Array]:
-    """Lowest eigenvalues (count,) of K φ = λ M φ and this rank's rows of the vectors.
-
-    Source: K.-J. Bathe, Finite Element Procedures, 1996, section 11.6.
-    """
-    comm = solver.getComm().tompi4py()
-    right, left = solver.getOperators()[0].createVecs()
-    before = np.full(count, np.inf)
-    for _ in range(MAX_ITERATIONS):
-        mx = mass[:, None] * x
-        y = np.empty_like(x)
-        for k in range(x.shape[1]):
-            right.setArray(mx[:, k])
-            solver.solve(right, left)
-            if solver.getConvergedReason() < 0:
-                raise SolverError("the stiffness of the state cannot be factored", collective=True)
-            y[:, k] = left.getArray(readonly=True)
-        stiffness = comm.allreduce(y.T @ mx)
-        inertia = comm.allreduce(y.T @ (mass[:, None] * y))
-        squares, combination = _small_problem(stiffness, inertia)
-        x = y @ combination
-        if np.all(np.abs(squares[:count] - before) <= TOLERANCE * np.abs(squares[:count])):
-            break
-        before = squares[:count]
-    else:
-        raise SolverError(f"{count} modes not found in {MAX_ITERATIONS} subspace iterations", collective=True)
-    right.destroy()
-    left.destroy()
-    if not squares[0] > 0.0:
+        squares, vectors = eigsh(
+            stiffness, more, inertia, sigma=-shift, v0=first, ncv=min(2 * more + 1, rank)
+        )
+    except (ArpackError, RuntimeError) as error:
+        raise SolverError(f"{count} modes not found: {error}", collective=True) from None
+    order = np.argsort(squares)[:count]
+    if not squares[order[0]] > -shift:
         raise SolverError("the stiffness of the state is not positive definite", collective=True)
-    return squares[:count], x[:, :count]
-
-
-def _small_problem(stiffness: Array, inertia: Array) -> tuple[Array, Array]:
-    """All eigenpairs of a small symmetric pencil, eigenvalues ascending, vectors of unit inertia."""
-    try:
-        factor = np.linalg.inv(np.linalg.cholesky(0.5 * (inertia + inertia.T)))
-    except np.linalg.LinAlgError:
-        # the same numbers on all ranks
-        raise SolverError(
-            "subspace iteration lost the independence of its vectors", collective=True
-        ) from None
-    squares, vectors = np.linalg.eigh(factor @ (0.5 * (stiffness + stiffness.T)) @ factor.T)
-    return squares, factor.T @ vectors
+    return squares[order], vectors[:, order]

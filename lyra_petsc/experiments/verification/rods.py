@@ -1,4 +1,4 @@
-"""Cantilevers that bend without limit: exact shapes by Chebyshev collocation, numpy only.
+"""Cantilevers that bend without limit: exact shapes by collocation (scipy).
 
 A strip clamped horizontally at S = 0 carries its weight w [N/m²] and a tip load P [N/m], both dead and
 downwards. θ is the angle below the horizontal, V = P + w (L − S) the vertical force per width carried by
@@ -29,7 +29,7 @@ Columns and tall cantilevers buckle: `column_shape`, `tall_cantilever`. Pressure
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -37,9 +37,8 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 
-NODES = 160
-"""Collocation points: 1e-11 for weights up to 1e4 B/L³, whose boundary layer is 0.01 L wide."""
-
+POINTS, ACCURACY = 201, 1e-10
+"""Of a rod in the first guess, and the relative residual of its equations in the end."""
 
 PACE = 0.7
 """Steps of the load in a doubling of it."""
@@ -85,40 +84,31 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
     ArithmeticError
         If Newton's method does not converge.
     """
-    s, _, integral = chebyshev(NODES)
 
-    def bent(state: Array, part: float) -> tuple[Array, Array]:
-        """Force and stretch along the strip under this part of the load."""
+    # θ, θ', reach, drop
+    def rates(s: Array, state: Array, part: float) -> Array:
+        angle, bend, _, _ = state
         force = part * (tip_load + weight * (1.0 - s))
-        return force, stretches(force * np.sin(state[:, 0]), stretch)
+        length = stretches(force * np.sin(angle), stretch)
+        along = length * np.cos(angle)
+        return np.stack([bend, -force * along, along, length * np.sin(angle)])
 
-    def rates(state: Array, part: float) -> Array:
-        force, length = bent(state, part)
-        return np.stack([state[:, 1], -length * force * np.cos(state[:, 0])], axis=1)
+    def ends(clamp: Array, tip: Array) -> Array:
+        return np.array([clamp[0], tip[1], clamp[2], clamp[3]])
 
-    # θ and θ'
-    state = _grown(rates, np.zeros(2), 1, NODES, load=max(weight, tip_load))
-    theta, length = state[:, 0], bent(state, 1.0)[1]
-    return Cantilever(
-        reach=float(integral @ (length * np.cos(theta))),
-        drop=float(integral @ (length * np.sin(theta))),
-        angle=float(theta[-1]),
-        clamp_curvature=float(state[0, 1]),
-    )
+    state = _grown(rates, ends, [0.0, 0.0, 0.0, 0.0], along=2, load=max(weight, tip_load))
+    angle, _, reach, drop = state[:, -1].tolist()
+    return Cantilever(reach, drop, angle, float(state[1, 0]))
 
 
 @cache
 def overhang_weight(degrees: float) -> float:
     """Γ at which the chord from the clamp to the tip is ``degrees`` below the horizontal (secant method)."""
+    from scipy.optimize import newton
+
     target = math.tan(math.radians(degrees))
-    before, now = 1.0, 8.0 * target
-    error_before = _slope(before) - target
-    for _ in range(50):
-        error = _slope(now) - target
-        if abs(error) < 1e-11:
-            return now
-        before, now, error_before = now, now - error * (now - before) / (error - error_before), error
-    raise ArithmeticError(f"no overhang found for {degrees} degrees")
+    # without a derivative this is the secant method
+    return float(newton(lambda weight: _slope(weight) - target, 1.0, x1=8.0 * target, tol=1e-12))
 
 
 def _slope(weight: float) -> float:
@@ -127,53 +117,58 @@ def _slope(weight: float) -> float:
 
 
 def _grown(
-    rates: Callable[[Array, float], Array], start: Array, held: int, nodes: int, *, load: float
+    rates: Callable[..., Array],
+    ends: Callable[[Array, Array], Array],
+    start: Sequence[float],
+    *,
+    along: int,
+    load: float,
 ) -> Array:
-    """The state (nodes + 1, m) of a rod that has grown with its load, by Newton's method.
+    """The state (m, n) from the clamp to the tip of a rod that has grown with its load, by collocation.
 
     Parameters
     ----------
     rates : callable
-        Derivatives (nodes + 1, m) along the rod, of a state and the part of the load.
+        Derivatives (m, n) along the rod, of places s, a state and the part of the load.
+    ends : callable
+        What is to vanish (m,), of the states at the clamp and at the tip.
     start : (m,)
-        Unknowns everywhere in the straight rod.
-    held : int
-        So many of them keep their values at the clamp; the others are zero at the free end.
+        The state at the clamp of the straight rod, which is the same all along.
+    along : int
+        But for this one, the place along it.
     load : float
         Its size.
 
     Raises
     ------
     ArithmeticError
-        If Newton's method does not converge.
+        If no equilibrium is found.
     """
-    n, m = nodes + 1, len(start)
-    linear = np.einsum("ij,ab->iajb", chebyshev(nodes)[1], np.eye(m))
-    linear[0, :held] = linear[-1, held:] = 0.0
-    for a in range(m):
-        linear[0 if a < held else -1, a, 0 if a < held else -1, a] = 1.0
-    inside = np.ones((n, m))
-    inside[0, :held] = inside[-1, held:] = 0.0
-    ends = np.zeros((n, m))
-    ends[0, :held] = start[:held]
-    state, steps = np.tile(start, (n, 1)), max(1, math.ceil(PACE * math.log2(1.0 + load)))
+    s, steps = np.linspace(0.0, 1.0, POINTS), max(1, math.ceil(PACE * math.log2(1.0 + load)))
+    state = np.tile(np.asarray(start)[:, None], POINTS)
+    state[along] = s
     for step in range(1, steps + 1):
         part = ((1.0 + load) ** (step / steps) - 1.0) / load if load > 0.0 else 1.0
-        for _ in range(40):
-            residual = np.tensordot(linear, state) - ends - inside * rates(state, part)
-            jacobian = linear.copy()
-            for a in range(m):
-                moved = np.zeros_like(state)
-                moved[:, a] = size = 1e-6 * (1.0 + np.abs(state[:, a]).max())
-                slope = (rates(state + moved, part) - rates(state - moved, part)) / (2.0 * size)
-                jacobian[np.arange(n), :, np.arange(n), a] -= inside * slope
-            change = np.linalg.solve(jacobian.reshape(n * m, n * m), residual.reshape(-1))
-            state = state - change.reshape(n, m)
-            if np.abs(change).max() < 1e-9 * (1.0 + np.abs(state).max()):
-                break
-        else:
-            raise ArithmeticError(f"no equilibrium found at load {part * load:g}")
+        accuracy = ACCURACY if step == steps else 1e-4
+        s, state, _ = _solved(partial(rates, part=part), ends, s, state, accuracy)
     return state
+
+
+def _solved(
+    rates: Callable[..., Array],
+    ends: Callable[..., Array],
+    s: Array,
+    state: Array,
+    accuracy: float = ACCURACY,
+    parameters: Sequence[float] | None = None,
+) -> tuple[Array, Array, Array]:
+    """Places, states and parameters that solve a boundary value problem."""
+    from scipy.integrate import solve_bvp
+
+    found = solve_bvp(rates, ends, s, state, p=parameters, tol=accuracy, max_nodes=50_000)
+    if not found.success:
+        raise ArithmeticError(f"no equilibrium found: {found.message}")
+    return found.x, found.y, found.p
 
 
 def stretches(tension: Array, compliance: float) -> Array:
@@ -185,30 +180,6 @@ def stretches(tension: Array, compliance: float) -> Array:
         if np.abs(change).max() < 1e-15:
             break
     return length
-
-
-def chebyshev(n: int) -> tuple[Array, Array, Array]:
-    """Chebyshev points on [0, 1] ascending (n + 1,), differentiation matrix, Clenshaw-Curtis weights."""
-    k = np.arange(n + 1)
-    t = -np.cos(np.pi * k / n)
-    c = np.where((k == 0) | (k == n), 2.0, 1.0) * (-1.0) ** k
-    # differences as products of sines: no cancellation between close points
-    apart = -2.0 * np.sin(np.pi * (k[:, None] + k) / (2 * n)) * np.sin(np.pi * (k - k[:, None]) / (2 * n))
-    np.fill_diagonal(apart, 1.0)
-    derivative = (c[:, None] / c) / apart
-    np.fill_diagonal(derivative, 0.0)
-    np.fill_diagonal(derivative, -derivative.sum(axis=1))
-    even = np.arange(2, n + 1, 2)
-    moments = np.zeros(n + 1)
-    moments[0] = 2.0
-    moments[even] = 2.0 / (1.0 - even**2.0)
-    ends = np.where((k == 0) | (k == n), 0.5, 1.0)
-    cosines = np.cos(np.pi * np.outer(k, k) / n)
-    weights = ends * (cosines * (ends * moments)).sum(axis=1) * 2.0 / n
-    return 0.5 * (1.0 + t), 2.0 * derivative, 0.5 * weights
-
-
-COUPLED_NODES = 64
 
 
 @cache
@@ -227,57 +198,34 @@ def heavy_coupled_strip(weight: float, stretch: float = 0.0) -> tuple[float, flo
     ArithmeticError
         If Newton's method does not converge.
     """
-    s, _, integral = chebyshev(COUPLED_NODES)
-    force = np.zeros((COUPLED_NODES + 1, 3))
-    force[:, 2] = -weight * (1.0 - s)
-    # quaternion of the frame, and the moment in space
-    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    rates = partial(_rates, force=force, stretch=stretch)
-    state = _grown(rates, start, 4, COUPLED_NODES, load=weight)
-    along = _frame(state)[0]
-    length = stretches((along * force).sum(axis=1), stretch)
-    reach, sideways, up = integral @ (length[:, None] * along)
-    return float(reach), float(sideways), float(-up)
+
+    # quaternion of the frame, moment in space, and place
+    def ends(clamp: Array, tip: Array) -> Array:
+        return np.concatenate([clamp[:4] - [1.0, 0.0, 0.0, 0.0], tip[4:7], clamp[7:]])
+
+    start = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    state = _grown(partial(_rates, weight=weight, stretch=stretch), ends, start, along=7, load=weight)
+    reach, sideways, up = state[7:, -1].tolist()
+    return reach, sideways, -up
 
 
-def _frame(state: Array) -> tuple[Array, Array]:
-    """d1 and d2 (n, 3) of the quaternions."""
-    w, x, y, z = state[:, :4].T
-    one = np.stack([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    two = np.stack([2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)], axis=1)
-    return one, two
-
-
-def _rates(state: Array, part: float, force: Array, stretch: float) -> Array:
-    """Derivatives of the state along the strip, lengths over L and moments over B/L."""
-    force = part * force
-    one, two = _frame(state)
-    moment = state[:, 4:]
-    about_one, about_two = (moment * one).sum(axis=1), (moment * two).sum(axis=1)
+def _rates(s: Array, state: Array, part: float, weight: float, stretch: float) -> Array:
+    """Derivatives (10, n) of the state along the strip, lengths over L and moments over B/L."""
+    force = np.stack([0.0 * s, 0.0 * s, -part * weight * (1.0 - s)])
+    (w, x, y, z), moment = state[:4], state[4:7]
+    # d1 and d2 of the quaternion
+    one = np.stack([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    two = np.stack([2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)])
+    about_one, about_two = (moment * one).sum(axis=0), (moment * two).sum(axis=0)
     twist = 0.25 * (about_one + about_two)
     bend = -about_two - twist
-    length = stretches((one * force).sum(axis=1), stretch)
-    w, x, y, z = state[:, :4].T
+    along = stretches((one * force).sum(axis=0), stretch) * one
     # ½ q ω with ω = (twist, −bend, 0) in the frame
-    turning = 0.5 * np.stack(
-        [-x * twist + y * bend, w * twist + z * bend, -w * bend + z * twist, -x * bend - y * twist], axis=1
-    )
-    return np.concatenate([turning, -length[:, None] * np.cross(one, force)], axis=1)
+    turning = [-x * twist + y * bend, w * twist + z * bend, -w * bend + z * twist, -x * bend - y * twist]
+    return np.concatenate([0.5 * np.stack(turning), -np.cross(along, force, axis=0), along])
 
 
 # -- buckling --------------------------------------------------------------------------------------------
-
-
-def elliptic(k: float) -> tuple[float, float]:
-    """Complete elliptic integrals K and E of modulus 0 ≤ k < 1, by the arithmetic-geometric mean."""
-    a, b, total, power = 1.0, math.sqrt(1.0 - k * k), 0.5 * k * k, 0.5
-    while a - b > 1e-15 * a:
-        c = 0.5 * (a - b)
-        a, b = 0.5 * (a + b), math.sqrt(a * b)
-        power *= 2.0
-        total += power * c * c
-    whole = 0.5 * math.pi / a
-    return whole, whole * (1.0 - total)
 
 
 def column_shape(*, shortening: float | None = None, load: float | None = None) -> tuple[float, float]:
@@ -287,16 +235,17 @@ def column_shape(*, shortening: float | None = None, load: float | None = None) 
     half the angle at the ends, P L²/B = 4 K², distance of the ends 2 E/K − 1 and height k/K. Clamped, each
     half of the column is the same curve at half the size: four times the load, the same height.
     """
-    low, high = 0.0, 1.0 - 1e-15
-    for _ in range(200):
-        k = 0.5 * (low + high)
-        whole, second = elliptic(k)
+    from scipy.optimize import brentq
+    from scipy.special import ellipe, ellipk
+
+    def off(k: float) -> float:
+        """How far the curve of modulus k is off what is given."""
         if load is None:
-            assert shortening is not None
-            less = 2.0 - 2.0 * second / whole < shortening
-        else:
-            less = 4.0 * whole**2 < load
-        low, high = (k, high) if less else (low, k)
+            return 2.0 - 2.0 * ellipe(k * k) / ellipk(k * k) - shortening
+        return 4.0 * ellipk(k * k) ** 2 - load
+
+    k = brentq(off, 0.0, 1.0 - 1e-15, xtol=1e-15)
+    whole = float(ellipk(k * k))
     return 4.0 * whole**2, k / whole
 
 
@@ -316,21 +265,26 @@ def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]
     stiffer, warping : float
         EI/GJ and μ.
     """
-    s, derivative, integral = chebyshev(COUPLED_NODES)
-    lever, n = 1.0 - s, len(s)
-    from_clamp, to_end = np.zeros((n, n)), np.zeros((n, n))
-    from_clamp[1:, 1:] = np.linalg.inv(derivative[1:, 1:])
-    to_end[:-1, :-1] = -np.linalg.inv(derivative[:-1, :-1])
-    twisting = np.eye(n) - warping * derivative @ derivative
-    torque = to_end @ np.diag(lever**2) @ from_clamp
-    if warping > 0.0:
-        twisting[0], twisting[-1] = np.eye(n)[0], derivative[-1]
-        torque[[0, -1]] = 0.0
-    values, vectors = np.linalg.eig(np.linalg.solve(twisting, torque))
-    lowest = int(np.argmax(values.real))
-    factor, turn = 1.0 / math.sqrt(values[lowest].real), from_clamp @ vectors[:, lowest].real
-    deflection = factor / math.sqrt(stiffer) * float(integral @ (lever**2 * turn))
-    return factor, abs(float(turn[-1]) / deflection)
+
+    # θ and ∫ₛ¹ (1 − t)² θ dt, with μ also u and √μ u'; the parameter is κ², the turn of the tip is 1
+    layer = math.sqrt(warping)
+
+    def rates(s: Array, state: Array, square: Array) -> Array:
+        turn, torque, *warped = state
+        rate = warped[0] if warped else square * torque
+        more = [warped[1] / layer, (rate - square * torque) / layer] if warped else []
+        return np.stack([rate, -((1.0 - s) ** 2) * turn, *more])
+
+    def ends(clamp: Array, tip: Array, square: Array) -> Array:
+        more = [clamp[2], tip[3]] if warping else []
+        return np.array([clamp[0], tip[1], tip[0] - 1.0, *more])
+
+    s = np.linspace(0.0, 1.0, POINTS)
+    guess = np.stack([s * (2.0 - s), 0.1 * (1.0 - s), 2.0 - 2.0 * s, -2.0 * layer + 0.0 * s])
+    _, state, (square,) = _solved(rates, ends, s, guess[: 4 if warping else 2], 1e-8, [16.0])
+    factor = math.sqrt(square)
+    deflection = factor / math.sqrt(stiffer) * float(state[1, 0])
+    return factor, 1.0 / abs(deflection)
 
 
 def pressed_tip(load: float, steps: int = 1000) -> tuple[float, float]:

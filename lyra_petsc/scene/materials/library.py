@@ -139,34 +139,15 @@ class ClothTable:
     measured: bool = False
 
 
-@dataclass(frozen=True)
-class IsotropicSheet:
-    """A sheet of an isotropic engineering material.
-
-    Attributes
-    ----------
-    young : float [Pa]
-    poisson : float
-    thickness : float [m]
-    density : float
-        Areal density [kg/m²].
-    """
-
-    young: float
-    poisson: float
-    thickness: float
-    density: float
-
-
 def _read(library: str) -> dict[str, Any]:
     text = files(__package__).joinpath(library).read_text(encoding="utf-8")
     return json.loads(text)
 
 
 @cache
-def entries() -> dict[str, ClothTable | IsotropicSheet]:
+def entries() -> dict[str, ClothTable | ShellMaterial]:
     """Every material of every library, by name."""
-    found: dict[str, ClothTable | IsotropicSheet] = {}
+    found: dict[str, ClothTable | ShellMaterial] = {}
     for library in TABLE_LIBRARIES:
         for name, row in _read(library)["tables"].items():
             found[name] = ClothTable(
@@ -177,7 +158,7 @@ def entries() -> dict[str, ClothTable | IsotropicSheet]:
     for library in ISOTROPIC_LIBRARIES:
         for name, row in _read(library)["isotropic"].items():
             areal = row["density"] * row["thickness"]
-            found[name] = IsotropicSheet(row["young"], row["poisson"], row["thickness"], areal)
+            found[name] = of_isotropic(row["young"], row["poisson"], row["thickness"], areal)
     return found
 
 
@@ -198,7 +179,7 @@ def isotropic() -> list[str]:
 
 def is_isotropic(name: object) -> bool:
     """Whether an engineering material of the library has this name."""
-    return isinstance(name, str) and isinstance(entries().get(name), IsotropicSheet)
+    return isinstance(name, str) and isinstance(entries().get(name), ShellMaterial)
 
 
 def resolve(
@@ -230,7 +211,7 @@ def resolve(
         if isinstance(entry, ClothTable):
             shell, notes = of_table(entry, material.cloth)
         else:
-            shell = of_isotropic(entry)
+            shell = entry
         name = material.cloth
     else:
         assert material.density is not None
@@ -241,8 +222,7 @@ def resolve(
         else:
             assert material.poisson is not None
             assert material.thickness is not None
-            sheet = IsotropicSheet(material.young, material.poisson, material.thickness, material.density)
-            shell = of_isotropic(sheet)
+            shell = of_isotropic(material.young, material.poisson, material.thickness, material.density)
     if material.bending_model == "midedge":
         shell, more = _with_plate(shell, name)
         notes += more
@@ -289,16 +269,13 @@ def of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
     return ShellMaterial(table.density, c11, c12, c22, table.c33, (at_0, at_45, at_90)), notes
 
 
-def of_isotropic(sheet: IsotropicSheet) -> ShellMaterial:
-    """Constants of an isotropic sheet in plane stress."""
-    stretch = sheet.young * sheet.thickness / (1 - sheet.poisson**2)
-    shear = sheet.young * sheet.thickness / (2 * (1 + sheet.poisson))
-    bend = stretch * sheet.thickness * sheet.thickness / 12
-    nu = sheet.poisson
-    plate = (bend, nu * bend, bend, 0.5 * (1 - nu) * bend)
-    return ShellMaterial(
-        sheet.density, stretch, nu * stretch, stretch, shear, (bend, bend, bend), plate=plate
-    )
+def of_isotropic(young: float, poisson: float, thickness: float, density: float) -> ShellMaterial:
+    """Constants of an isotropic sheet in plane stress; young [Pa], thickness [m], areal density [kg/m²]."""
+    stretch = young * thickness / (1 - poisson**2)
+    shear = young * thickness / (2 * (1 + poisson))
+    bend = stretch * thickness * thickness / 12
+    plate = (bend, poisson * bend, bend, 0.5 * (1 - poisson) * bend)
+    return ShellMaterial(density, stretch, poisson * stretch, stretch, shear, (bend, bend, bend), plate=plate)
 
 
 def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[str]]:

@@ -145,7 +145,6 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     """
     run = StoredRun(options.run)
     scene = scene_shown(run, options.settings)
-    static = scene.time.static
     size = _size(options.size)
     limits = _range(options)
     _check_speeds(options)
@@ -160,8 +159,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
             raise InputError("this run's scene has no handles to draw", key="--handles")
         HeldVertices(run)
     times = _times(options.at)
-    unit = "" if static else " s"
-    states = [pick_state(run.times, time, unit) for time in times]
+    states = [pick_state(run, time, "--at") for time in times]
     nothing_named = not (times or options.film or options.sheet)
     folder = options.out or run.folder
     film_file = options.film or (folder / FILM if nothing_named else None)
@@ -171,6 +169,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     if film_file is not None:
         check_film(options.film or Path(FILM), size)  # the folder of --out may not be there yet
         gif = film_file.suffix.lower() == ".gif"
+        static = scene.time.static
         film = film_file, film_timing(run.times, options.fps, options.speed, static=static, gif=gif)
     check_opengl()
     if options.out is not None:
@@ -210,7 +209,13 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _numbers(text: str, key: str, example: str) -> list[float]:
+def numbers(text: str, key: str, example: str) -> list[float]:
+    """The numbers of an option, with commas between them.
+
+    Raises
+    ------
+    InputError
+    """
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError:
@@ -221,7 +226,7 @@ def _numbers(text: str, key: str, example: str) -> list[float]:
 
 
 def _times(text: str | None) -> list[float]:
-    times = list(dict.fromkeys(_numbers(text, "--at", "0.25,1,2"))) if text is not None else []
+    times = list(dict.fromkeys(numbers(text, "--at", "0.25,1,2"))) if text is not None else []
     if len(times) > MOST_PICTURES:
         raise InputError(
             f"names {len(times)} times, at most {MOST_PICTURES} are drawn; see --film", key="--at"
@@ -315,19 +320,20 @@ def nearest_states(times: Array, at: Array) -> Ints:
     return np.asarray(after - nearer_before, dtype=np.int64)
 
 
-def pick_state(times: Array, time: float, unit: str) -> int:
-    """The state nearest to a time of ``--at``.
+def pick_state(run: StoredRun, time: float, key: str) -> int:
+    """The state nearest to a time that the option ``key`` names.
 
     Raises
     ------
     InputError
         If the time is outside the run.
     """
+    times, unit = run.times, "" if run.scene.time.static else " s"
     first, last = float(times[0]), float(times[-1])
     slack = 1e-6 * max(last - first, abs(last)) + 0.5 * float(np.diff(times).max(initial=0.0))
     if not first - slack <= time <= last + slack:
         raise InputError(
-            f"{time:g}{unit} is outside the run, whose states go from {first:g} to {last:g}{unit}", key="--at"
+            f"{time:g}{unit} is outside the run, whose states go from {first:g} to {last:g}{unit}", key=key
         )
     return int(nearest_states(times, np.array([time]))[0])
 

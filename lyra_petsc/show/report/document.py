@@ -23,9 +23,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lyra_petsc.errors import OutputError
 from lyra_petsc.extras import missing, remedy
-from lyra_petsc.output.agreement import reason, replace_text
+from lyra_petsc.output.agreement import replace_bytes, replace_text
 
 
 def short(value: float, digits: int = 3) -> str:
@@ -211,10 +210,7 @@ class Report:
         for drawing in self.drawings:
             for ending, content in (("png", drawing.png), ("svg", drawing.svg)):
                 path = folder / f"{drawing.name}.{ending}"
-                try:
-                    path.write_bytes(content)
-                except OSError as error:
-                    raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+                replace_bytes(path, content)
                 written.append(path)
         for name, text in (("report.md", self.markdown()), ("report.html", self.html())):
             replace_text(folder / name, text)

@@ -16,6 +16,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.extras import missing
+from lyra_petsc.output import read_run
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
@@ -24,12 +25,7 @@ from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_pla
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure, surface
 
-ENERGIES = {
-    "kinetic_energy": "kinetic",
-    "membrane_energy": "membrane",
-    "bending_energy": "bending",
-    "potential_energy": "potential",
-}
+ENERGIES = {column: column.removesuffix("_energy") for column in read_run.ENERGIES}
 """Names of the columns of energies [J] in words."""
 
 

@@ -8,23 +8,41 @@ from typing import Any
 
 import numpy as np
 import pytest
+from physics import reference
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
 from lyra_petsc.experiments.verification.answers import data
-from lyra_petsc.experiments.verification.cases.hanging import middle
+from lyra_petsc.experiments.verification.cases.hanging import middle, of_chain, of_strip
+from lyra_petsc.experiments.verification.cases.membranes import answer
 from lyra_petsc.experiments.verification.cases.motions import level_fall
 from lyra_petsc.experiments.verification.flat_plates import arc
 
 
 def test_the_level_fall_is_the_tabulated_one() -> None:
-    for t, speed, z in data("wind_drag")["backward_euler_dt_0.01"]:
-        assert level_fall(100.0, t) == pytest.approx((speed, -z), rel=1e-12)
+    for steps, speed, z in reference("backward_euler")["terminal_velocity"]["rows"]:
+        assert level_fall(100.0, 0.01 * steps) == pytest.approx((speed, -z), rel=1e-12)
 
 
 def test_the_level_fall_tends_to_the_continuous_one() -> None:
-    for t, speed, z in data("wind_drag")["continuous"]:
-        assert level_fall(1e5, t) == pytest.approx((speed, -z), rel=1e-3)
+    assert level_fall(1e5, 0.5) == pytest.approx((1.3981709474047688, 0.5619092595485882), rel=1e-3)
+
+
+def test_strips_and_chains_hang_as_tabulated() -> None:
+    tables = reference("hanging")
+    for e, exact in tables["strip"]["rows"]:
+        assert of_strip(e) == pytest.approx(exact, rel=1e-9)
+    for e, bars, exact in tables["chain"]["rows"]:
+        assert of_chain(e, bars) == pytest.approx(exact, rel=1e-9)
+
+
+def test_stress_and_energy_are_the_tabulated_ones() -> None:
+    tables = reference("stvk_patch")
+    for material, _, gradient, _, stress, _, energy in tables["rows"]:
+        c = dict(zip(("c11", "c12", "c22", "c33"), tables["materials"][material], strict=True))
+        found, stored = answer(np.array(gradient), c)
+        np.testing.assert_allclose(found, stress, rtol=1e-9, atol=1e-9)
+        assert stored == pytest.approx(energy, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("row", data("catenary")["unequal_heights"]["rows"])

@@ -1,4 +1,4 @@
-"""Frequencies by subspace iteration."""
+"""Frequencies of small motions."""
 
 from __future__ import annotations
 

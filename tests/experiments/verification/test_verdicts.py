@@ -171,3 +171,13 @@ def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -
 def test_a_limit_wrong_by_a_few_percent_fails(comm: MPI.Comm, name: str) -> None:
     outcome = run_case(comm, wrong_by(CASES.load(name), 0.05), quick=True, warm=False)
     assert not any(verdict.passed for verdict in outcome.verdicts.values())
+
+
+def test_a_package_that_is_missing_is_named() -> None:
+    def measure(bench: Bench, n: float) -> list[Measured]:
+        raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
+
+    case = VerificationCase("a", "b", measure, "c", (1.0,), Exact())
+    [verdict] = run_case(MPI.COMM_SELF, case).verdicts.values()
+    assert not verdict.passed
+    assert "scipy is not installed; get the extra" in verdict.words

@@ -9,8 +9,8 @@ import pytest
 from written_run import met, position, written
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.show.export import formats
-from lyra_petsc.show.export.export_run import FORMATS, ExportFormat, export_run
+from lyra_petsc.show import export
+from lyra_petsc.show.export import FORMATS, ExportFormat, export_run
 
 
 def states(folder):
@@ -49,8 +49,8 @@ def test_times_of_a_sequence_are_beside_it(tmp_path):
     ("asked", "words"),
     [
         ({"to": "fbx"}, r"--to: unknown format 'fbx', (known|did you)"),
-        ({"times": "1.5"}, r"--times: the run goes from 0 to 0\.2 s, not to 1\.5"),
-        ({"times": "nan"}, r"not to nan"),
+        ({"times": "1.5"}, r"--times: 1\.5 s is outside the run, whose states go from 0 to 0\.2 s"),
+        ({"times": "nan"}, r"--times: must be numbers with commas"),
         ({"times": "a"}, r"--times: must be numbers"),
         ({"every": 0}, r"--every: must be at least 1"),
         ({"every": 1, "times": "0"}, r"--every: choose states either by"),
@@ -93,13 +93,13 @@ def test_a_failure_leaves_what_stood_there(tmp_path, monkeypatch):
     run, out = written(tmp_path / "run"), tmp_path / "out"
     export_run(run, "obj", out)
 
-    write_obj = formats.write_obj
+    write_obj = export.write_obj
 
     def fails(states, folder, name):
         write_obj(states, folder, name)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(formats, "write_obj", fails)
+    monkeypatch.setattr(export, "write_obj", fails)
     with pytest.raises(OutputError, match=r"out: cannot be written: No space left on device"):
         export_run(run, "obj", out, force=True, every=2)
     assert states(out) == [0, 1, 2]
@@ -129,7 +129,7 @@ def test_what_has_no_obstacles_does_not_import_them(tmp_path):
     code = """
 import sys
 from lyra_petsc.mesh.build import mesh_of
-from lyra_petsc.show.export.export_run import export_run
+from lyra_petsc.show.export import export_run
 from lyra_petsc.output.read_run import StoredRun
 import lyra_petsc.show.render.draw
 mesh_of(StoredRun(sys.argv[1]).scene)

@@ -12,8 +12,7 @@ from lyra_petsc.mesh.obj_file import read_obj
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.show.export.export_run import export_run
-from lyra_petsc.show.export.formats import turned_up
+from lyra_petsc.show.export import export_run, turned_up
 
 pytestmark = pytest.mark.quick
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,10 @@ from lyra_petsc.show.render.render_plan import (
     pick_state,
     spread_states,
 )
+
+
+def run_of(times):
+    return SimpleNamespace(times=times, scene=SimpleNamespace(time=SimpleNamespace(static=False)))
 
 
 @pytest.mark.parametrize(
@@ -86,13 +92,13 @@ def test_the_nearest_state():
         2,
         2,
     ]
-    assert pick_state(times, 3.0, " s") == 2
+    assert pick_state(run_of(times), 3.0, "--at") == 2
 
 
 @pytest.mark.parametrize("time", [-0.03, 1.03])
 def test_times_outside_the_run_are_refused(time):
     with pytest.raises(InputError, match=r"--at: .* is outside the run, whose states go from 0 to 1 s"):
-        pick_state(np.linspace(0.0, 1.0, 26), time, " s")
+        pick_state(run_of(np.linspace(0.0, 1.0, 26)), time, "--at")
 
 
 def test_pictures_of_a_sheet_are_spread():

@@ -16,13 +16,12 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.meshes import evenly, rectangle
 from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
     STEP,
-    USUAL,
     Content,
     Setting,
     StressCase,
@@ -62,12 +61,16 @@ def _over_ball(
     setting: Setting, bench: Bench, contact: Content, stiffer: float = 1.0, speed: float = 0.0
 ) -> Content:
     """A square metre over a ball, on which it falls."""
-    apart = contact.get("thickness", 0.0) + 0.02
-    mesh = grid(1.0, 1.0, CELLS, CELLS, "alternating")
-    mesh["transform"] = {"translate": [-0.5, -0.48, RADIUS + apart]}
     ball = {"ball": {"sphere": {"center": [0.0, 0.0, 0.0], "radius": RADIUS}}}
+    mesh = _square(RADIUS + (contact.get("thickness", 0.0) + 0.02))
     content = _scene(setting, mesh, contact, ball, initial={"velocity": [0.0, 0.0, -speed]})
     return scale(content, stretching=stiffer)
+
+
+def _square(height: float, side: float = 1.0, cells: int = CELLS, y: float = -0.48) -> Content:
+    """A square [m] whose middle is nearly above the origin."""
+    place = [-0.5 * side, y * side, height]
+    return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": place}}
 
 
 def _on_needles(setting: Setting, bench: Bench) -> Content:
@@ -83,8 +86,7 @@ def _on_needles(setting: Setting, bench: Bench) -> Content:
         sides += [[first + i, first + i + 1, n + 1 + i], [first + i + 1, n + 2 + i, n + 1 + i]]
     triangles = np.concatenate([np.stack(side, axis=1) for side in sides])
     roof = bench.mesh(np.concatenate([below, ridge, beyond]), triangles)
-    mesh = grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": {"translate": [-0.5, -0.48, 0.02]}}
-    return _scene(setting, mesh, {"gap": 0.01}, {"roof": {"mesh": roof}})
+    return _scene(setting, _square(0.02), {"gap": 0.01}, {"roof": {"mesh": roof}})
 
 
 def _through_ring(setting: Setting, bench: Bench) -> Content:
@@ -95,8 +97,7 @@ def _through_ring(setting: Setting, bench: Bench) -> Content:
     ring = {
         f"part{k}": {"capsule": {"from": corners[k], "to": corners[k + 1], "radius": thick}} for k in range(n)
     }
-    mesh = grid(0.5, 0.5, CELLS, CELLS, "alternating")
-    mesh["transform"] = {"translate": [-0.25, -0.25, thick + 0.02]}
+    mesh = _square(thick + 0.02, 0.5, y=-0.5)
     middle = {"nodes": [(CELLS + 1) * (CELLS // 2) + CELLS // 2], "motion": "pull"}
     pull = [{"time": 0.0}, {"time": 80 * STEP, "translate": [0.0, 0.0, -0.6]}]
     scene = _scene(setting, mesh, {"gap": 0.005}, ring)
@@ -135,15 +136,14 @@ def _knot(setting: Setting, bench: Bench) -> Content:
         on = (end - before) / np.linalg.norm(end - before)
         tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * on + s * out)
     way = KNOT * np.concatenate([tails[0][::-1], bow, tails[1]])
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-    cells = round(float(length[-1]) / STRAND)
-    at = np.linspace(0.0, length[-1], cells + 1)
-    middle = np.column_stack([np.interp(at, length, way[:, k]) for k in range(3)])
+    length = float(np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))[-1])
+    cells = round(length / STRAND)
+    middle = evenly(way, cells + 1)
     along = np.gradient(middle, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    flat, faces = rectangle(cells, WIDE, float(length[-1]), WIDE * STRAND)
+    flat, faces = rectangle(cells, WIDE, length, WIDE * STRAND)
     side = np.arange(WIDE + 1.0) - 0.5 * WIDE
     start = (middle + STRAND * side[:, None, None] * across).reshape(-1, 3)
     row = (cells + 1) * np.arange(WIDE + 1)
@@ -214,63 +214,49 @@ def _judged(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verd
 
 _case = partial(StressCase, own=True, steps=STEPS, step=STEP, observe=_crossings, judge=_judged)
 
-GAP = 0.01
+
+def _ball(
+    name: str,
+    title: str,
+    *,
+    stiffer: float = 1.0,
+    speed: float = 0.0,
+    contact: Content | None = None,
+    **more: Any,
+) -> StressCase:
+    """A case over the ball; ``contact`` is added to a gap of a centimetre, ``more`` as of `StressCase`."""
+    scene = partial(_over_ball, contact={"gap": 0.01} | (contact or {}), stiffer=stiffer, speed=speed)
+    return _case(f"contact-{name}", title, scene, **more)
+
+
+RUBS = {"friction": 0.5}
 
 contact = family(
     "contact",
     "contact: thickness, gap, Δt, stiffness, speed, friction, needles, a ring, a knot, layers",
-    _case("contact-plain", "over a ball", partial(_over_ball, contact={"gap": GAP}), level=QUICK),
-    *(
-        _case(
-            f"contact-thick-{part}", f"thickness {part} edges",
-            partial(_over_ball, contact={"gap": GAP, "thickness": part / CELLS}),
-        )
-        for part in (0.1, 0.5)
-    ),
-    *(
-        _case(
-            f"contact-gap-{gap}", f"gap {gap} m",
-            partial(_over_ball, contact={"gap": float(gap)}), level=level,
-        )
-        for gap, level in (("1e-3", FULL), ("1e-4", USUAL), ("1e-5", FULL))
-    ),
-    _case(
-        "contact-gap-1e-5-10ms", "gap 1e-5 m, Δt 10 ms", partial(_over_ball, contact={"gap": 1e-5}),
-        step=0.01, steps=30,
-    ),
-    *(
-        _case(
-            f"contact-{ms}ms", f"Δt {ms} ms", partial(_over_ball, contact={"gap": GAP}),
-            step=1e-3 * ms, steps=steps, level=level,
-        )
-        for ms, steps, level in ((1, 120, FULL), (20, 20, USUAL), (40, 20, USUAL))
-    ),
-    *(
-        _case(f"contact-{factor}", f"membrane × {factor}",
-              partial(_over_ball, contact={"gap": GAP}, stiffer=float(factor)), level=level)
-        for factor, level in (("1e3", USUAL), ("1e6", USUAL))
-    ),
-    *(
-        _case(
-            f"contact-thrown-{speed}", f"thrown at the ball with {speed} m/s",
-            partial(_over_ball, contact={"gap": GAP}, speed=float(speed)), steps=20, level=level,
-        )
-        for speed, level in ((1, FULL), (10, USUAL), (100, USUAL))
-    ),
+    _ball("plain", "over a ball", level=QUICK),
+    _ball("thick-0.1", "thickness 0.1 edges", contact={"thickness": 0.1 / CELLS}),
+    _ball("thick-0.5", "thickness 0.5 edges", contact={"thickness": 0.5 / CELLS}),
+    _ball("gap-1e-3", "gap 1e-3 m", contact={"gap": 1e-3}, level=FULL),
+    _ball("gap-1e-4", "gap 1e-4 m", contact={"gap": 1e-4}),
+    _ball("gap-1e-5", "gap 1e-5 m", contact={"gap": 1e-5}, level=FULL),
+    _ball("gap-1e-5-10ms", "gap 1e-5 m, Δt 10 ms", contact={"gap": 1e-5}, step=0.01, steps=30),
+    _ball("1ms", "Δt 1 ms", step=1e-3, steps=120, level=FULL),
+    _ball("20ms", "Δt 20 ms", step=1e-3 * 20, steps=20),
+    _ball("40ms", "Δt 40 ms", step=1e-3 * 40, steps=20),
+    _ball("1e3", "membrane × 1e3", stiffer=1e3),
+    _ball("1e6", "membrane × 1e6", stiffer=1e6),
+    _ball("thrown-1", "thrown at the ball with 1 m/s", speed=1.0, steps=20, level=FULL),
+    _ball("thrown-10", "thrown at the ball with 10 m/s", speed=10.0, steps=20),
+    _ball("thrown-100", "thrown at the ball with 100 m/s", speed=100.0, steps=20),
     _case("contact-needles", "on a roof of triangles of aspect 1000", _on_needles),
     _case("contact-ring", "pulled through a narrow ring", _through_ring, steps=80),
-    _case(
-        "contact-friction", "friction 0.5",
-        partial(_over_ball, contact={"gap": GAP, "friction": 0.5}), level=QUICK,
-    ),
-    _case(
-        "contact-friction-thrown", "friction 0.5, thrown with 10 m/s",
-        partial(_over_ball, contact={"gap": GAP, "friction": 0.5}, speed=10.0), steps=20,
-    ),
+    _ball("friction", "friction 0.5", contact=RUBS, level=QUICK),
+    _ball("friction-thrown", "friction 0.5, thrown with 10 m/s", contact=RUBS, speed=10.0, steps=20),
     _case("contact-knot", "an overhand knot pulled tight", _knot, steps=80),
     _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
     _case(
-        "contact-many", "a stack with 100,000 contacts", _stack,
-        steps=4, level=FULL, observe=_contacts, judge=_judged_many,
+        "contact-many", "a stack with 100,000 contacts", _stack, steps=4, level=FULL, observe=_contacts,
+        judge=_judged_many,
     ),
 )  # fmt: skip

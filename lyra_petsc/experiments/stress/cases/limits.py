@@ -127,19 +127,13 @@ chain = family(
     "a strip between two supports against the chain that does not stretch",
     *(
         StressCase(
-            f"chain-{stiffness}",
-            f"C {stiffness} N/m, swinging",
-            partial(_strip, stiffness=float(stiffness)),
-            steps=STEPS,
-            step=STEP,
-            level=level,
-            own=True,
-            observe=_edge,
+            f"chain-{stiffness}", f"C {stiffness} N/m, swinging", partial(_strip, stiffness=float(stiffness)),
+            steps=STEPS, step=STEP, level=level, own=True, observe=_edge,
             judge=partial(_tends, stiffness=float(stiffness)),
         )
         for stiffness, level in (("1e4", USUAL), ("1e6", QUICK), ("1e8", USUAL), ("1e10", USUAL))
     ),
-)
+)  # fmt: skip
 
 
 SIDE, GRAVITY, AREAL, CELLS = 1.0, 9.8, 0.15, 16
@@ -185,17 +179,12 @@ def _falls(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdi
 
 
 def _plate_case(stiffness: str, bending: str, step: float, level: Scope) -> StressCase:
+    ms = f"{step * 1e3:g}"
     return StressCase(
-        f"plate-{stiffness}-{bending}-{step * 1e3:g}ms",
-        f"C {stiffness} N/m, B {bending} N·m, Δt {step * 1e3:g} ms",
+        f"plate-{stiffness}-{bending}-{ms}ms", f"C {stiffness} N/m, B {bending} N·m, Δt {ms} ms",
         partial(_plate, stiffness=float(stiffness), bending=float(bending)),
-        steps=round(0.5 / step),
-        step=step,
-        level=level,
-        own=True,
-        observe=_centre,
-        judge=_falls,
-    )
+        steps=round(0.5 / step), step=step, level=level, own=True, observe=_centre, judge=_falls,
+    )  # fmt: skip
 
 
 rigid_plate = family(
@@ -254,17 +243,11 @@ def _paper_case(step: float, level: Scope) -> StressCase:
         )
         return {"kinetic energy": Verdict(error <= allowed, words)}
 
+    ms = f"{step * 1e3:g}"
     return StressCase(
-        f"paper-{step * 1e3:g}ms",
-        f"the paper scene, Δt {step * 1e3:g} ms",
-        lambda setting, bench: _paper(bench, "beuler"),
-        steps=round(PAPER_END / step),
-        step=step,
-        level=level,
-        own=True,
-        observe=_kinetic,
-        judge=judge,
-    )
+        f"paper-{ms}ms", f"the paper scene, Δt {ms} ms", lambda setting, bench: _paper(bench, "beuler"),
+        steps=round(PAPER_END / step), step=step, level=level, own=True, observe=_kinetic, judge=judge,
+    )  # fmt: skip
 
 
 paper = family(

@@ -232,8 +232,7 @@ SPIN = [3.0, 20.0, 1.0]
 """rad/s"""
 
 
-def _tumbling(setting: Setting, bench: Bench) -> Content:
-    content = changed(release)(setting, bench)
+def _spun(content: Content) -> Content:
     content["initial"] = {**(content.get("initial") or {}), "angular_velocity": SPIN}
     return content
 
@@ -242,7 +241,7 @@ free = family(
     "free",
     "no handle: falling, and tumbling",
     StressCase("falling", "no handle, released at rest", changed(release), level=QUICK),
-    StressCase("tumbling", "no handle, thrown with 20 rad/s", _tumbling),
+    StressCase("tumbling", "no handle, thrown with 20 rad/s", changed(release, _spun)),
 )
 
 
@@ -299,13 +298,13 @@ def _jump(setting: Setting, bench: Bench) -> Content:
     return move(setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}])
 
 
-def spinning(setting: Setting, bench: Bench) -> Content:
-    quarters = int(4.0 * TURNS * STEPS * setting.step) + 2
+def _turning(content: Content) -> Content:
+    quarters = int(4.0 * TURNS * STEPS * float(content["time"]["step"])) + 2
     turn = [
         {"time": k / (4.0 * TURNS), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
         for k in range(quarters)
     ]
-    return move(setting.content(), turn)
+    return move(content, turn)
 
 
 def _pull(setting: Setting, bench: Bench, to: float) -> Content:
@@ -321,7 +320,7 @@ handles = family(
     "handles",
     "handles that jump, spin, squeeze and stretch",
     StressCase("jump", "handles jump by a quarter of the sheet in one step", _jump, level=QUICK),
-    StressCase("spin", "handles turn ten times a second", spinning, steps=STEPS),
+    StressCase("spin", "handles turn ten times a second", changed(_turning), steps=STEPS),
     StressCase("squeeze", "handles come together to a tenth", partial(_pull, to=0.1), steps=STEPS),
     StressCase("stretch", "handles go apart threefold", partial(_pull, to=3.0), steps=STEPS, level=QUICK),
 )
@@ -365,10 +364,6 @@ MANY, FEW, LONG = 80, 20, 0.02
 """Numbers of steps, and Δt [s] of the few."""
 
 
-def _changed(change: Callable[..., Content], setting: Setting, bench: Bench, **numbers: float) -> Content:
-    return change(by_directors(setting.content()), **numbers)
-
-
 def _creased(x: Array, spacing: float) -> Array:
     """What is beyond a crease in the middle of x, turned about it until it nearly lies on the rest."""
     middle = 0.5 * (x[:, 0].min() + x[:, 0].max())
@@ -381,21 +376,12 @@ def _creased(x: Array, spacing: float) -> Array:
     return y
 
 
-def _spun(setting: Setting, bench: Bench) -> Content:
-    return by_directors(spinning(setting, bench))
+def _stiffer(content: Content) -> Content:
+    return scale(content, stretching=8.0, bending=10.0)
 
 
-def _strip(
-    setting: Setting,
-    bench: Bench,
-    frames: list[dict[str, Any]],
-    stiffer: bool,
-    integrator: str = "beuler",
-) -> Content:
-    """A strip of the base scene's sheet, or a stiffer one, clamped at both ends, one of which moves."""
-    content = by_directors(setting.content())
-    if stiffer:
-        content = scale(content, stretching=8.0, bending=10.0)
+def _strip(content: Content, frames: list[dict[str, Any]], integrator: str = "beuler") -> Content:
+    """A strip of the sheet, clamped at both ends, one of which moves."""
     content["mesh"] = grid(1.0, 0.3, 40, 12, "alternating") | {"transform": {"translate": [0.0, -0.15, 0.0]}}
     content["time"] = {**content["time"], "integrator": integrator}
     content["handles"] = [{"group": "right", "clamp": True}]
@@ -404,56 +390,45 @@ def _strip(
     return content
 
 
-def _drawn_together(setting: Setting, bench: Bench) -> Content:
+def _drawn_together(content: Content) -> Content:
     """The sheet, whose four sides come together."""
-    content = by_directors(setting.content())
     content["handles"] = [{"group": side} for side in ("left", "right", "bottom", "top")]
     return move(content, [{"time": 0.0}, {"time": MANY * STEP, "scale": [CRUMPLED, CRUMPLED, 1.0]}])
 
 
 def _twist(degrees: float, seconds: float, parts: int) -> list[dict[str, Any]]:
     """Keyframes."""
-    return [
-        {
-            "time": seconds * k / parts,
-            "rotate": {"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts},
-        }
-        for k in range(parts + 1)
-    ]
+    turns = [{"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts} for k in range(parts + 1)]
+    return [{"time": seconds * k / parts, "rotate": turn} for k, turn in enumerate(turns)]
 
 
 CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": MANY * STEP, "scale": [PART, 1.0, 1.0]}]
 
+
+def _directors(
+    name: str, title: str, *changes: Callable[..., Content], case: Any = (), **numbers: Any
+) -> StressCase:
+    """A case of the sheet that bends by directors, changed; ``case`` as of `StressCase`."""
+    return StressCase(f"directors-{name}", title, changed(by_directors, *changes, **numbers), **dict(case))
+
+
+SLOW = {"steps": MANY, "own": True}
+FAST = {"steps": FEW, "step": LONG, "own": True}
+TWICE, THRICE = _twist(720.0, MANY * STEP, 16), _twist(1080.0, FEW * LONG, FEW)
+
 directors = family(
     "directors",
     "bending_model: midedge",
-    StressCase("directors-plain", "as it is", changed(by_directors), level=QUICK),
-    *(
-        StressCase(
-            f"directors-1e6-{ms}ms", f"membrane × 1e6, Δt {ms} ms", partial(_changed, scale, stretching=1e6),
-            step=1e-3 * ms,
-        )
-        for ms in (5, 40)
-    ),
-    StressCase("directors-bending-1e6", "bending × 1e6", partial(_changed, scale, bending=1e6)),
-    StressCase("directors-wind-200", "wind 200 m/s", partial(_changed, blow, speed=200.0)),
-    StressCase("directors-spin", "handles turn ten times a second", _spun, steps=FEW, level=FULL),
-    StressCase("directors-folded", "a crease of 179°, no handle", partial(_changed, release), shape=_creased),
-    StressCase(
-        "directors-twist", "a stiff strip twisted by 720°", steps=MANY, own=True,
-        scene=partial(_strip, frames=_twist(720.0, MANY * STEP, 16), stiffer=True),
-    ),
-    StressCase(
-        "directors-twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", steps=FEW, step=LONG, own=True,
-        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False),
-    ),
-    StressCase(
-        "directors-twist-bdf2", "the same with bdf2", steps=FEW, step=LONG, own=True,
-        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False, integrator="bdf2"),
-    ),
-    StressCase(
-        "directors-crush", "a stiff strip crushed to 2 %", steps=MANY, own=True,
-        scene=partial(_strip, frames=CRUSH, stiffer=True),
-    ),
-    StressCase("directors-crumpled", "all sides come together to 0.3", _drawn_together, steps=MANY, own=True),
-)  # fmt: skip
+    _directors("plain", "as it is", case={"level": QUICK}),
+    _directors("1e6-5ms", "membrane × 1e6, Δt 5 ms", scale, stretching=1e6, case={"step": 0.005}),
+    _directors("1e6-40ms", "membrane × 1e6, Δt 40 ms", scale, stretching=1e6, case={"step": 0.04}),
+    _directors("bending-1e6", "bending × 1e6", scale, bending=1e6),
+    _directors("wind-200", "wind 200 m/s", blow, speed=200.0),
+    _directors("spin", "handles turn ten times a second", _turning, case={"steps": FEW, "level": FULL}),
+    _directors("folded", "a crease of 179°, no handle", release, case={"shape": _creased}),
+    _directors("twist", "a stiff strip twisted by 720°", _stiffer, _strip, frames=TWICE, case=SLOW),
+    _directors("twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", _strip, frames=THRICE, case=FAST),
+    _directors("twist-bdf2", "the same with bdf2", _strip, frames=THRICE, integrator="bdf2", case=FAST),
+    _directors("crush", "a stiff strip crushed to 2 %", _stiffer, _strip, frames=CRUSH, case=SLOW),
+    _directors("crumpled", "all sides come together to 0.3", _drawn_together, case=SLOW),
+)

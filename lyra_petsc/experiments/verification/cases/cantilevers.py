@@ -371,18 +371,13 @@ SHIFT = 100.0
 """1/s², of the size of the lowest square: it stays positive with it also beyond the critical load"""
 
 IN_PLANE = ["x", "y"]
-SECANTS, CLOSE = 8, 1e-5
 
 
 def critical(lowest: Callable[[float], float], first: float, second: float) -> float:
     """The load at which the lowest square changes its sign, by the secant method."""
-    low, high = lowest(first), lowest(second)
-    for _ in range(SECANTS):
-        first, second = second, second - high * (second - first) / (high - low)
-        if abs(second - first) <= CLOSE * abs(second):
-            break
-        low, high = high, lowest(second)
-    return second
+    from scipy.optimize import newton
+
+    return float(newton(lowest, first, x1=second, tol=1e-300, rtol=1e-5))
 
 
 @case(
@@ -449,13 +444,8 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                 motions={"push": frames},
                 loads=[{"traction": [0.0, 0.0, ASIDE], "until": 0.1}],
             )
-            shortenings = iter(SHORTENINGS)
             with bench.simulation(shortened) as trial:
-                while not trial.simulation.finished:
-                    trial.step()
-                    if not np.isclose(trial.simulation.time, (0.5, 1.0)).any():
-                        continue
-                    shortening = next(shortenings)
+                for shortening, _ in zip(SHORTENINGS, trial.through((0.5, 1.0)), strict=True):
                     load, height = column_shape(shortening=shortening)
                     load *= COLUMNS[words][1] / math.pi**2
                     name = f"{words}, {kind}, shortened by {shortening:g} L"

@@ -28,8 +28,27 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
 )
 from lyra_petsc.experiments.verification.flat_plates import lowest_modes
+from lyra_petsc.experiments.verification.rods import stretches
 
-DATA = data("patch_states")
+MATERIALS = {
+    "isotropic": {"c11": 1e3 / 0.91, "c12": 300.0 / 0.91, "c22": 1e3 / 0.91, "c33": 350.0 / 0.91},
+    "orthotropic": {"c11": 1200.0, "c12": 300.0, "c22": 800.0, "c33": 250.0},
+    "nu = 0": {"c11": 1000.0, "c12": 0.0, "c22": 1000.0, "c33": 500.0},
+}
+"""N/m"""
+
+TURN = math.radians(30.0)
+GRADIENTS = [
+    np.diag(stretches)
+    for stretches in ([1, 1], [1.1, 1], [1, 0.9], [1.05, 1.2], [1.2, 1 / 1.2], [3, 1], [0.2, 1])
+]
+GRADIENTS += [np.array([[1.0, 0.3], [0.0, 1.0]]), np.array([[1.07, 0.11], [-0.05, 0.93]])]
+GRADIENTS += [np.array([[math.cos(TURN), -math.sin(TURN)], [math.sin(TURN), math.cos(TURN)]]) @ GRADIENTS[3]]
+"""Plane deformation gradients F: stretches, simple shear, one in general, a turn of stretches."""
+
+PULLS = {"isotropic": (1.01, 1.1, 1.5, 2.0), "orthotropic": (1.01, 1.1, 1.5), "nu = 0": (1.01, 1.1, 1.5, 2.0)}
+"""Stretches along the pull."""
+
 BASE, HEIGHT = 1.0, 0.7
 """m"""
 
@@ -41,13 +60,13 @@ TILT = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
 
 
 def _scene(mesh: dict[str, Any], material: str, **more: Any) -> dict[str, Any]:
-    shell = {"density": 0.2, "membrane": DATA["materials"][material]}
+    shell = {"density": 0.2, "membrane": MATERIALS[material]}
     return scene(mesh, shell, **{"time": ASSEMBLED} | more)
 
 
 @case(
     "30 homogeneous deformations of an irregular membrane: energy, stress, and no force inside",
-    source=DATA["source"],
+    source="closed form S = C e, e = (E11, E22, 2 E12), E = (F^T F - I)/2, energy e.S/2",
     resolutions=(3, 6, 12),
     claim=Exact(1e-10),
 )
@@ -55,20 +74,27 @@ def patch_states(bench: Bench, n: float) -> Sequence[Measured]:
     vertices, triangles = irregular_rectangle(int(n), int(n), BASE, HEIGHT)
     mesh = bench.mesh(vertices, triangles)
     found: list[list[Measured]] = []
-    for material in DATA["materials"]:
+    for material in MATERIALS:
         with bench.simulation(_scene(mesh, material)) as trial:
-            for state in DATA["states"]:
-                if state["material"] == material:
-                    trial.set_state(x=vertices[:, :2] @ np.array(state["F"]).T @ TILT[:2])
-                    found.append(_of_state(trial, state))
+            for gradient in GRADIENTS:
+                trial.set_state(x=vertices[:, :2] @ gradient.T @ TILT[:2])
+                found.append(_of_state(trial, gradient, MATERIALS[material]))
     # of each quantity the state that is farthest off
     return [max(quantity, key=lambda one: one.error) for quantity in zip(*found, strict=True)]
 
 
-def _of_state(trial: Trial, state: dict[str, Any]) -> list[Measured]:
+def answer(gradient: Array, c: dict[str, float]) -> tuple[Array, float]:
+    """Stress S11, S22, S12 [N/m] and energy [J/m²] of a deformation gradient F (2, 2)."""
+    strain = 0.5 * (gradient.T @ gradient - np.eye(2))
+    e = np.array([strain[0, 0], strain[1, 1], 2.0 * strain[0, 1]])
+    stress = np.array([[c["c11"], c["c12"], 0.0], [c["c12"], c["c22"], 0.0], [0.0, 0.0, c["c33"]]]) @ e
+    return stress, 0.5 * float(e @ stress)
+
+
+def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measured]:
     problem = trial.simulation.problem
     membrane, points = problem.membrane, problem.points
-    c = DATA["materials"][state["material"]]
+    exact, stored = answer(gradient, c)
     stiffness, area = max(c["c11"], c["c22"]), BASE * HEIGHT
     energy = trial.total(membrane.energies(problem.system.x)) / area
     force = np.zeros((points.n_local, 3))
@@ -76,19 +102,18 @@ def _of_state(trial: Trial, state: dict[str, Any]) -> list[Measured]:
     x, y = trial.start.T[:2]
     inner = (x > NEAR) & (x < BASE - NEAR) & (y > NEAR) & (y < HEIGHT - NEAR)
     residual = np.abs(trial.gather(force)[inner]).max(initial=0.0)
-    scale = float(max(stiffness, *np.abs(state["S"])))
+    scale = float(max(stiffness, *np.abs(exact)))
     # [N] that one triangle of the mean size puts on a vertex
     nodal = scale * float(np.sqrt(area / problem.outline.n_triangles))
     mine = membrane.strain_and_stress(problem.system.x)[1][: membrane.n_owned]
     stress = np.concatenate(points.comm.allgather(mine))
     measured = [
-        Measured("energy per area", energy, state["energy"], "J/m²", max(stiffness, state["energy"])),
+        Measured("energy per area", energy, stored, "J/m²", max(stiffness, stored)),
         Measured("largest force on an inner vertex", float(residual), 0.0, "N", nodal),
     ]
     for k, name in enumerate(("S11", "S22", "S12")):
-        exact = state["S"][k]
-        value = farthest(stress[:, k], exact)
-        measured.append(Measured(f"{name} of the triangle farthest off", value, exact, "N/m", scale))
+        value, known = farthest(stress[:, k], exact[k]), float(exact[k])
+        measured.append(Measured(f"{name} of the triangle farthest off", value, known, "N/m", scale))
     return measured
 
 
@@ -108,7 +133,10 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
         {"nodes": [0], "axes": ["y"]},
         {"box": [[-1, -1, -1], [2, 2, 1]], "axes": ["z"]},
     ]  # fmt: skip
-    for material, along, across, pull in DATA["uniaxial"]["rows"]:
+    for material, along in ((material, along) for material, some in PULLS.items() for along in some):
+        c, strain = MATERIALS[material], 0.5 * (along**2 - 1.0)
+        across = math.sqrt(1.0 - 2.0 * c["c12"] / c["c22"] * strain)
+        pull = along * (c["c11"] - c["c12"] ** 2 / c["c22"]) * strain
         pulled = [{"time": 0}, {"time": 1, "translate": [(along - 1.0) * BASE, 0, 0]}]
         static = {"handles": handles, "motions": {"pull": pulled}, "time": STATIC}
         with bench.simulation(_scene(mesh, material, **static)) as trial:
@@ -158,20 +186,33 @@ def circular_membrane(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- a stretched one -------------------------------------------------------------------------------------
 
-STRETCHED = data("vibrations")["membrane"]
-MODES = ("11", "21", "31", "12")
+LONG, SHORT, AREAL = 1.0, 0.5, 0.2
+"""m, m, kg/m²"""
+
+TENSE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
+"""N/m"""
+
+STRETCHES = np.diag([1.02, 1.01])
+MODES = ((1, 1), (2, 1), (3, 1), (1, 2))
 """Half waves along and across, by ascending frequency."""
+
+
+def omega_of(along: int, across: int) -> float:
+    """ω [rad/s] of a mode."""
+    (s11, s22, _), _ = answer(STRETCHES, TENSE)
+    return math.pi * math.sqrt((s11 * (along / LONG) ** 2 + s22 * (across / SHORT) ** 2) / AREAL)
 
 
 def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[str, Any]:
     """The scene of the membrane in its stretched state, all edges held there; n × n/2 cells."""
-    vertices, triangles = rectangle(n, n // 2, STRETCHED["A"], STRETCHED["B"])
+    vertices, triangles = rectangle(n, n // 2, LONG, SHORT)
     number = np.arange(len(vertices)).reshape(n // 2 + 1, n + 1)
     edge = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
-    start = vertices * [STRETCHED["lam1"], STRETCHED["lam2"], 0.0]
-    membrane = {name.lower(): STRETCHED[name] for name in ("C11", "C22", "C12", "C33")}
-    mesh, material = bench.mesh(start, triangles, rest=vertices[:, :2]), {"density": STRETCHED["rho"]}
-    return scene(mesh, material | {"membrane": membrane}, time, handles=[{"nodes": edge.tolist()}], **more)
+    start = vertices * [*np.diag(STRETCHES), 0.0]
+    mesh = bench.mesh(start, triangles, rest=vertices[:, :2])
+    return scene(
+        mesh, {"density": AREAL, "membrane": TENSE}, time, handles=[{"nodes": edge.tolist()}], **more
+    )
 
 
 @case(
@@ -186,7 +227,7 @@ def stretched_membrane(bench: Bench, n: float) -> Sequence[Measured]:
     with bench.simulation(_stretched(bench, int(n), ASSEMBLED)) as trial:
         found, _ = lowest_modes(trial, len(MODES))
     return [
-        Measured(f"ω of mode {mode}", float(omega), STRETCHED["omega"][mode], "rad/s")
+        Measured(f"ω of mode {mode[0]}{mode[1]}", float(omega), omega_of(*mode), "rad/s")
         for mode, omega in zip(MODES, found, strict=True)
     ]
 
@@ -195,7 +236,7 @@ CELLS = 16
 AMPLITUDE = 1e-5
 """m: small enough for a linear motion, large enough for its forces to stand above round-off"""
 
-PERIOD = 2.0 * math.pi / STRETCHED["omega"]["11"]
+PERIOD = 2.0 * math.pi / omega_of(1, 1)
 """s"""
 
 
@@ -251,7 +292,6 @@ def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[n
 
 # -- a hanging one ---------------------------------------------------------------------------------------
 
-CHAIN = data("vibrations")["hanging_chain"]
 LENGTH, WIDTH, DENSITY = 1.0, 0.05, 0.2
 """m, m, kg/m²"""
 
@@ -276,18 +316,17 @@ def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
         x = trial.start
         trial.set_state(x=np.column_stack([x[:, 0], _hanging(x[:, 1], n), x[:, 2]]))
         found, _ = lowest_modes(trial, 3)
-    exact = [half * math.sqrt(G / LENGTH) for half in CHAIN["half_j0"]]
+    from scipy.special import jn_zeros
+
+    exact = 0.5 * jn_zeros(0, len(found)) * math.sqrt(G / LENGTH)
     return [
-        Measured(f"ω of mode {k}", float(omega), exact[k - 1], "rad/s") for k, omega in enumerate(found, 1)
+        Measured(f"ω of mode {k}", float(omega), float(wanted), "rad/s")
+        for k, (omega, wanted) in enumerate(zip(found, exact, strict=True), 1)
     ]
 
 
 def _hanging(y: Array, n: float) -> Array:
     """Heights at which every bar between two rows carries what hangs below its middle."""
     tension = DENSITY * G * LENGTH * (np.arange(int(n)) + 0.5) / n
-    # λ³ − λ = 2 T/C by two Newton steps from the linear answer
-    stretch = 1.0 + tension / STIFF
-    for _ in range(2):
-        stretch -= (stretch**3 - stretch - 2.0 * tension / STIFF) / (3.0 * stretch**2 - 1.0)
-    heights = np.concatenate([[0.0], np.cumsum(stretch) * LENGTH / n])
+    heights = np.concatenate([[0.0], np.cumsum(stretches(tension, 1.0 / STIFF)) * LENGTH / n])
     return np.asarray(LENGTH - (heights[-1] - heights)[np.rint(y / LENGTH * n).astype(np.int64)])

@@ -7,13 +7,13 @@ Their deflections, curvatures and small vibrations.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.meshes import SIDES
 from lyra_petsc.experiments.verification.answers import (
     ASSEMBLED,
     STATIC,
@@ -26,16 +26,17 @@ from lyra_petsc.experiments.verification.answers import (
     farthest,
     scene,
 )
-from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, lowest_modes, plate_material
+from lyra_petsc.experiments.verification.flat_plates import (
+    KINDS,
+    flat_mesh,
+    held,
+    lowest_modes,
+    plate_material,
+)
 from lyra_petsc.terms.midedge import MidEdge
 
 EXACT = data("linear_plate")
 AT_ONCE = STATIC | {"step": 1.0}
-HELD = {
-    "CCCC": ("clamp", SIDES),
-    "SSSS": ("pin", SIDES),
-    "CFFF": ("clamp", ("left",)),
-}
 LARGEST = 1e-4
 """Deflection over the side: the plate, which stretches where it bends, is softer by 220 of its squares."""
 
@@ -54,17 +55,11 @@ iterations, where two give nine digits."""
 def plate(bench: Bench, n: float) -> Iterator[Measured]:
     for words, exact in EXACT["deflection"].items():
         edges, poisson = words.split()
-        how, sides = HELD[edges]
-        load = LARGEST / exact["at"]
+        material, load = plate_material(1.0, poisson=float(poisson)), [0.0, 0.0, LARGEST / exact["at"]]
+        loaded = partial(scene, gravity=load, handles=held(edges), solver=FINE_ENOUGH)
         for kind in KINDS:
-            mesh, material = (
-                flat_mesh(bench, kind, round(n), round(n)),
-                plate_material(1.0, poisson=float(poisson)),
-            )
-            held = [{"group": side, "clamp": how == "clamp"} for side in sides]
-            with bench.simulation(
-                scene(mesh, material, AT_ONCE, gravity=[0.0, 0.0, load], handles=held, solver=FINE_ENOUGH)
-            ) as trial:
+            mesh = flat_mesh(bench, kind, round(n), round(n))
+            with bench.simulation(loaded(mesh, material, AT_ONCE)) as trial:
                 height, start = trial.run().x[:, 2], trial.start[:, :2]
             at = int(np.argmin(np.linalg.norm(start - exact["place"], axis=1)))
             value = float(height[at]) / LARGEST
@@ -101,22 +96,16 @@ def _at(x: float, y: float) -> dict[str, Any]:
 )
 def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
     for poisson in RATIOS:
-        moment = SMALL * (1.0 - poisson**2)
+        material, moment = plate_material(1.0, poisson=poisson), SMALL * (1.0 - poisson**2)
         loads: dict[str, tuple[list[dict[str, Any]], tuple[float, float, float]]] = {
-            "bent": (
-                [{"group": side, "moment": moment} for side in ("left", "right")],
-                (1.0, -poisson, 0.0),
-            ),
+            "bent": ([{"group": s, "moment": moment} for s in ("left", "right")], (1.0, -poisson, 0.0)),
             "twisted": ([_at(1.0, 1.0) | {"force": [0, 0, 2.0 * SMALL * (1.0 - poisson)]}], (0.0, 0.0, 1.0)),
         }
         for words, (load, exact) in loads.items():
             for kind in KINDS:
-                mesh, material = (
-                    flat_mesh(bench, kind, round(n), round(n)),
-                    plate_material(1.0, poisson=poisson),
-                )
-                held = [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS]
-                with bench.simulation(scene(mesh, material, AT_ONCE, loads=load, handles=held)) as trial:
+                mesh = flat_mesh(bench, kind, round(n), round(n))
+                body = [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS]
+                with bench.simulation(scene(mesh, material, AT_ONCE, loads=load, handles=body)) as trial:
                     found = _curvatures(bench, trial.run()) / SMALL
                 for k, name in enumerate(("κ11", "κ22", "κ12")):
                     value = farthest(found[:, k], exact[k])
@@ -131,8 +120,6 @@ def _curvatures(bench: Bench, trial: Trial) -> Array:
 
 
 VIBRATIONS = data("plate_vibrations")
-
-CLAMPED = {"CCCC": SIDES, "CFFF": ("left",), "FFFF": ()}
 
 SHAPES = {"square": (1.0, 1), "strip": (0.2, 2)}
 """Height of plates of length 1 m, and how many times n cells they have along that."""
@@ -156,11 +143,10 @@ def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
             edges, poisson = words.split()
             for kind in KINDS:
                 mesh = flat_mesh(bench, kind, round(finer * n), round(finer * n * height), 1.0, height)
-                clamped = [{"group": side, "clamp": True} for side in CLAMPED[edges]]
-                held = [{"group": "sheet", "axes": ["x", "y"]}, *clamped]
+                across = [{"group": "sheet", "axes": ["x", "y"]}, *held(edges)]
                 material = plate_material(1.0, poisson=float(poisson))
-                rigid = 0 if clamped else 3
-                with bench.simulation(scene(mesh, material, ASSEMBLED, handles=held)) as trial:
+                rigid = 3 if edges == "FFFF" else 0
+                with bench.simulation(scene(mesh, material, ASSEMBLED, handles=across)) as trial:
                     found, _ = lowest_modes(trial, rigid + len(exact), shift=SHIFT if rigid else 0.0)
                 for number, (omega, wanted) in enumerate(zip(found[rigid:], exact, strict=True), 1):
                     name = f"λ{number}, {shape}, {edges}, ν = {poisson}, {kind}"

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.optimize import brentq
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import walls
@@ -93,6 +92,8 @@ def flange(length: float, poisson: float) -> float:
     """Compression over π² D/b² at which a plate buckles, three of whose sides are supported, ``length``
     over its width b, that of the last side which is free.
     """
+    from scipy.optimize import brentq
+
     along = math.pi / length
 
     def condition(k: float) -> float:

@@ -6,20 +6,22 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from pydantic import ValidationError
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.scene.json_schema import schema_file
 from lyra_petsc.scene.materials.library import names
-from lyra_petsc.scene.schema import FIELDS
+from lyra_petsc.scene.schema import FIELDS, MeshSource
 
 CLOTHS = 4
 """Names of the library that are shown."""
-
-Box = tuple[tuple[float, ...], tuple[float, ...]]
 
 _GRID = """\
 mesh:
@@ -35,28 +37,7 @@ _PLAIN_NAME = re.compile(r"[A-Za-z_][\w-]*")
 _RESERVED = re.compile("null|true|false|yes|no|on|off", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class OwnMesh:
-    """What the starter scene says of a mesh file.
-
-    Attributes
-    ----------
-    file : Path
-    n_vertices, n_triangles : int
-    groups : mapping of str to (str, int)
-        Point, curve or surface, and the number of vertices, by name.
-    span : pair of (3,)
-        Lower and upper corner [m].
-    """
-
-    file: Path
-    n_vertices: int
-    n_triangles: int
-    groups: Mapping[str, tuple[str, int]]
-    span: Box
-
-
-def starter(scene: Path, commands: tuple[str, str], mesh: OwnMesh | None = None) -> str:
+def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_mesh: bool) -> str:
     """A commented scene that can be run as it stands.
 
     Parameters
@@ -65,32 +46,50 @@ def starter(scene: Path, commands: tuple[str, str], mesh: OwnMesh | None = None)
         Where it will be written; the mesh file is named relative to it.
     commands : pair of str
         How the program is started on one rank and on two.
-    mesh : OwnMesh, optional
-        Without it, a grid.
+    file : Path or None
+        A mesh; without it, a grid.
+    trust_mesh : bool
+        Give gmsh the script whatever it says.
+
+    Raises
+    ------
+    InputError
+        If the mesh cannot be used.
     """
     schema = schema_file()
-    text = files("lyra_petsc.scene").joinpath("starter.yaml").read_text(encoding="utf-8")
+    mesh = None if file is None else _read(file, trust_mesh)
+    text = files("lyra_petsc.cli").joinpath("starter.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(
         schema=schema.as_uri() if " " in str(schema) and schema.is_absolute() else schema,
         one=commands[0],
         two=commands[1],
         file=shlex.quote(scene.name),
         title=_quoted(scene.stem),
-        mesh=_GRID if mesh is None else _mesh(mesh, scene),
+        mesh=_GRID if file is None or mesh is None else _mesh(file, mesh, scene),
         handle=_GRID_HANDLE if mesh is None else _handle(mesh),
         cloths=", ".join(names()[:CLOTHS]),
         fields=", ".join(name for name in FIELDS if name != "velocity"),
     )
 
 
-def _mesh(mesh: OwnMesh, scene: Path) -> str:
-    file = os.path.relpath(mesh.file.absolute(), scene.absolute().parent)
-    if file.startswith(os.path.join("..", "..")):  # far away: neither is likely to move with the other
-        file = str(mesh.file.absolute())
-    lines = ["mesh:", f"  file: {_quoted(file)}"]
-    if mesh.file.suffix.lower() == ".geo":
+def _read(file: Path, trust_mesh: bool) -> Mesh:
+    try:
+        source = MeshSource.model_validate({"file": str(file)})
+    except ValidationError as error:
+        raise InputError(error.errors()[0]["msg"], key="--mesh") from None
+    if not file.is_file():
+        raise InputError(f"no such file: {file}", key="--mesh")
+    return build_mesh([source], trust_scripts=trust_mesh)
+
+
+def _mesh(file: Path, mesh: Mesh, scene: Path) -> str:
+    name = os.path.relpath(file.absolute(), scene.absolute().parent)
+    if name.startswith(os.path.join("..", "..")):  # far away: neither is likely to move with the other
+        name = str(file.absolute())
+    lines = ["mesh:", f"  file: {_quoted(name)}"]
+    if file.suffix.lower() == ".geo":
         lines.append("  # size: 0.02                # m, instead of the element sizes in the .geo")
-    low, high = ("[" + ", ".join(f"{x:.4g}" for x in corner) + "]" for corner in mesh.span)
+    low, high = ("[" + ", ".join(f"{x:.4g}" for x in corner) + "]" for corner in _span(mesh))
     lines += [
         "  # transform: {scale: 0.001}   # for a mesh in millimetres; also: rotate, translate",
         f"  # {mesh.n_vertices} vertices, {mesh.n_triangles} triangles, from {low} to {high}",
@@ -99,21 +98,27 @@ def _mesh(mesh: OwnMesh, scene: Path) -> str:
         lines.append("  # groups, for handles, loads and probes, and those of surfaces for materials:")
         width = max(len(_quoted(name)) for name in mesh.groups)
         lines += [
-            f"  #   {_quoted(name):{width}}  {kind}, {count} {'vertex' if count == 1 else 'vertices'}"
-            for name, (kind, count) in mesh.groups.items()
+            f"  #   {_quoted(name):{width}}  {DIMENSION_NAMES[group.dimension]}, "
+            f"{len(group.vertices)} {'vertex' if len(group.vertices) == 1 else 'vertices'}"
+            for name, group in mesh.groups.items()
         ]
     else:
         lines.append("  # it has no groups (gmsh: Physical Curve, Physical Surface; .obj: g NAME)")
     return "\n".join(lines)
 
 
-def _handle(mesh: OwnMesh) -> str:
+def _span(mesh: Mesh) -> tuple[list[float], list[float]]:
+    """Lower and upper corner [m]."""
+    return mesh.positions.min(axis=0).tolist(), mesh.positions.max(axis=0).tolist()
+
+
+def _handle(mesh: Mesh) -> str:
     lines = ["    # motion: swing"]
-    for name, (kind, count) in mesh.groups.items():
-        if kind != "surface" and count < mesh.n_vertices:
+    for name, group in mesh.groups.items():
+        if group.dimension < 2 and len(group.vertices) < mesh.n_vertices:
             return "\n".join([f"  - group: {_quoted(name)}", *lines])
     # nothing to name: the upper end of the sheet, along z or the longest axis of a flat one
-    low, high = mesh.span
+    low, high = _span(mesh)
     extent = [b - a for a, b in zip(low, high, strict=True)]
     axis = 2 if extent[2] > 0.01 * max(extent) else extent.index(max(extent))
     bottom = [high[k] - 0.01 * extent[k] if k == axis else low[k] for k in range(3)]

@@ -1,0 +1,42 @@
+"""What readers take for granted of a run's summary.json."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel
+
+
+class _Key(BaseModel):
+    key: str = ""
+
+
+class _Resumption(BaseModel):
+    step: int = 0
+    time: float = 0.0
+    ranks: int = 1
+    changes: list[_Key] = []
+
+
+class _Failure(BaseModel):
+    advice: list[str] = []
+
+
+class Summary(BaseModel):
+    """Any entry may be missing, and there are others."""
+
+    title: str | None = None
+    outcome: str = ""
+    ranks: int = 1
+    sizes: dict[str, int] = {}
+    terms: list[str] = []
+    linear_solver: str = ""
+    versions: dict[str, str] = {}
+    petsc_options: dict[str, str | None] = {}
+    unused_petsc_options: list[str] = []
+    integrator: str = ""
+    time: float = 0.0
+    estimated_error: float | None = None
+    steps: int = 0
+    wall_seconds: dict[str, float] = {}
+    notes: list[str] = []
+    resumed: list[_Resumption] = []
+    failure: _Failure = _Failure()
