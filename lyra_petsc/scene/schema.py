@@ -653,7 +653,8 @@ class Handle(Selector):
     axes : tuple of "x", "y", "z"
         Directions that are held.
     clamp : bool
-        Keep the slope of held boundary edges; needs all axes.
+        Keep the slope of held boundary edges. With part of the ``axes`` they slide along the others, in the
+        sheet's plane; by ``midedge`` only.
     symmetry : "x", "y" or "z", or None
         The vertices lie in a plane normal to this axis, in which the sheet is mirrored: they stay in it, and
         the sheet stays normal to it. Takes the place of ``axes``; bends by ``midedge`` only.
@@ -672,8 +673,11 @@ class Handle(Selector):
     rules = (
         *Selector.rules,
         Rule(
-            when(given(clamp={"const": True}), {"properties": {"axes": _ALL_AXES}}),
-            "keeps the slope of an edge that does not move by itself; hold all axes, or leave clamp out",
+            when(
+                given(clamp={"const": True}),
+                {"anyOf": [{"properties": {"axes": _ALL_AXES}}, absent("stiffness")]},
+            ),
+            "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
             "clamp",
         ),
         Rule(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -30,6 +30,9 @@ from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Load
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.following_loads import FollowingLoads
 
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""
@@ -64,6 +67,9 @@ LONGEST = 1e7
 
 ANY = float(np.finfo(np.float64).max)
 """Beyond all Δτ."""
+
+NUDGE = 1e-6
+"""Of an edge, by which handles are moved to see what force that takes."""
 
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
@@ -148,8 +154,7 @@ class Equilibrium:
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
-                self._rate, spent = self._stepper.tangent(self._pull)
-                linear += spent
+                linear += self._learn_rate(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
@@ -161,7 +166,7 @@ class Equilibrium:
             if attempt.converged:
                 system.active.on_the_way(system.x)
             if self._follows:
-                self._take_loads(relaxation, before, factor)
+                linear += self._take_loads(relaxation, before, factor, first=solves == 0)
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
@@ -204,27 +209,95 @@ class Equilibrium:
         )
 
     def _look_ahead(self, before: float, factor: float) -> None:
-        """Expect equilibria to go on along the tangent where loads alone change; collective."""
+        """Expect equilibria to go on along the tangent; collective."""
         if before != self._found:
             return
-        system = self._system
-        self._pull = system.out_of_balance()[0] / (factor - before)
-        moves = system.points.largest(float(np.abs(system.prescribed.velocity).max(initial=0.0)))[0] > 0.0
-        if self._rate is not None and not moves:
+        self._pull = self._system.out_of_balance()[0] / (factor - before)
+        if self._rate is not None:
             self._integrator.others = self._extrapolation.along(factor, self._rate)
 
-    def _take_loads(self, relaxation: Relaxation, before: float, factor: float) -> None:
-        """Let the next solve have loads of the present shape, and pressures as they change from there."""
+    def _learn_rate(self, start: Array, before: float, factor: float) -> int:
+        """How the equilibrium just found changes as loads do and handles go on from where they were in the
+        positions ``start`` (n_owned, 3); linear iterations; collective.
+        """
+        system, n = self._system, len(start)
+        step = factor - before
+        moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
+        (largest,) = system.points.largest(float(np.abs(moved).max(initial=0.0)))
+        pull = self._pull
+        if largest > 0.0 and system.discretisation.guards:
+            self._rate = None  # with contact guesses are others
+            return 0
+        if largest > 0.0:
+            x, part = system.x.copy(), NUDGE * self._spacing / largest
+            here = system.out_of_balance()[0]
+            system.x[:n] += part * moved
+            system.points.update_ghosts(system.x)
+            system.forget_forces()
+            pull = pull + (system.out_of_balance()[0] - here) / (part * step)
+            system.x[:] = x
+            system.forget_forces()
+        self._rate, spent = self._tangent(pull, self._known(before, factor))
+        if self._rate is not None:
+            self._rate += moved / step
+        return spent
+
+    def _take_loads(self, relaxation: Relaxation, before: float, factor: float, *, first: bool) -> int:
+        """Let the next solve have loads of the present shape, and pressures as they change from there.
+
+        Returns linear iterations.
+        """
+        system, now = self._system, self._system.applied.now.copy()
+        known = system.applied.following = self._known(before, factor)
+        way, spent = None, 0
+        if known is not None and not system.active.viscous:  # of wind no stiffness is known
+            if not first:
+                way, spent = self._tangent(system.out_of_balance()[0], known)
+            elif self._integrator.others and self._rate is not None:
+                way = (factor - before) * self._rate
+        if known is None or way is None:
+            system.applied.given = relaxation.following(now)
+        else:
+            system.applied.given = now + self._skew_force(known, way)
+        return spent
+
+    def _known(self, before: float, factor: float) -> FollowingLoads | None:
+        """Pressures as they change from the present shape, if there are any."""
+        pressures = self._system.active.following
+        if not pressures:
+            return None
+        from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
+
+        def force_of(load: Load, x: Array, out: Array) -> None:
+            load.add_force(x, before, factor, out)
+
+        return FollowingLoads(pressures, self._system.x, force_of, factor)
+
+    def _skew_force(self, known: FollowingLoads, way: Array) -> Array:
+        """Force (n_owned, 3) [N] on free unknowns by the skew stiffness of pressures on a way; collective."""
         system = self._system
-        system.applied.given = relaxation.following(system.applied.now.copy())
-        pressures = system.active.following
-        if pressures:
-            from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
+        local = np.zeros_like(system.x)
+        local[: len(way)] = way
+        system.points.update_ghosts(local)
+        return np.where(system.prescribed.free, known.skew_force(local, len(way)), 0.0)
 
-            def force_of(load: Load, x: Array, out: Array) -> None:
-                load.add_force(x, before, factor, out)
+    def _tangent(self, force: Array, known: FollowingLoads | None) -> tuple[Array | None, int]:
+        """As `Stepper.tangent`, with all of the stiffness of pressures; collective."""
+        if known is None:
+            return self._stepper.tangent(force)
+        from lyra_petsc.stepping.following_loads import newton_way
 
-            system.applied.following = FollowingLoads(pressures, system.x, force_of, factor)
+        linear = 0
+
+        def solve(force: Array) -> Array | None:
+            nonlocal linear
+            way, spent = self._stepper.tangent(force)
+            linear += spent
+            return way
+
+        comm = self._system.points.comm
+        way = newton_way(force, solve, lambda way: self._skew_force(known, way), comm.allreduce)
+        return way, linear
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""

@@ -209,6 +209,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
     _check_symmetry(rest, held)
+    _check_sliding(rest, held)
     for entry in map(registered, names):
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
@@ -269,6 +270,40 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
             problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
         if problem:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
+
+
+def _check_sliding(rest: RestShape, held: Selection) -> None:
+    """Refuse clamps that slide and turn, or slide out of the sheet's plane, or on which hinges end.
+
+    The director of an edge that slides in a plane normal to it stays as it is.
+    """
+    scene, mesh = rest.scene, rest.mesh
+    for number, vertices in held.items():
+        handle = scene.handles[number]
+        free = [axis for axis in range(3) if axis not in handle.axis_numbers]
+        if not handle.clamp or not free:
+            continue
+        from lyra_petsc.terms.midedge import normals_of  # with kernels
+
+        there = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
+        leaning = np.abs(normals_of(mesh.positions, mesh.triangles[there])[:, free]).max(initial=0.0)
+        keyframes = scene.motions[handle.motion] if handle.motion is not None else ()
+        names = ", ".join(AXES[axis] for axis in free)
+        problem = ""
+        if leaning > FLAT:
+            problem = (
+                f"keeps the slope of an edge that slides in its sheet's plane, not along {names} out of it"
+            )
+        elif (there & rest.bends_by("hinge")).any():
+            problem = "is not kept by hinges on edges that slide; give the material bending_model: midedge"
+        elif any(keyframe.rotate is not None for keyframe in keyframes):
+            problem = "keeps no slope of an edge that turns and slides"
+        if problem:
+            raise InputError(
+                f"{problem}; hold all axes, or leave clamp out",
+                file=scene.source,
+                key=f"handles[{number}].clamp",
+            )
 
 
 def _barrier(rest: RestShape) -> Barrier | None:

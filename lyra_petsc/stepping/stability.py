@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.inertia import Inertia
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.term import Load
 
 MOST_VERTICES = 200_000
 """Above it no factors are computed."""
@@ -28,6 +29,9 @@ HALVINGS, DOUBLINGS = 10, 40
 
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Golden ratio, whose multiples fill the fractions evenly."""
+
+GAUSS = np.sqrt(3.0) / 6.0
+"""From the middle to the points of the quadrature with two of them, exact for cubics."""
 
 BENDS = 0.5
 """Part of a mode that must be on vertices with bending stiffness for it not to be a wrinkle."""
@@ -149,7 +153,7 @@ class Examination:
         return way
 
     def _potential(self, way: Array) -> float:
-        """Energies minus the work of the present loads [J] at the end of a way from here."""
+        """Energies minus the work of the loads [J] at the end of a way from here."""
         system = self._system
         x = system.x.copy()
         x[: len(way)] += way
@@ -157,7 +161,20 @@ class Examination:
         stored = sum(
             float(term.energies(x, system.active.frozen[term]).sum()) for term in system.active.elastic
         )
-        return float(system.points.summed(stored - float(np.vdot(system.applied.now, way)))[0])
+        force = system.applied.now.copy()
+        for load in system.active.following:
+            force += system.applied.factor * self._change(load, x, len(way))
+        return float(system.points.summed(stored - float(np.vdot(force, way)))[0])
+
+    def _change(self, load: Load, x: Array, n: int) -> Array:
+        """Mean on the way to x (n_local, 3) of a load's change from here (n, 3) [N], exact for a pressure."""
+        system = self._system
+        total = np.zeros_like(x)
+        for part in (0.5 - GAUSS, 0.5 + GAUSS):
+            load.add_force((1.0 - part) * system.x + part * x, system.t0, system.t1, total)
+        here = np.zeros_like(x)
+        load.add_force(system.x, system.t0, system.t1, here)
+        return (0.5 * total - here)[:n]
 
     def destroy(self) -> None:
         """Free the factors; collective."""

@@ -1,4 +1,4 @@
-"""Symmetric part of the stiffness of loads that follow the shape, by differences of each element's force."""
+"""Stiffness of loads that follow the shape, by differences of each element's force."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ STEP = 1e-5
 
 def following_stiffness(
     term: Term, x: Array, force: Callable[[Term, Array, Array], None]
-) -> NDArray[np.float64]:
-    """−½ (∂f/∂x + ∂f/∂xᵀ) of each element [N/m], (E, n, n, 3, 3), at positions x (n_local, 3).
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Symmetric and skew part of −∂f/∂x of each element [N/m], each (E, n, n, 3, 3), at x (n_local, 3).
 
     ``force`` adds the forces [N] of a term at positions to an array. The term's elements are pulled apart,
     so that each of their points can be moved in all at once.
@@ -41,4 +41,5 @@ def following_stiffness(
                 force(apart, moved.reshape(-1, 3), forces)
                 change += sign * forces
             out[:, :, point, :, axis] = -change.reshape(n_elements, n, 3) / (2.0 * step)
-    return 0.5 * (out + out.transpose(0, 2, 1, 4, 3))
+    other = out.transpose(0, 2, 1, 4, 3)
+    return 0.5 * (out + other), 0.5 * (out - other)

@@ -112,7 +112,7 @@ CASES = [
     ("handles: [{nodes: [0], stiffness: 1, symmetry: x}]", "handles[0].symmetry", "motion, stiffness"),
     ("handles: [{nodes: [0], from: 1, symmetry: x}]", "handles[0].symmetry", "stands still"),
     ("handles: [{nodes: [0], symmetry: w}]", "handles[0].symmetry", "must be one of x, y, z"),
-    ("handles: [{nodes: [0], axes: [x, z], clamp: true}]", "handles[0].clamp", "hold all axes"),
+    ("handles: [{nodes: [0], axes: [x, z], clamp: true, stiffness: 1}]", "handles[0].clamp", "hold all axes"),
     ("gravity: [0, 0, .nan]", "gravity", "finite"),
     ("time: {end: .inf, step: 0.1}", "time.end", "finite"),
     ("time: {end: 1" + "0" * 400 + ", step: 0.1}", "time.end", "below 1.8e308"),

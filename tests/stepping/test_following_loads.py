@@ -15,8 +15,9 @@ from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import symmetric
+from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.following_loads import FollowingLoads
+from lyra_petsc.stepping.following_loads import FollowingLoads, newton_way
 from lyra_petsc.terms.term import Load
 
 
@@ -59,8 +60,8 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
 RADIUS, THICKNESS, YOUNG, OVAL = 1.0, 0.02, 1e6, 0.01
 
 
-def ring(comm: MPI.Comm, part: float) -> tuple[float, int]:
-    """How far a ring of radius 1 and amplitude ``OVAL`` is oval under a part of the pressure at which it
+def ring(comm: MPI.Comm, part: float, start: float = OVAL) -> tuple[float, int]:
+    """How far a ring of radius 1 that is ``start`` oval is so under a part of the pressure at which it
     buckles, 3 D / R³, and Newton iterations.
 
     M. Lévy, Journal de mathématiques pures et appliquées 10 (1884); S. P. Timoshenko, J. M. Gere, Theory of
@@ -69,7 +70,7 @@ def ring(comm: MPI.Comm, part: float) -> tuple[float, int]:
     bench = Bench(comm, exact=False)
     flat, faces = rectangle(16, 2, 1.0, 1.0, alternating=True)
     angle = 0.5 * math.pi * flat[:, 0]
-    radius = RADIUS + OVAL * np.cos(2.0 * angle)
+    radius = RADIUS + start * np.cos(2.0 * angle)
     vertices = np.column_stack([radius * np.cos(angle), 0.25 * flat[:, 1], radius * np.sin(angle)])
     pressure = part * 3.0 * YOUNG * THICKNESS**3 / 12.0 / RADIUS**3
     content = scene(
@@ -96,3 +97,46 @@ def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
     oval, newton = ring(comm, 1.3)
     assert oval > 0.3
     assert newton <= 35  # 109
+
+
+def test_a_round_ring_leaves_its_unstable_equilibrium() -> None:
+    """Between 3 D/R³ and 4 D/R³, at which it would under forces that keep their directions."""
+    assert abs(ring(MPI.COMM_SELF, 1.1, start=0.0)[0]) > 0.1
+
+
+def test_a_skew_stiffness_is_solved_with() -> None:
+    random = np.random.default_rng(0)
+    skew = random.normal(size=(6, 6))
+    skew = 3.0 * (skew - skew.T)  # more than the symmetric part: a fixed point would run away
+    size = random.uniform(1.0, 2.0, 6)
+    force = random.normal(size=(2, 3))
+    way = newton_way(
+        force,
+        lambda force: force / size.reshape(2, 3),
+        lambda way: (skew @ way.ravel()).reshape(2, 3),
+        lambda numbers: numbers,
+    )
+    assert way is not None
+    np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
+
+
+@pytest.mark.parallel
+def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
+    """Beyond half a circle; beside free edges the stiffness of the pressure is not symmetric."""
+    load, thickness, young = 30.0, 0.002, 1.2e9
+    mesh = {"grid": {"width": 1.0, "height": 0.1, "nx": 40, "ny": 4, "pattern": "alternating"}}
+    content = scene(
+        mesh,
+        {"young": young, "poisson": 0.0, "thickness": thickness, "density": 1.0},
+        STATIC | {"step": 0.125},
+        gravity=[0, 0, 0],
+        handles=[{"group": "left", "clamp": True}],
+        loads=[{"pressure": load * young * thickness**3 / 12.0}],
+    )
+    newton = 0
+    with Bench(comm, exact=False).simulation(content) as trial:
+        while not trial.simulation.finished:
+            newton += trial.step().newton_iterations
+        tip = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
+    np.testing.assert_allclose(tip[[0, 2]], pressed_tip(load), atol=6e-3)
+    assert newton <= 90  # 353 where a solve takes what is skew as it was

@@ -206,6 +206,27 @@ def test_a_shell_takes_few_iterations(comm: MPI.Comm, tmp_path: Path) -> None:
         assert simulation.totals["newton_iterations"] <= 80  # 79; without either 92
 
 
+def test_the_tangent_tells_where_moving_handles_lead(comm: MPI.Comm) -> None:
+    """Against the difference of two equilibria, of a strip that a clamp lifts under its weight."""
+    x, rate = [], np.empty(0)
+    for more in (1.0, 1.01):
+        lifted = {"time": 1.0, "translate": [-0.1 * more, 0.0, 0.3 * more]}
+        moving = {"group": "right", "clamp": True, "motion": "lift", "interpolation": "linear"}
+        content = {
+            "mesh": grid(1.0, 0.2, 20, 4, "alternating"),
+            "material": {"young": 1e7, "poisson": 0.3, "thickness": 0.01, "density": 1.0},
+            "gravity": [0.0, 0.0, -more],
+            "handles": [{"group": "left", "clamp": True}, moving],
+            "motions": {"lift": [{"time": 0.0}, lifted]},
+        }
+        with at_rest(comm, **content) as simulation:
+            x.append(shape(simulation))
+            if more == 1.0:
+                rate = simulation.problem.points.gathered(simulation._seek.memory(1.0)[0]["rate"])
+    expected = (x[1] - x[0]) / 0.01
+    assert np.abs(rate - expected).max() < 0.05 * np.abs(expected).max()
+
+
 @pytest.mark.parallel(1)
 def test_a_solve_ends_as_soon_as_it_is_near_enough(comm: MPI.Comm, tmp_path: Path) -> None:
     """What second solves with the same matrix add tells how near."""

@@ -395,6 +395,47 @@ def test_a_clamp_turns_the_sheet_with_it() -> None:
     assert energies[2] < 1e-9
 
 
+RIGHT = [[0.59, -1, -1], [1, 1, 1]]
+SLIDING = {"box": RIGHT, "axes": ["z"], "clamp": True}
+
+
+@pytest.mark.parallel(2)
+def test_a_clamped_edge_slides_in_the_plane_of_the_sheet(comm: MPI.Comm) -> None:
+    """Pulled aside until it has turned far in its plane; under its weight its slope stays 0."""
+    sideways = {
+        "handles": [SHEET["handles"][0], SLIDING],
+        "material": STIFF | {"membrane": {"c11": 10.0, "c22": 10.0, "c12": 3.0, "c33": 3.0}},
+        "gravity": [0, 0, 0],
+        "loads": [{"box": RIGHT, "force": [0, 0.1, 0]}],
+        "time": {"analysis": "static", "step": 0.5},
+    }
+    x, energies = outcome(comm, sideways)
+    edge = x[-1] - x[5]
+    assert abs(edge[0]) > 0.3 * edge[1]
+    assert energies[1] > 1e-3
+    assert energies[2] < 1e-12
+    light = {"material": STIFF | {"density": 1e-6}, "time": {"analysis": "static", "step": 1.0}}
+    ends = SLIDING, {"box": RIGHT, "clamp": True}, {"box": RIGHT}
+    held = [outcome(comm, light | {"handles": [SHEET["handles"][0], end]})[0][:, 2] for end in ends]
+    np.testing.assert_allclose(held[0], held[1], rtol=0, atol=1e-6 * np.abs(held[1]).max())
+    assert np.abs(held[2]).max() > 1.5 * np.abs(held[1]).max()
+
+
+@pytest.mark.parametrize(
+    ("handle", "more", "words"),
+    [
+        (SLIDING | {"axes": ["x", "y"]}, {}, "not along z out of it"),
+        (SLIDING, {"material": CLOTH | {"bending": 2e-2, "bending_model": "hinge"}}, "not kept by hinges"),
+        (SLIDING | {"motion": "turn"}, {"motions": TURN["motions"]}, "turns and slides"),
+    ],
+)
+def test_clamps_that_cannot_slide_are_refused(
+    handle: dict[str, Any], more: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        Run(MPI.COMM_SELF, scene_of(SHEET | {"handles": [handle]} | more))
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["beuler", "alpha2"])
 def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp: Path) -> None:

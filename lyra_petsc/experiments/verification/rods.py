@@ -23,7 +23,7 @@ Frame d1 (along), d2 (across), d3 (normal), rotation rate ω = (τ, −κ, 0) in
 M · d3 is what keeps the strip from bending in its plane. Source: Kirchhoff rods, e.g. S. S. Antman, Nonlinear
 Problems of Elasticity, 2nd ed., chapter 8.
 
-Columns and tall cantilevers buckle: `column_shape`, `tall_cantilever`.
+Columns and tall cantilevers buckle: `column_shape`, `tall_cantilever`. Pressure follows: `pressed_tip`.
 """
 
 from __future__ import annotations
@@ -285,3 +285,26 @@ def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]
     factor = math.sqrt(square)
     deflection = factor / math.sqrt(stiffer) * float(state[1, 0])
     return factor, 1.0 / abs(deflection)
+
+
+def pressed_tip(load: float, steps: int = 1000) -> tuple[float, float]:
+    """Where the tip (x, z) of an inextensible cantilever of length 1 along x is under a pressure of ``load``
+    B/L³ that follows it and lifts it at first.
+
+    With θ, κ, N and Q the angle, the curvature and the tension and shear over B/L², from the tip on, where
+    the last three are 0: θ' = κ, κ' = −Q, N' = Q κ, Q' = −N κ − load; by Runge and Kutta.
+    """
+
+    def rates(y: Array) -> Array:
+        angle, curvature, tension, shear = y[:4]
+        turned = [curvature, -shear, shear * curvature, -tension * curvature - load]
+        return np.array([*turned, math.cos(angle), math.sin(angle)])
+
+    y, h = np.zeros(6), -1.0 / steps
+    for _ in range(steps):
+        a = rates(y)
+        b = rates(y + 0.5 * h * a)
+        c = rates(y + 0.5 * h * b)
+        y = y + h / 6.0 * (a + 2.0 * (b + c) + rates(y + h * c))
+    cos, sin = math.cos(y[0]), math.sin(y[0])
+    return float(-cos * y[4] - sin * y[5]), float(sin * y[4] - cos * y[5])

@@ -25,7 +25,7 @@ LONG = (
     "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
     "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane", "roll-up", "plate-curvature",
     "heavy-cantilever", "tip-load", "catenary-elastic", "sze-end-shear", "uniaxial-pull", "wind-drag",
-    "frames", "sections",
+    "frames", "sections", "supported-disc", "pressed-strip",
 )  # fmt: skip
 """Cases whose finest resolutions take long."""
 
