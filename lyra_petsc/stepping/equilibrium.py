@@ -295,8 +295,7 @@ class Equilibrium:
             linear += spent
             return way
 
-        comm = self._system.points.comm
-        way = newton_way(force, solve, lambda way: self._skew_force(known, way), comm.allreduce)
+        way = newton_way(force, solve, lambda way: self._skew_force(known, way), self._system.points.comm)
         return way, linear
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:

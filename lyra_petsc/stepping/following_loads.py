@@ -17,7 +17,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.scatter import add_elements
@@ -25,8 +27,10 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.load_stiffness import following_stiffness
 from lyra_petsc.terms.term import Term
 
-MOST_WAYS, ENOUGH, ROUNDING = 10, 1e-3, 1e-12
-"""Solves for a displacement, the part of the force that it may leave, and what of a unit force is none."""
+MOST_WAYS, ENOUGH = 10, 1e-3
+"""Iterations for a displacement, and the part of the force that it may leave."""
+
+Solve = Callable[[Array], "Array | None"]
 
 
 class FollowingLoads:
@@ -52,8 +56,7 @@ class FollowingLoads:
         factor: float,
     ) -> None:
         self._from = x.copy()
-        self._parts = []
-        self._skew = []
+        self._parts, self._skew = [], []
         for load in loads:
             symmetric, skew = following_stiffness(load, x, force_of)
             self._parts.append((load.stencil, factor * symmetric, load.n_owned))
@@ -96,17 +99,23 @@ def _scatter(stencil: NDArray[np.int32], force: Array, out: Array, n: int) -> No
         out[:, axis] += np.bincount(stencil.ravel(), force[:, :, axis].ravel(), n)[: len(out)]
 
 
-def newton_way(
-    force: Array,
-    solve: Callable[[Array], Array | None],
-    skew: Callable[[Array], Array],
-    summed: Callable[[Array], Array],
-) -> Array | None:
+class _Preconditioned:
+    """Forces less those by the skew part on the displacements that the symmetric part has for them."""
+
+    def __init__(self, solve: Solve, skew: Callable[[Array], Array]) -> None:
+        self._solve, self._skew = solve, skew
+
+    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        force = x.getArray(readonly=True).reshape(-1, 3)
+        way = self._solve(force)
+        y.setArray((force if way is None else force - self._skew(way)).ravel())
+
+
+def newton_way(force: Array, solve: Solve, skew: Callable[[Array], Array], comm: MPI.Comm) -> Array | None:
     """Displacement (n, 3) [m] to which a force (n, 3) [N] leads with a skew stiffness, too; None where there
     are no factors; collective.
 
-    GMRES, whose preconditioner is the symmetric part (Saad, Iterative Methods for Sparse Linear Systems,
-    2nd ed. 2003, section 9.3.2).
+    GMRES (``-loads_ksp_``), whose preconditioner from the right is the symmetric part.
 
     Parameters
     ----------
@@ -114,31 +123,23 @@ def newton_way(
         The displacement that the symmetric part of the stiffness, loads included, has for a force.
     skew : callable
         Force by the loads' skew part on a displacement.
-    summed : callable
-        Sums over all ranks.
     """
-    size = float(np.sqrt(summed(np.array([np.vdot(force, force)]))[0]))
-    if size == 0.0:
-        return np.zeros_like(force)
-    basis, ways = [force / size], []
-    table = np.zeros((MOST_WAYS + 1, MOST_WAYS))
-    part = np.empty(0)
-    for k in range(MOST_WAYS):
-        way = solve(basis[k])
-        if way is None:
-            return None
-        ways.append(way)
-        rest = basis[k] - skew(way)
-        for _ in range(2):  # rounding spoils what is made orthogonal once
-            parts = summed(np.array([np.vdot(each, rest) for each in basis]))
-            table[: k + 1, k] += parts
-            rest = rest - np.tensordot(parts, basis, 1)
-        table[k + 1, k] = np.sqrt(summed(np.array([np.vdot(rest, rest)]))[0])
-        goal = np.append(size, np.zeros(k + 1))
-        part = np.linalg.lstsq(table[: k + 2, : k + 1], goal, rcond=None)[0]
-        left = float(np.linalg.norm(goal - table[: k + 2, : k + 1] @ part))
-        if left <= ENOUGH * size or table[k + 1, k] <= ROUNDING:
-            break
-        basis.append(rest / table[k + 1, k])
-    found: Array = np.tensordot(part, ways, 1)
-    return found
+    if solve(force) is None:
+        return None
+    local = (force.size, None)
+    matrix = PETSc.Mat().createPython((local, local), _Preconditioned(solve, skew), comm)
+    matrix.setUp()
+    b, u = matrix.createVecs()
+    b.setArray(force.ravel())
+    ksp = PETSc.KSP().create(comm)
+    ksp.setOperators(matrix)
+    ksp.setOptionsPrefix("loads_")
+    ksp.setType("gmres")
+    ksp.getPC().setType("none")
+    ksp.setTolerances(rtol=ENOUGH, max_it=MOST_WAYS)
+    ksp.setFromOptions()
+    ksp.solve(b, u)
+    way = solve(u.getArray(readonly=True).reshape(-1, 3))
+    for each in (ksp, b, u, matrix):
+        each.destroy()
+    return way

@@ -66,6 +66,8 @@ OPTIONS = {
     "mat_type": "Type of the operator and of what the preconditioner is built from: `aij`, `baij`, `sbaij`. "
     "By default the operator is block rows of the program's (`python`), the other as the preconditioner "
     "needs.",
+    "loads_ksp_rtol": "Part of a force that may be left where equilibria solve with the skew stiffness of "
+    "pressures (1e-3), by the KSP with the prefix `-loads_`.",
     "mg_coarse_mat_type": "Type of the matrix of multigrid's coarsest level (`aij`).",
     "snes_lag_preconditioner": "How many linear systems a preconditioner serves, where a step of "
     "`semi-implicit` would decide by its iterations.",
