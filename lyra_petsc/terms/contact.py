@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near, swept_boxes
@@ -793,13 +794,16 @@ def elements(rest: RestShape) -> Elements:
 
 def parts(triangles: Ints, area: Array) -> Ints:
     """Which part of k, in units of 1 / `PARTS`, pairs of the corners of triangles (F, 3) have: their area
-    over that of a vertex inside of a regular mesh with as many triangles.
+    over that of a vertex inside of a regular mesh with as many triangles as their sheet.
 
-    So what presses evenly has everywhere the same distance, whatever the size of the triangles.
+    So what presses evenly has everywhere the same distance, whatever the size of the triangles. With the mean
+    of all sheets the few vertices of a coarse one would bear most of what lies on it, and friction tremble.
     """
+    sheet = np.unique(patches.connected(triangles), return_inverse=True)[1]
+    mean = np.bincount(sheet, area) / np.bincount(sheet)
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
-    part = np.clip(of_vertex / (2.0 * area.mean()), LEAST, MOST)
-    return np.rint(PARTS * part[triangles]).astype(np.int64)
+    part = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], LEAST, MOST)
+    return np.rint(PARTS * part).astype(np.int64)
 
 
 def barrier(rest: RestShape) -> Barrier:
