@@ -181,8 +181,8 @@ elements = contact.elements
 
 def make(given: Any, scene: Scene, mass: Array) -> Multipliers:
     """The term, as the registry asks for it."""
-    uv, rings = given.data["uv"].reshape(-1, 3, 2), given.data["rings"].astype(np.int64)
-    return Multipliers(given.stencil.astype(np.int32), uv, rings)
+    uv, marks = given.data["uv"].reshape(-1, 3, 2), given.data["marks"].reshape(-1, 4).astype(np.int64)
+    return Multipliers(given.stencil.astype(np.int32), uv, marks)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near, swept_boxes
@@ -77,6 +78,13 @@ STRAIN = 0.01
 which takes Newton's method many iterations."""
 
 
+PARTS = 1_000_000_000
+"""Parts of the stiffness are whole numbers of its billionths: they go with triangles from rank to rank."""
+
+LEAST, MOST = 1e-3, 1e3
+"""Of the stiffness that pairs of a vertex have, for its area."""
+
+
 class Barrier(NamedTuple):
     """Numbers of the barrier, the same on all ranks.
 
@@ -84,7 +92,7 @@ class Barrier(NamedTuple):
     ----------
     gap, thickness : float [m]
     stiffness : float [N/m]
-        k.
+        k inside of a regular mesh.
     parallel : float
         Squared sine of the angle of edges below which their energy fades.
     flat : float
@@ -280,22 +288,23 @@ class ContactBarrier(Elastic):
         Triangles of this rank, in local rows.
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
-    rings : (F,)
-        What is around them, as `surface_shares.rings` has it.
+    marks : (F, 4)
+        What is around them, as `surface_shares.rings` has it, and `parts` of their corners.
     """
 
-    def __init__(self, surface: NDArray[np.int32], uv: Array, rings: Ints) -> None:
-        empty = {"what": np.empty((0, 7)), "number": np.empty((0, 4))}
+    def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
+        empty = {"what": np.empty((0, 8)), "number": np.empty((0, 4))}
         self.obstacles, self.itself, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
-        self.surface_marks = rings
+        self.surface_marks = marks
         self._room = 0
         self._extents: tuple[Array, Array] | None = None  # of obstacles in ``_places``
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
         self._taken: Ints | None = None  # triangles that the search has
+        self._parts = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
         self._meeting = Remembered(self._meet)
 
     def set_up(
@@ -316,12 +325,13 @@ class ContactBarrier(Elastic):
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
-        what = elements.data["what"].reshape(-1, 7).astype(np.int64)
+        what = elements.data["what"].reshape(-1, 8).astype(np.int64)
         self.number = elements.data["number"].astype(np.int64)
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
+        self.stiffness = self.barrier.stiffness / PARTS * what[:, 7]
         self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
         self._foreseen = np.full(self.n_elements, np.nan)
@@ -372,6 +382,8 @@ class ContactBarrier(Elastic):
         self.stale = False
         if triangles is not self._taken:
             self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
+            self._parts = np.full(len(x) + 1, PARTS)  # the last one of what is no vertex
+            self._parts[triangles[:, :3]] = triangles[:, 4:]
             self._taken = triangles
         boxes = self._sheets.boxes(x, way)
         most = max(MANY, MANY_PER_VERTEX * len(x)) if way.any() and not self.static else np.inf
@@ -393,7 +405,8 @@ class ContactBarrier(Elastic):
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
-        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6]])
+        vertex = np.where((kind != EDGE_EDGE) & sheet[:, 0], points[:, 0], -1)
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], self._parts[vertex]])
         return np.where(sheet, points, first[:, None]), what
 
     def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints) -> Ints:
@@ -513,7 +526,7 @@ class ContactBarrier(Elastic):
     @property
     def _of_pairs(self) -> tuple[Any, ...]:
         """Kinds, points, offsets, gaps, and constants of the barrier."""
-        return self.kind, self.points, self.offset, self.gap, self.barrier.stiffness, self.barrier.parallel
+        return self.kind, self.points, self.offset, self.gap, self.stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: Places) -> Array:
         if not self.n_elements:
@@ -559,7 +572,7 @@ class ContactBarrier(Elastic):
         return float(stiffness.max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
+        return HALFWAY * self.stiffness * size
 
     def sizes(self, size: float) -> Array:
         return np.maximum(size, self._far)
@@ -575,12 +588,12 @@ class ContactBarrier(Elastic):
 
     def springs(self, x: Array, way: Array, frozen: Places) -> Springs:
         met, room = self.meeting(x, frozen.now), self._room
-        pairs = self.kind, self.points, self.offset, self.gap, self.barrier.stiffness, self.barrier.parallel
         given = met.at, met.weight, met.counted, met.beta, met.felt
         while True:
             numbers = np.empty(room, dtype=np.int64)
             found = numbers, np.empty((room, 4)), np.empty((room, 3)), *np.empty((3, room))
-            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, given, self.n_owned, found)
+            pairs = *self._of_pairs, given, self.n_owned
+            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, found)
             if n <= room:
                 break
             room = n
@@ -773,9 +786,24 @@ def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array
 
 def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets."""
-    triangles = rest.mesh.triangles
-    rings = surface_shares.rings(triangles.astype(np.int64)).astype(np.float64)
-    return Elements(triangles, {"uv": rest.mesh.triangle_uv.reshape(-1, 6), "rings": rings})
+    triangles = rest.mesh.triangles.astype(np.int64)
+    marks = np.column_stack([surface_shares.rings(triangles), parts(triangles, rest.area)])
+    uv = rest.mesh.triangle_uv.reshape(-1, 6)
+    return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
+
+
+def parts(triangles: Ints, area: Array) -> Ints:
+    """Which part of k, in units of 1 / `PARTS`, pairs of the corners of triangles (F, 3) have: their area
+    over that of a vertex inside of a regular mesh with as many triangles as their sheet.
+
+    So what presses evenly has everywhere the same distance, whatever the size of the triangles. With the mean
+    of all sheets the few vertices of a coarse one would bear most of what lies on it, and friction tremble.
+    """
+    sheet = np.unique(patches.connected(triangles), return_inverse=True)[1]
+    mean = np.bincount(sheet, area) / np.bincount(sheet)
+    of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
+    part = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], LEAST, MOST)
+    return np.rint(PARTS * part).astype(np.int64)
 
 
 def barrier(rest: RestShape) -> Barrier:
@@ -805,5 +833,5 @@ def barrier(rest: RestShape) -> Barrier:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must follow."""
-    uv, rings = elements.data["uv"].reshape(-1, 3, 2), elements.data["rings"].astype(np.int64)
-    return ContactBarrier(elements.stencil.astype(np.int32), uv, rings)
+    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 4)
+    return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))

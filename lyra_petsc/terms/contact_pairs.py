@@ -444,7 +444,7 @@ def _write_near(  # type: ignore[no-untyped-def]
         b1, b2, b3 = beta[m, 0], beta[m, 1], beta[m, 2]
         n = _write(
             n, numbers, often, counted, share, energies, felt,
-            e, count[m], ours, 1.0, b1, b2, b3, p, delta, d, gap[e], stiffness, 1.0,
+            e, count[m], ours, 1.0, b1, b2, b3, p, delta, d, gap[e], stiffness[e], 1.0,
         )  # fmt: skip
     return n
 
@@ -457,6 +457,8 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n
     ----------
     gap : (E,)
         Below which distances less the offset [m] pairs feel each other.
+    stiffness : (E,)
+        The barrier's k [N/m]: the same of all pairs of one vertex, and of all others.
     shares : (E, 6)
         Of a triangle before a vertex of a sheet: how often its sides, from each corner to the next, and its
         corners count. Pairs of a vertex next to each other are looked at together.
@@ -544,7 +546,7 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n
         d = -d if behind else d
         n = _write(
             n, numbers, often, for_us, share, energies, felt,
-            e, 1.0, ours, b0, b1, b2, b3, p, delta, d, gap[e], stiffness, part,
+            e, 1.0, ours, b0, b1, b2, b3, p, delta, d, gap[e], stiffness[e], part,
         )  # fmt: skip
     return _write_near(
         x, others, points, number, at, count, apart, beta, n_counted, offset, gap, stiffness, n, found, q
@@ -593,7 +595,8 @@ def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, met,
                 d = _length(p, beta[m, 0], beta[m, 1], beta[m, 2], beta[m, 3])
                 delta = d - offset[e]
                 slope *= part
-                turn = weight[m] * stiffness * barrier(delta, gap[e])[0] * first if delta > 0.0 else np.nan
+                energy = stiffness[e] * barrier(delta, gap[e])[0] if delta > 0.0 else np.nan
+                turn = weight[m] * energy * first
         for i in range(4):
             if beta[m, i] == 0.0 and turn == 0.0:
                 continue
@@ -691,7 +694,7 @@ def _add_hessian(  # type: ignore[no-untyped-def]
         return
     _hessian(g, b, first, free, gamma, e, h)
     delta = math.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2) - offset[pair]
-    _add_fading(p, b, g, gap[pair], delta, stiffness, g[3], blend, parallel, slope, h)
+    _add_fading(p, b, g, gap[pair], delta, stiffness[pair], g[3], blend, parallel, slope, h)
     for i in range(4):
         if points[pair, i] < 0:
             h[i], h[:, i] = 0.0, 0.0
@@ -948,7 +951,7 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, me
     met : tuple
         Numbers, how often they count, for this rank too, β and what is felt of the pairs of `meeting`.
     found : tuple of (room,), (room, 4), (room, 3), (room,), (room,), (room,)
-        Numbers of the pairs, β, unit normals, how often each counts times the barrier's k [N/m], δ at x [m],
+        Numbers of the pairs, β, unit normals, how often each counts times its k [N/m], δ at x [m],
         and how often they count for this rank.
 
     Returns
@@ -969,7 +972,7 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, me
                 continue
         d = math.sqrt(felt[m, 0] ** 2 + felt[m, 1] ** 2 + felt[m, 2] ** 2)
         d = -d if kind[e] == VERTEX_INSIDE else d
-        numbers[n], spring[n], counted[n] = e, often[m] * stiffness, ours[m] / often[m]
+        numbers[n], spring[n], counted[n] = e, often[m] * stiffness[e], ours[m] / often[m]
         length[n] = d - offset[e]
         for i in range(4):
             beta[n, i] = given[m, i]
@@ -986,7 +989,7 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, me
         if not gap[e] <= delta < gap[e] + nearer or (kind[e] == EDGE_EDGE and _fades(p, parallel)):
             continue
         if n < len(numbers):
-            numbers[n], spring[n], length[n] = e, stiffness, delta
+            numbers[n], spring[n], length[n] = e, stiffness[e], delta
             counted[n] = 1.0 if e < n_counted else 0.0
             for i in range(4):
                 beta[n, i] = b[i]
@@ -1190,7 +1193,7 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, m
             _load(x, others, points, e, p)
             beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = _weights(kind[e], p)
             d = _between(x, others, kind, points, beta, e, n, p, g)
-            force[n] = _force(p, kind[e], d - offset[e], gap[e], stiffness, parallel, slope)
+            force[n] = _force(p, kind[e], d - offset[e], gap[e], stiffness[e], parallel, slope)
         if force[n] == 0.0:
             continue
         for k in range(3):

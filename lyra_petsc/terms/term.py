@@ -257,7 +257,7 @@ class Elastic(Term):
     """Whether what moves works by its forces (`work`), as its motion alone may make the energy infinite."""
 
     surface_marks: Ints | None = None
-    """A number (F,) that goes with each of them, if any: the last column of what ``neighbours`` gets."""
+    """Numbers (F, m) that go with each of them, if any: the last columns of what ``neighbours`` gets."""
 
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
@@ -330,9 +330,9 @@ class Elastic(Term):
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
 
         And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
-        the points' global numbers, ``triangles`` (F, 3 or 4) near ones of ``surface``. Where ``unseen``
-        is given, also those that come so near on their straight ways (N, 3) [m]; None where these are so long
-        that there are too many: it is asked again with shorter ones. Ranks that see the same
+        the points' global numbers, ``triangles`` (F, 3 + m) near ones of ``surface`` with its marks. Where
+        ``unseen`` is given, also those that come so near on their straight ways (N, 3) [m]; None where these
+        are so long that there are too many: it is asked again with shorter ones. Ranks that see the same
         points must name them in the same order within an element; the owner of the first counts it.
         """
         raise NotImplementedError

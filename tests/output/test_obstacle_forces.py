@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import grid
+from physics import grid, obj_file
 from test_resume import journey
 
 from lyra_petsc.output.read_run import StoredRun
@@ -46,6 +46,25 @@ def test_a_sheet_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
     expected = WEIGHT * np.array([0.0, 0.0, -1.0, -0.5, 0.5, 0.0])
     np.testing.assert_allclose(last, expected, atol=1e-5 * WEIGHT)
     np.testing.assert_allclose(run.field("contact_pressure")[-1], WEIGHT, rtol=5e-5)
+
+
+def test_pressure_is_uniform_whatever_the_triangles(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Their sizes and shapes differ, and stiff ones would carry the weight from one to the other."""
+    n = 8
+    if comm.rank == 0:
+        along = np.linspace(0.0, 1.0, n + 1) ** 2
+        corners = [(x, y, 0.0) for y in along for x in along]
+        first = [j * (n + 1) + i for j in range(n) for i in range(n)]
+        faces = [(a, a + 1, a + n + 2) for a in first] + [(a, a + n + 2, a + n + 1) for a in first]
+        obj_file(shared_tmp / "graded.obj", corners, faces)
+    comm.Barrier()
+    mesh = {"file": str(shared_tmp / "graded.obj"), "transform": {"translate": [0.0, 0.0, -0.0199 + 0.005]}}
+    stiff = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0, "c33": 250.0}}
+    scene = SCENE | {"mesh": mesh, "material": stiff | {"bending": 0.1}, "contact": {"gap": 0.007}}
+    journey(comm, scene | {"time": {"end": 1.0, "step": 0.05}}, shared_tmp / "run", None)
+    if comm.rank == 0:
+        pressure = StoredRun(shared_tmp / "run").field("contact_pressure")[-1]
+        np.testing.assert_allclose(pressure, WEIGHT, rtol=1e-3)
 
 
 @pytest.mark.parallel(2)

@@ -102,9 +102,9 @@ def test_nearer_than_thickness(comm: MPI.Comm) -> None:
         assert isinstance(contact, ContactBarrier)
         energies = contact.energies(system.x, system.active.frozen[contact])
         total = comm.allreduce(float(energies.sum()))
-    # of 25 vertices at the first state, of which no step has been taken
+    # of what 16 vertices inside would have, at the first state, of which no step has been taken
     stiffness, left, gap = contact.barrier.stiffness, 0.001, 0.02
-    assert total == pytest.approx(25 * stiffness * (gap - left) ** 3 / left)
+    assert total == pytest.approx(16 * stiffness * (gap - left) ** 3 / left)
     text = refusal(comm, scene | {"contact": {"gap": 0.02, "thickness": 0.004}})
     assert text == (
         "obstacles.thing: at the start vertex 0 and the obstacle 'thing', around (0, 0, 0) m, are 0.003 m "

@@ -56,7 +56,7 @@ class Pairs:
     def meeting(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which of them are nearer than the gap; β and the energy of all, 0 of others."""
         n = len(self)
-        numbers = self.offset, np.full(n, GAP), STIFFNESS, parallel, np.zeros((n, 6))
+        numbers = self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel, np.zeros((n, 6))
         found = met_of(x, self.others, self.kind, self.points, *numbers, counted=n)
         assert (found["weight"] == 1.0).all()
         near, beta, energy = np.zeros(n, dtype=np.bool_), np.zeros((n, 4)), np.zeros(n)
@@ -70,7 +70,7 @@ class Pairs:
     def _met(self, x: Array, parallel: float) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """What the kernels take of pairs and of what is met."""
         n = len(self)
-        of = self.kind, self.points, self.offset, np.full(n, GAP), STIFFNESS, parallel
+        of = self.kind, self.points, self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel
         found = met_of(x, self.others, *of, np.zeros((n, 6)), counted=n)
         return of, tuple(found[name] for name in MET)
 
@@ -488,7 +488,8 @@ def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel
     n = len(pairs)
 
     def summed(of: Pairs, counted: int, shares: Array) -> tuple[dict[str, NDArray[Any]], list[Any]]:
-        constants = of.kind, of.points, of.offset, np.full(len(of), gap), STIFFNESS, parallel
+        barriers = np.full(len(of), gap), np.full(len(of), STIFFNESS)
+        constants = of.kind, of.points, of.offset, *barriers, parallel
         found = met_of(of.x, of.others, *constants, shares, counted=counted)
         met = tuple(found[name] for name in MET)
         out, hessian = np.zeros_like(of.x), np.zeros((len(of.x), len(of.x), 3, 3))
@@ -528,7 +529,7 @@ def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
 def felt_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray[Any]], Array, Array]:
     """What is met, its gradient, and its Hessian."""
     n, none = len(pairs), np.empty((0, 3))
-    of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), STIFFNESS, NOWHERE
+    of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
     found = met_of(x, none, *of, shares, counted=n, room=999)
     out, hessian = np.zeros_like(x), np.zeros((len(x), len(x), 3, 3))
     taken = tuple(found[name] for name in MET)
