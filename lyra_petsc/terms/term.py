@@ -314,6 +314,10 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
+    def stiffness(self, x: Array, frozen: Any) -> Array:
+        """Force over displacement [N/m] of each element at positions x (n_local, 3), (E,)."""
+        return self.force_scale(1.0)
+
     def sizes(self, size: float) -> float | Array:
         """Coordinates [m] that each element's energy is of differences of, where the sheet's are ``size``."""
         return size
