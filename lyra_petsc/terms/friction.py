@@ -247,6 +247,22 @@ class CoulombFriction(Elastic):
         friction_pairs.energies(x, *self._at_stage(frozen), out)
         return out
 
+    def work_of_targets(
+        self, ends: tuple[Array, Array], frozen: tuple[ObstacleMoves, ObstacleMoves]
+    ) -> float:
+        # by forces: an obstacle goes many times as far as what sticks, over which energies tell nothing
+        work = 0.0
+        if self._contact.obstacles.moving and self.n_elements:
+            _, _, _, before, *_ = self._at_stage(frozen[0])
+            _, _, _, after, *_ = self._at_stage(frozen[1])
+            for x, at in zip(ends, frozen, strict=True):
+                stencil, beta, normal, start, slip, spring, limit = self._at_stage(at)
+                u = np.einsum("ei,eik->ek", beta, x[stencil]) - start
+                u += slip - np.einsum("ek,ek->e", u, normal)[:, None] * normal
+                pull = np.minimum(spring, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))[:, None] * u
+                work -= 0.5 * float(np.vdot(pull[: self.n_owned], (after - before)[: self.n_owned]))
+        return work
+
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
         if self.n_elements:
             friction_pairs.add_gradient(x, *self._at_stage(frozen), out)
