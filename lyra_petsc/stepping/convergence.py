@@ -8,6 +8,7 @@ from petsc4py import PETSc
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.roundoff import roundoff_of_contact
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
@@ -78,14 +79,15 @@ class Convergence:
         *,
         linear_limit: float,
     ) -> None:
-        self._equations, self._tolerances, self.spacing, self._floor = equations, tolerances, spacing, floor
+        self._equations, self._tolerances, self.spacing = equations, tolerances, spacing
+        self._floor = self._least_floor = floor
         self._linear_limit = linear_limit
         self.usual, self.farthest = 0.0, np.inf
         self.begin()
 
     def begin(self) -> None:
         """A new solve."""
-        self.norm, self.fell, self.at_roundoff = 0.0, False, False
+        self.norm, self.fell, self.at_roundoff, self._floor = 0.0, False, False, self._least_floor
         self.halved = True
         self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
@@ -126,8 +128,10 @@ class Convergence:
                 return int(Reason.DIVERGED_MAX_IT)
             self._moved_by(moved)
             self.usual += RECENT * (spent - self._spent - self.usual)
-        stalls = iteration > 0 and STALLED * before < residual <= self._floor
-        self._stalled = self._stalled + 1 if stalls else 0
+        slow = iteration > 0 and residual > STALLED * before
+        if slow and self._equations.discretisation.near:
+            self._floor = max(self._least_floor, roundoff_of_contact(self._equations))
+        self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)

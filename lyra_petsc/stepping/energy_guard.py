@@ -224,11 +224,12 @@ class EnergyGuard:
         first = self._frozen(turning, system.t0, x0)
         last = self._frozen(turning, system.t1, x1)
         for term in turning:
-            at = [[float(term.energies(x, f[term]).sum()) for f in (first, last)] for x in (x0, x1)]
-            rise += at[1][1] - at[0][0]
-            work += 0.5 * (at[0][1] - at[0][0] + at[1][1] - at[1][0])
+            frozen = first[term], last[term]
+            before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
+            rise += after - before
+            work += term.work_of_targets((x0, x1), frozen)
             if not term.registration.energy:
-                springs = [springs[0] + at[0][0], springs[1] + at[1][1]]
+                springs = [springs[0] + before, springs[1] + after]
         return rise, work, springs[0], springs[1]
 
     def _outer_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:

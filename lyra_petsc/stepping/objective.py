@@ -64,7 +64,7 @@ class Objective:
             parts.append(rate * float(each.sum()))
             stiffness = self.stiffnesses.get(term)
             if stiffness is None:
-                stiffness = term.force_scale(1.0)[: term.n_owned]
+                stiffness = term.stiffness(x, of.active.frozen[term])[: term.n_owned]
             sizes = term.sizes(self._size)
             of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
             # ** would raise where the square is infinite

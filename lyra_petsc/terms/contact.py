@@ -574,6 +574,13 @@ class ContactBarrier(Elastic):
     def force_scale(self, size: float) -> Array:
         return HALFWAY * self.stiffness * size
 
+    def stiffness(self, x: Array, frozen: Places) -> Array:
+        met, out = self.meeting(x, frozen.now), np.zeros(self.n_elements)
+        square = np.sum(met.felt[:, :3] ** 2, axis=1)
+        pressed = np.maximum(met.weight, met.counted) * met.felt[:, 4] * square
+        out[met.at] = np.maximum(pressed, HALFWAY * self.barrier.stiffness)
+        return out
+
     def sizes(self, size: float) -> Array:
         return np.maximum(size, self._far)
 

@@ -73,15 +73,18 @@ class ObstacleMoves(NamedTuple):
 
     Attributes
     ----------
+    time : float
+        The end of the step [s].
     part : float
         Of the step, up to its stage; 1 also at its start.
     stage, end : list of (3, 3) and (3,)
-        Rotation and translation [m] of each from the start of the step to where friction is asked, and to the
-        end.
+        Rotation and translation [m] of each from where pairs were taken, the start of the step but on the way
+        of a static load step, to where friction is asked, and to the end.
     now, places : (m, 3)
         Their points and normals at the stage, and at the end.
     """
 
+    time: float
     part: float
     stage: list[tuple[Array, Array]]
     end: list[tuple[Array, Array]]
@@ -115,6 +118,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
+        self._taken_at: float | None = None  # [s], where obstacles stood
         self._owed: Array | None = None  # after the step, until that is accepted
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
@@ -157,9 +161,9 @@ class CoulombFriction(Elastic):
         self.stale, self._known = False, self._pairs
         return self._pairs.key[:, :4], self._pairs.what
 
-    def _renew(self, x: Array, places: Array, old: Pairs) -> None:
-        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
-        contact = self._contact
+    def _renew(self, x: Array, frozen: ObstacleMoves, old: Pairs) -> None:
+        """Take the pairs that touch at positions x (n_local, 3) at the end of a step; ``old`` ones go on."""
+        contact, places, self._taken_at = self._contact, frozen.places, frozen.time
         if not contact.n_elements and not len(self._pairs.key):
             return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
@@ -173,7 +177,7 @@ class CoulombFriction(Elastic):
         self._pairs, self.stale = Pairs(key, what), True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
-        self._renew(x, frozen.places, self._pairs)
+        self._renew(x, frozen, self._pairs)
 
     def element_state(self) -> tuple[Ints, Array]:
         """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
@@ -199,26 +203,29 @@ class CoulombFriction(Elastic):
 
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles, part = self._contact.obstacles, 1.0
-        end = stage = obstacles.moved(step.start, step.end)
+        start = step.start if self._taken_at is None else self._taken_at
+        end = stage = obstacles.moved(start, step.end)
         if step.start < step.at < step.end:
             part = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
-            stage = obstacles.moved(step.start, step.at)
+            stage = obstacles.moved(start, step.at)
         places = obstacles.at(step.end)
         now = obstacles.at(step.at) if obstacles.moving else places
-        return ObstacleMoves(part, stage, end, now, places)
+        return ObstacleMoves(step.end, part, stage, end, now, places)
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
-        """What the kernels take, with obstacles moved so."""
-        start = self._still
+        """What the kernels take, with obstacles moved so, and what sticks to them."""
+        start, slip = self._still, self._slip
         for obstacle, (rotation, translation) in enumerate(moved):
             if not translation.any() and (rotation == np.eye(3)).all():
                 continue
             mine, foot = self._obstacle == obstacle, self._foot
-            start = start.copy() if start is self._still else start
+            if start is self._still:
+                start, slip = start.copy(), slip.copy()
             side, foot = self._beta[mine].sum(axis=1), foot[mine]
             start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
-        return self.stencil, self._beta, self._normal, start, self._slip, self._spring, self._limit
+            slip[mine] = slip[mine] @ rotation.T
+        return self.stencil, self._beta, self._normal, start, slip, self._spring, self._limit
 
     def _at_stage(self, frozen: ObstacleMoves) -> tuple[NDArray[Any], ...]:
         """The same for positions of the stage, a part a of the way to the end: a D, with D there, has the
@@ -239,6 +246,22 @@ class CoulombFriction(Elastic):
             return out
         friction_pairs.energies(x, *self._at_stage(frozen), out)
         return out
+
+    def work_of_targets(
+        self, ends: tuple[Array, Array], frozen: tuple[ObstacleMoves, ObstacleMoves]
+    ) -> float:
+        # by forces: an obstacle goes many times as far as what sticks, over which energies tell nothing
+        work = 0.0
+        if self._contact.obstacles.moving and self.n_elements:
+            _, _, _, before, *_ = self._at_stage(frozen[0])
+            _, _, _, after, *_ = self._at_stage(frozen[1])
+            for x, at in zip(ends, frozen, strict=True):
+                stencil, beta, normal, start, slip, spring, limit = self._at_stage(at)
+                u = np.einsum("ei,eik->ek", beta, x[stencil]) - start
+                u += slip - np.einsum("ek,ek->e", u, normal)[:, None] * normal
+                pull = np.minimum(spring, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))[:, None] * u
+                work -= 0.5 * float(np.vdot(pull[: self.n_owned], (after - before)[: self.n_owned]))
+        return work
 
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
         if self.n_elements:
@@ -262,7 +285,7 @@ class CoulombFriction(Elastic):
         the normal forces [N] that they are given in the step.
         """
         mine, state = slice(self.n_owned), list(self._at_stage(frozen))
-        state[SLIP] = self._slip.copy()
+        state[SLIP] = state[SLIP].copy()
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         friction_pairs.slide(x, *state, heat, slides)
         sliding = float(np.count_nonzero(slides[mine]))
@@ -275,28 +298,28 @@ class CoulombFriction(Elastic):
         self._heat[:, OWED], self._owed = (0.0 if self._owed is None else self._owed), None
         if not self.n_elements:
             self._on_obstacles = np.zeros_like(self._on_obstacles)
-            self._renew(x, frozen.places, self._known)
+            self._renew(x, frozen, self._known)
             return
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         state = list(self._state(frozen.end))
         self._on_obstacles = self._forces(x, tuple(state))
         # forces stay those of the step until there are other pairs
-        state[SLIP] = slip = self._slip.copy()
+        state[SLIP] = slip = state[SLIP].copy()
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
         old = self._known.what.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
-        self._renew(x, frozen.places, Pairs(self._known.key, old))
+        self._renew(x, frozen, Pairs(self._known.key, old))
 
     def rubbing(
         self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
     ) -> Rubbing:
-        contact, state, slip = self._contact, list(self._state(frozen.end)), self._slip.copy()
+        contact, state = self._contact, list(self._state(frozen.end))
         *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
         vertex, slides = contact.vertex_of(at), np.empty(self.n_elements, dtype=np.bool_)
         on = (vertex >= 0) & (sheets | (contact.obstacle[at] >= 0))
-        state[SLIP] = slip
+        state[SLIP] = slip = state[SLIP].copy()
         friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
         led = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
         rub = led[slides[led]]
@@ -322,15 +345,13 @@ class CoulombFriction(Elastic):
         return Rubbing(points, beta, along, more, obstacle, moved)
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
-        # what obstacles take along in the load step would go that way twice
-        if all((turn == np.eye(3)).all() and not way.any() for turn, way in frozen.end):
-            self.accept(x, frozen)
+        self.accept(x, frozen)
 
-    def touched(self) -> tuple[Pairs, Array, Array]:
-        return self._pairs, self._heat.copy(), self._on_obstacles
+    def touched(self) -> tuple[Pairs, Array, Array, float | None]:
+        return self._pairs, self._heat.copy(), self._on_obstacles, self._taken_at
 
-    def touch_again(self, touched: tuple[Pairs, Array, Array]) -> None:
-        self._pairs, self._heat, self._on_obstacles = touched
+    def touch_again(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
+        self._pairs, self._heat, self._on_obstacles, self._taken_at = touched
         self.stale = True
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:

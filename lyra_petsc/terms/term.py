@@ -314,6 +314,10 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
+    def stiffness(self, x: Array, frozen: Any) -> Array:
+        """Force over displacement [N/m] of each element at positions x (n_local, 3), (E,)."""
+        return self.force_scale(1.0)
+
     def sizes(self, size: float) -> float | Array:
         """Coordinates [m] that each element's energy is of differences of, where the sheet's are ``size``."""
         return size
@@ -446,6 +450,13 @@ class Elastic(Term):
 
     def accept(self, x: Array, frozen: Any) -> None:
         """The step to positions x (n_local, 3) is accepted; for terms that have a state."""
+
+    def work_of_targets(self, ends: tuple[Array, Array], frozen: tuple[Any, Any]) -> float:
+        """Work [J] of its targets' motion in a step between these positions (n_local, 3), by the mean over
+        both ends; ``frozen`` with targets at its start and at its end.
+        """
+        first, last = frozen
+        return 0.5 * sum(float((self.energies(x, last) - self.energies(x, first)).sum()) for x in ends)
 
     def on_the_way(self, x: Array, frozen: Any) -> None:
         """A part of a static load step led to positions x; for terms that take up there what touches."""

@@ -131,6 +131,55 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     assert ways[1] > 0.05
 
 
+def test_what_sticks_turns_with_a_plane(comm: MPI.Comm) -> None:
+    """The elastic part of its way, which holds it against its inertia, turns, too; else it would creep."""
+    side, far, quarter = 0.06, 0.4, {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}
+    content = {
+        "mesh": grid(side, side, 2, 2) | {"transform": {"translate": [far, 0.0, 0.95 * GAP]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0, "density": 400.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": 0.5, "self": False},
+        "obstacles": {"disc": {"plane": FLAT, "motion": [{"time": 0.5}, {"time": 2.5, "rotate": quarter}]}},
+        "time": {"end": 2.6, "step": 0.02},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    layout = simulation.problem.points
+    settled = None
+    while not simulation.finished:
+        simulation.step()
+        if settled is None and simulation.time > 0.49:
+            settled = gathered(layout, simulation.problem.system.x)
+    x = gathered(layout, simulation.problem.system.x)
+    simulation.destroy()
+    assert settled is not None
+    crept = np.column_stack([x[:, 1], -x[:, 0]]) - settled[:, :2]
+    assert np.abs(crept).max() < 1e-6
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
+def test_what_an_obstacle_takes_along_has_its_energy_from_there(comm: MPI.Comm, integrator: str) -> None:
+    """A plane that sets out goes many times as far in a step as what sticks may, and works all the same."""
+    end, far, gap = 0.1, 0.6, 0.003
+    away = {"time": 1.0, "translate": [far, 0.0, 0.0]}
+    content = {
+        "mesh": grid(0.06, 0.06, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.985 * gap]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": gap, "friction": 0.5, "self": False},
+        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away]}},
+        "time": {"end": end, "step": 0.005, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    start = gathered(simulation.problem.points, simulation.problem.system.x)
+    while not simulation.finished:
+        simulation.step()
+    way = (gathered(simulation.problem.points, simulation.problem.system.x) - start)[:, 0]
+    rejected = simulation.totals["rejected"]
+    simulation.destroy()
+    np.testing.assert_allclose(way, far * (3.0 * end**2 - 2.0 * end**3), rtol=1e-3)
+    assert rejected <= 8
+
+
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2", "semi-implicit"])
 def test_friction_is_that_of_the_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:

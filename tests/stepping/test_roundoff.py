@@ -47,3 +47,36 @@ def test_soft_sheets_are_solved_and_say_nothing(comm: MPI.Comm) -> None:
     lowest, notes = after_a_step(1.0, comm)
     assert np.isclose(lowest, -GRAVITY * 0.005**2, rtol=0.05)
     assert notes == []
+
+
+def test_what_is_pressed_hard_takes_the_steps_planned(comm: MPI.Comm) -> None:
+    """Forces of contact are then far above all others, and their round-off above the scene's tolerance."""
+    low, room, gap = -0.0049, 8e-5, 0.005
+    plates = {
+        "low": {"plane": {"point": [0.0, 0.0, low], "normal": [0.0, 0.0, 1.0]}},
+        "high": {
+            "plane": {"point": [0.0, 0.0, 0.01], "normal": [0.0, 0.0, -1.0]},
+            "motion": [{"time": 0.0}, {"time": 0.3, "translate": [0.0, 0.0, low + room - 0.01]}],
+        },
+    }
+    scene: dict[str, Any] = {
+        "mesh": grid(0.2, 0.2, 4, 4, "alternating") | {"transform": {"translate": [0.9, 0.9, 0.0]}},
+        "material": {"cloth": "gray-interlock", "damping": 0.01},
+        "gravity": [0.0, 0.0, -GRAVITY],
+        "contact": {"gap": gap, "friction": 0.3},
+        "obstacles": plates,
+        "time": {"end": 0.35, "step": 0.01},
+        "solver": {},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    while not simulation.finished:
+        simulation.step()
+    force = simulation.ledger.obstacle_forces(2)[:, 2]
+    newton, steps = simulation.totals["newton_iterations"], simulation.step_number
+    notes = [note for note in simulation.notes if "round-off" in note]
+    simulation.destroy()
+    assert force[1] > 1e4
+    assert np.isclose(force[0], -force[1], rtol=1e-4)
+    assert steps <= 37
+    assert newton <= 4 * steps
+    assert len(notes) == 1
