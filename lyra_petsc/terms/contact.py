@@ -331,7 +331,7 @@ class ContactBarrier(Elastic):
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
-        self.stiffness = self.barrier.stiffness / PARTS * what[:, 7]
+        self._k = self.barrier.stiffness / PARTS * what[:, 7]
         self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
         self._foreseen = np.full(self.n_elements, np.nan)
@@ -526,7 +526,7 @@ class ContactBarrier(Elastic):
     @property
     def _of_pairs(self) -> tuple[Any, ...]:
         """Kinds, points, offsets, gaps, and constants of the barrier."""
-        return self.kind, self.points, self.offset, self.gap, self.stiffness, self.barrier.parallel
+        return self.kind, self.points, self.offset, self.gap, self._k, self.barrier.parallel
 
     def energies(self, x: Array, frozen: Places) -> Array:
         if not self.n_elements:
@@ -572,13 +572,13 @@ class ContactBarrier(Elastic):
         return float(stiffness.max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        return HALFWAY * self.stiffness * size
+        return HALFWAY * self._k * size
 
     def stiffness(self, x: Array, frozen: Places) -> Array:
         met, out = self.meeting(x, frozen.now), np.zeros(self.n_elements)
         square = np.sum(met.felt[:, :3] ** 2, axis=1)
         pressed = np.maximum(met.weight, met.counted) * met.felt[:, 4] * square
-        out[met.at] = np.maximum(pressed, HALFWAY * self.barrier.stiffness)
+        out[met.at] = np.maximum(pressed, HALFWAY * self._k[met.at])
         return out
 
     def sizes(self, size: float) -> Array:
