@@ -5,8 +5,8 @@ Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²),
 where the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy,
 until the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
 are taken anew before every solve, under-relaxed; pressures change in it along their own stiffness. Friction
-is taken anew after every solve: a sheet that comes to lie on something in a load step is held there by the
-forces found on the way, and in equilibrium by no more than those there allow.
+is taken anew, too, where obstacles stand still: a sheet that comes to lie on something in a load step is held
+there by the forces found on the way.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -163,6 +163,8 @@ class Equilibrium:
             if force > WORSE * last:
                 self._integrator.pseudo *= SHRINK
             last = force
+            if attempt.converged:
+                system.active.on_the_way(system.x)
             if self._follows:
                 linear += self._take_loads(relaxation, before, factor, first=solves == 0)
             leap = leaps and self._integrator.pseudo > self._careful
@@ -177,7 +179,6 @@ class Equilibrium:
             if attempt.converged:
                 arrived = True
                 system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
-                system.active.on_the_way(system.x)
                 self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
                 self._careful = max(min(self._careful, BELOW * ceiling), self._integrator.pseudo)
                 ceiling *= RISE

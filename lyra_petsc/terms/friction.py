@@ -73,18 +73,15 @@ class ObstacleMoves(NamedTuple):
 
     Attributes
     ----------
-    time : float
-        The end of the step [s].
     part : float
         Of the step, up to its stage; 1 also at its start.
     stage, end : list of (3, 3) and (3,)
-        Rotation and translation [m] of each from where pairs were taken, the start of the step but on the way
-        of a static load step, to where friction is asked, and to the end.
+        Rotation and translation [m] of each from the start of the step to where friction is asked, and to the
+        end.
     now, places : (m, 3)
         Their points and normals at the stage, and at the end.
     """
 
-    time: float
     part: float
     stage: list[tuple[Array, Array]]
     end: list[tuple[Array, Array]]
@@ -118,7 +115,6 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
-        self._taken_at: float | None = None  # [s], where obstacles stood
         self._owed: Array | None = None  # after the step, until that is accepted
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
@@ -161,9 +157,9 @@ class CoulombFriction(Elastic):
         self.stale, self._known = False, self._pairs
         return self._pairs.key[:, :4], self._pairs.what
 
-    def _renew(self, x: Array, frozen: ObstacleMoves, old: Pairs) -> None:
-        """Take the pairs that touch at positions x (n_local, 3) at the end of a step; ``old`` ones go on."""
-        contact, places, self._taken_at = self._contact, frozen.places, frozen.time
+    def _renew(self, x: Array, places: Array, old: Pairs) -> None:
+        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
+        contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
             return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
@@ -177,7 +173,7 @@ class CoulombFriction(Elastic):
         self._pairs, self.stale = Pairs(key, what), True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
-        self._renew(x, frozen, self._pairs)
+        self._renew(x, frozen.places, self._pairs)
 
     def element_state(self) -> tuple[Ints, Array]:
         """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
@@ -203,15 +199,14 @@ class CoulombFriction(Elastic):
 
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles, part = self._contact.obstacles, 1.0
-        start = step.start if self._taken_at is None else self._taken_at
-        end = stage = obstacles.moved(start, step.end)
+        end = stage = obstacles.moved(step.start, step.end)
         if step.start < step.at < step.end:
             part = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
-            stage = obstacles.moved(start, step.at)
+            stage = obstacles.moved(step.start, step.at)
         places = obstacles.at(step.end)
         now = obstacles.at(step.at) if obstacles.moving else places
-        return ObstacleMoves(step.end, part, stage, end, now, places)
+        return ObstacleMoves(part, stage, end, now, places)
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so, and what sticks to them."""
@@ -298,7 +293,7 @@ class CoulombFriction(Elastic):
         self._heat[:, OWED], self._owed = (0.0 if self._owed is None else self._owed), None
         if not self.n_elements:
             self._on_obstacles = np.zeros_like(self._on_obstacles)
-            self._renew(x, frozen, self._known)
+            self._renew(x, frozen.places, self._known)
             return
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         state = list(self._state(frozen.end))
@@ -310,7 +305,7 @@ class CoulombFriction(Elastic):
         np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
         old = self._known.what.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
-        self._renew(x, frozen, Pairs(self._known.key, old))
+        self._renew(x, frozen.places, Pairs(self._known.key, old))
 
     def rubbing(
         self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
@@ -345,13 +340,15 @@ class CoulombFriction(Elastic):
         return Rubbing(points, beta, along, more, obstacle, moved)
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
-        self.accept(x, frozen)
+        # what obstacles take along in the load step would go that way twice
+        if all((turn == np.eye(3)).all() and not way.any() for turn, way in frozen.end):
+            self.accept(x, frozen)
 
-    def touched(self) -> tuple[Pairs, Array, Array, float | None]:
-        return self._pairs, self._heat.copy(), self._on_obstacles, self._taken_at
+    def touched(self) -> tuple[Pairs, Array, Array]:
+        return self._pairs, self._heat.copy(), self._on_obstacles
 
-    def touch_again(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
-        self._pairs, self._heat, self._on_obstacles, self._taken_at = touched
+    def touch_again(self, touched: tuple[Pairs, Array, Array]) -> None:
+        self._pairs, self._heat, self._on_obstacles = touched
         self.stale = True
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
