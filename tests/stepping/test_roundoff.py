@@ -77,6 +77,6 @@ def test_what_is_pressed_hard_takes_the_steps_planned(comm: MPI.Comm) -> None:
     simulation.destroy()
     assert force[1] > 2e4
     assert np.isclose(force[0], -force[1], rtol=1e-4)
-    assert steps <= 37
+    assert steps <= 40
     assert newton <= 4 * steps
     assert len(notes) == 1
