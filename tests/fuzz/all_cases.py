@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from contextlib import suppress
 
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
@@ -24,7 +26,14 @@ KINDS: dict[str, tuple[int, st.SearchStrategy[Case]]] = {
 def for_each(
     strategy: st.SearchStrategy[Case], number: int, seed: int, run: Callable[[Case], object]
 ) -> None:
-    """Give ``number`` cases, the same for the same seed, to ``run``."""
+    """Give ``number`` cases, the same for the same seed, to ``run``.
+
+    Hypothesis draws constants of the modules loaded so far, too: then cases would depend on earlier tests.
+    """
+    with suppress(ImportError, AttributeError):
+        providers = importlib.import_module("hypothesis.internal.conjecture.providers")
+        none = type(providers._local_constants)()
+        providers._get_local_constants = lambda: none
 
     @seeded(seed)
     @settings(
