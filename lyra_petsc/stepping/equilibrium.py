@@ -237,7 +237,7 @@ class Equilibrium:
             pull = pull + (system.out_of_balance()[0] - here) / (part * step)
             system.x[:] = x
             system.forget_forces()
-        self._rate, spent = self._tangent(pull, self._known(before, factor))
+        self._rate, spent = self._tangent(pull, self._linearised(before, factor))
         if self._rate is not None:
             self._rate += moved / step
         return spent
@@ -248,7 +248,7 @@ class Equilibrium:
         Returns linear iterations.
         """
         system, now = self._system, self._system.applied.now.copy()
-        known = system.applied.following = self._known(before, factor)
+        known = system.applied.following = self._linearised(before, factor)
         way, spent = None, 0
         if known is not None and not system.active.viscous:  # of wind no stiffness is known
             if not first:
@@ -261,8 +261,8 @@ class Equilibrium:
             system.applied.given = now + self._skew_force(known, way)
         return spent
 
-    def _known(self, before: float, factor: float) -> FollowingLoads | None:
-        """Pressures as they change from the present shape, if there are any."""
+    def _linearised(self, before: float, factor: float) -> FollowingLoads | None:
+        """Pressures, linear in the displacement from the present shape, if there are any."""
         pressures = self._system.active.following
         if not pressures:
             return None

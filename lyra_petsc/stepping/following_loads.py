@@ -56,18 +56,17 @@ class FollowingLoads:
         factor: float,
     ) -> None:
         self._from = x.copy()
-        self._parts, self._skew = [], []
+        self._parts = []
         for load in loads:
             symmetric, skew = following_stiffness(load, x, force_of)
-            self._parts.append((load.stencil, factor * symmetric, load.n_owned))
-            self._skew.append((load.stencil, factor * skew))
+            self._parts.append((load.stencil, factor * symmetric, factor * skew, load.n_owned))
 
     def _forces(self, x: Array) -> Iterator[tuple[NDArray[np.int32], Array, Array, int]]:
         """Of each load its stencil, displacements u (E, n, 3) [m], K u (E, n, 3) [N], and how many elements
         this rank counts.
         """
         ahead = x[: len(self._from)] - self._from
-        for stencil, blocks, n_owned in self._parts:
+        for stencil, blocks, _, n_owned in self._parts:
             u = ahead[stencil]
             yield stencil, u, -np.einsum("eabij,ebj->eai", blocks, u), n_owned
 
@@ -83,13 +82,13 @@ class FollowingLoads:
     def skew_force(self, way: Array, n_owned: int) -> Array:
         """Force (n_owned, 3) [N] by the skew part of K on a displacement (n_local, 3) [m]."""
         out = np.zeros((n_owned, 3))
-        for stencil, blocks in self._skew:
+        for stencil, _, blocks, _ in self._parts:
             _scatter(stencil, -np.einsum("eabij,ebj->eai", blocks, way[stencil]), out, len(way))
         return out
 
     def add_hessian(self, weight: float, pattern: BlockPattern, values: Array) -> None:
         """Add −weight K to block rows (n_blocks, 3, 3)."""
-        for stencil, blocks, _ in self._parts:
+        for stencil, blocks, _, _ in self._parts:
             add_elements(np.full(len(stencil), weight), blocks, pattern.offsets_of(stencil), values)
 
 

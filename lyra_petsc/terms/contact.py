@@ -79,7 +79,8 @@ which takes Newton's method many iterations."""
 
 
 PARTS = 1_000_000_000
-"""Parts of the stiffness are whole numbers of its billionths: they go with triangles from rank to rank."""
+"""Vertices have so many parts of k as their area asks for: whole numbers, which go from rank to rank with the
+triangles."""
 
 LEAST, MOST = 1e-3, 1e3
 """Of the stiffness that pairs of a vertex have, for its area."""
@@ -142,6 +143,12 @@ class Meeting(NamedTuple):
     beta: Array
     energy: Array
     felt: Array
+
+    @property
+    def stiffness(self) -> Array:
+        """b″ times the square of the distance's gradient [N/m], (m,)."""
+        square: Array = np.sum(self.felt[:, :3] ** 2, axis=1)
+        return self.felt[:, 4] * square
 
 
 _NONE = np.empty(0)
@@ -568,16 +575,14 @@ class ContactBarrier(Elastic):
     def largest_stiffness(self, x: Array, frozen: Places) -> float:
         """Largest stiffness b″ [N/m] of a counted contact, by as many pairs as it counts for."""
         met = self.meeting(x, frozen.now)
-        stiffness = met.counted * met.felt[:, 4] * np.sum(met.felt[:, :3] ** 2, axis=1)
-        return float(stiffness.max(initial=0.0))
+        return float((met.counted * met.stiffness).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
         return HALFWAY * self._k * size
 
     def stiffness(self, x: Array, frozen: Places) -> Array:
         met, out = self.meeting(x, frozen.now), np.zeros(self.n_elements)
-        square = np.sum(met.felt[:, :3] ** 2, axis=1)
-        pressed = np.maximum(met.weight, met.counted) * met.felt[:, 4] * square
+        pressed = np.maximum(met.weight, met.counted) * met.stiffness
         out[met.at] = np.maximum(pressed, HALFWAY * self._k[met.at])
         return out
 
