@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.terms.term import Pulling
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
@@ -121,7 +122,7 @@ class Ledger:
         n = system.points.n_owned
         columns = [*ENERGIES, *self._more]
         local = np.zeros(len(columns) + 1)
-        local[-1] = 0.5 * float(np.einsum("i,ij,ij", system.mass, system.v[:n], system.v[:n]))
+        local[-1] = kinetic_energy(system.mass, system.v[:n])
         self._moving = 0.0
         for term in system.active.elastic:
             entry = term.registration

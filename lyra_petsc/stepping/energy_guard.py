@@ -37,7 +37,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import Budget, Works
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.state import fitted
+from lyra_petsc.stepping.state import fitted, kinetic_energy
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -162,7 +162,7 @@ class EnergyGuard:
         x1, v1, at = system.x, system.v, system.prescribed.at
         moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
         works, heat_beside = self._with_least_heat(x1 - x0, works)
-        change = 0.5 * float(np.einsum("i,ij,ij", system.mass, gained, gained))
+        change = kinetic_energy(system.mass, gained)
         # what the ledger's kinetic energies hold beyond the free coordinates
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
         work = self._outer_work(x0, v0, x1, v1, moved)

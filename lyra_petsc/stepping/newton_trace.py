@@ -115,7 +115,8 @@ class Trace:
         linear = self._linear_iterations()
         taken = None
         if number > 0 and self._last is not None:
-            (square,) = self._system.points.summed(float(np.sum((here - self._last) ** 2)))
+            way = here - self._last
+            (square,) = self._system.points.summed(float(np.vdot(way, way)))
             moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0

@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.terms.term import Term
 
 if TYPE_CHECKING:
@@ -54,9 +55,7 @@ class Objective:
         of = self._equations
         n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.reach
         x, vs = of.evaluate_at(v)
-        change = v - of.history
-        squares = np.einsum("ij,ij->i", change, change)
-        parts, square = [0.5 * sigma * float(np.vdot(of.mass, squares))], 0.0
+        parts, square = [sigma * kinetic_energy(of.mass, v - of.history)], 0.0
         for term in of.active.elastic:
             if not term.n_elements:
                 continue

@@ -49,3 +49,8 @@ def fitted(values: Array, n_owned: int, n_local: int) -> Array:
     out = np.zeros((n_local, 3))
     out[:n_owned] = values[:n_owned]
     return out
+
+
+def kinetic_energy(mass: Array, velocity: Array) -> float:
+    """½ Σ m |v|² [J] of these rows, mass (n,) and velocity (n, 3)."""
+    return 0.5 * float(np.sum(mass @ np.square(velocity)))

@@ -133,32 +133,38 @@ def _weighted(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel(inline="always")
-def _friction(friction, e):  # type: ignore[no-untyped-def]
-    """c of triangle e."""
-    return friction[e, 0] if friction.shape[0] > 0 else 0.0
-
-
 @kernel()
 def _load(  # type: ignore[no-untyped-def]
     edges, sign, shape, tangent, stiffness, rest, friction, length, first, batch
 ):
-    """Into rows 9 to 36 of a batch γ_i, T, K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c."""
+    """Into rows 9 to 36 of a batch γ_i, T, K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c.
+
+    T̄, S̄ and c that there are none of are left as they are.
+    """
     last = edges.shape[0] - 1
+    # several short loops take less time than one that reads everything
     for number in range(BATCH):
         e, i = min(first + number, last), Index(number)
         put(batch, 9, i, row(shape, edges[e, 0], 3))
         put(batch, 12, i, row(shape, edges[e, 1], 3))
         put(batch, 15, i, row(shape, edges[e, 2], 3))
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
         put(batch, 18, i, row(tangent, e, 0))
-        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        k = _six(stiffness, e)
         put(batch, 21, i, (k[0], k[1], k[2]))
         put(batch, 24, i, (k[3], k[4], k[5]))
-        put(batch, 27, i, (bar[0], bar[1], bar[2]))
-        put(batch, 30, i, (bar[3], bar[4], bar[5]))
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
         q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
         put(batch, 33, i, (q0, q1, sign[e, 2] / length[edges[e, 2]]))
-        batch[Index(BATCH * 36) + i] = _friction(friction, e)
+    for number in range(BATCH if rest.shape[0] > 0 else 0):
+        i = Index(number)
+        bar = _at_rest(rest, min(first + number, last))
+        put(batch, 27, i, (bar[0], bar[1], bar[2]))
+        put(batch, 30, i, (bar[3], bar[4], bar[5]))
+    for number in range(BATCH if friction.shape[0] > 0 else 0):
+        batch[Index(BATCH * 36) + Index(number)] = friction[min(first + number, last), 0]
 
 
 @kernel(inline="always")
@@ -220,7 +226,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
     x, stencil, edges, places, sign, shape, tangent, stiffness, rest, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
-    flat, batch = out.reshape(-1), np.empty(46 * BATCH)
+    flat, batch = out.reshape(-1), np.zeros(46 * BATCH)
     for e in range(stencil.shape[0]):
         i = Index(e % BATCH)
         if i == 0:
@@ -513,7 +519,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
-    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.empty(88 * BATCH)
+    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.zeros(88 * BATCH)
     for e in range(stencil.shape[0]):
         _fetch_ahead(e, corners, offsets, values)
         i = Index(e % BATCH)
