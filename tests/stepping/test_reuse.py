@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.stepping.reuse import SET_UP, Reuse
+from lyra_petsc.stepping.linear_system import SET_UP, Reuse
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MASK = np.zeros((1, 3), dtype=bool)

@@ -13,8 +13,8 @@ from physics import gathered, grid, scene_of
 from lyra_petsc import phases as profiling
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import INCOMPLETE
-from lyra_petsc.stepping import diagonal_shift as shift
-from lyra_petsc.stepping.diagonal_shift import LARGEST, LEAST, DiagonalShift
+from lyra_petsc.stepping import linear_system
+from lyra_petsc.stepping.linear_system import LARGEST_SHIFT, LEAST_SHIFT, DiagonalShift
 from lyra_petsc.stepping.simulation import SteppedScene
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
@@ -51,7 +51,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
     growing = DiagonalShift(ksp, acts=True)
-    assert growing.value == LEAST
+    assert growing.value == LEAST_SHIFT
     tries = 0
     while True:
         diagonal = np.diag(KERSHAW) * (1.0 + growing.value)
@@ -64,13 +64,13 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
         tries += 1
         assert growing.raise_()
     assert tries > 0
-    assert LEAST < growing.value <= LARGEST
+    assert LEAST_SHIFT < growing.value <= LARGEST_SHIFT
     np.testing.assert_allclose(KERSHAW @ y.getArray(), b.getArray(), atol=1e-4)
     # what did not fail asks for no more
     assert not growing.raise_()
     before = growing.value
     growing.begin()
-    assert LEAST <= growing.value < before
+    assert LEAST_SHIFT <= growing.value < before
 
 
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
@@ -104,7 +104,7 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
     x, notes, preset = journey(comm, "semi-implicit")
     assert (notes, preset) == ([], incomplete)
     if comm.size == 1:
-        monkeypatch.setattr(shift, "LEAST", 0.0)
+        monkeypatch.setattr(linear_system, "LEAST_SHIFT", 0.0)
         monkeypatch.setattr(DiagonalShift, "raise_", lambda self: False)
         other, notes, preset = journey(comm, "semi-implicit")
         assert preset != "ilu"
