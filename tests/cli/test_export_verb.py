@@ -21,27 +21,6 @@ def test_states_are_written_and_named(tmp_path: Path, ranks: int) -> None:
     np.testing.assert_array_equal(found, [position(0), position(2)])
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["run"], "Missing option '--to'"),
-        (["run", "--to", "objj"], "--to: unknown format 'objj', did you mean 'obj'"),
-        (["nowhere", "--to", "obj"], "nowhere: no such folder"),
-        (["run", "--to", "obj", "--every", "x"], "Invalid value for '--every'"),
-        (["run", "--to", "obj", "--out", "run"], "run: --out: exists"),
-    ],
-)
-def test_a_mistake_is_one_line(tmp_path: Path, words: list[str], said: str, ranks: int) -> None:
-    written(tmp_path / "run")
-    before = sorted(tmp_path.rglob("*"))
-    left = lyra(["export", *words], tmp_path, ranks)
-    assert left.code == 2, left.err
-    (line,) = left.ours
-    assert said in line
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 SLOW = """
 import sys, time
 from lyra_petsc.show import export

@@ -6,7 +6,6 @@ import csv
 import json
 from pathlib import Path
 
-import pytest
 from launch import lyra
 
 SCENE = """
@@ -29,22 +28,3 @@ def test_a_test_leaves_table_curve_and_page(tmp_path: Path) -> None:
     assert curve[0] == "strain [%],force [gf/cm]"
     assert len(curve) > 10
     assert "fabric tensile cloth.yaml" in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["bendin", "gray-interlock"], "bending"),
-        (["bending", "gray-interlok"], "gray-interlock"),
-        (["bending"], "give a material"),
-        (["bending", "gray-interlock", "--cloth", "gray-interlock"], "give a material"),
-        (["cantilever", "limp.yaml"], "does not resist"),
-    ],
-)
-def test_bad_input_is_one_line(tmp_path: Path, words: list[str], told: str) -> None:
-    (tmp_path / "limp.yaml").write_text(SCENE.replace("B: 0.1, ", ""), encoding="utf-8")
-    left = lyra(["fabric", *words], tmp_path)
-    assert left.code == 2
-    assert told in left.err
-    assert len(left.err.strip().splitlines()) == 1
-    assert not (tmp_path / "fabric").exists()

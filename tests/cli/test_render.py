@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from launch import SCENE, lyra, start, without, write_scene
+from launch import SCENE, lyra, start, write_scene
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
@@ -103,16 +103,6 @@ def test_a_signal_ends_a_film_without_a_trace(tmp_path):
     assert process.returncode == 143, err
     assert "stopped by SIGTERM after" in err
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_a_missing_package_is_one_line(tmp_path):
-    written(tmp_path / "run")
-    left = without(["pyvista"], ["render", "run"], tmp_path)
-    assert left.code == 2
-    assert (
-        left.err
-        == "lyra-petsc: render: pyvista is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
-    )
 
 
 def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from launch import (
-    PICTURES,
     REDUNDANT,
     finish,
     lyra,
@@ -15,7 +14,6 @@ from launch import (
     read_json,
     start,
     wait_until,
-    without,
     write_scene,
 )
 
@@ -67,18 +65,6 @@ def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) ->
         assert (folder / "plots" / f"{name}.png").stat().st_size > 1000
 
 
-def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
-    left = without(PICTURES, ["stress", "--quick", "--only", "free", "--out", "out"], tmp_path)
-    assert left.code == 0, left.err
-    assert "1 of 1 cases passed" in left.out
-    assert "pip install 'lyra-petsc[study]'" in left.out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "report.md",
-        "stress.csv",
-        "stress.json",
-    ]
-
-
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: int) -> None:
     scene = write_scene(tmp_path)
@@ -120,38 +106,6 @@ def test_a_base_that_does_not_run_is_exit_code_3(tmp_path: Path, ranks: int) -> 
     [line] = left.ours
     assert "did not converge" in line
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path) -> None:
-    left = lyra(["stress", "--only", "chain-1e6,wint", "--out", "out"], tmp_path)
-    assert left.code == 2
-    [line] = left.ours
-    assert line.startswith("lyra-petsc: wint: unknown case or family, did you mean 'wind'")
-    assert left.out == ""
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--quick", "--full"], "--quick"),
-        (["none.yaml"], "none.yaml"),
-        (["--set", "material.density=-1"], "density"),
-        (["--set", "time.analysis=static"], "time"),
-        (["--set", "handles=[{group: nowhere}]"], "nowhere"),
-        (["--ranks", "0"], "--ranks"),
-        (["--only", "products"], "--full"),
-        (["--out", "taken"], "--force"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: str) -> None:
-    (tmp_path / "taken").mkdir()
-    left = lyra(["stress", *arguments], tmp_path)
-    assert left.code == 2, left.err
-    [line] = left.ours
-    assert words in line
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
-    assert list((tmp_path / "taken").iterdir()) == []
 
 
 def test_ranks_start_an_mpirun(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, without, write_scene
+from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, write_scene
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -276,16 +276,6 @@ def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, words: lis
 def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     refused(tmp_path, ["study", "scene.yaml", "--vary", "dt=0.01,0.01"], "twice", ranks=2)
-
-
-def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
-    write_scene(tmp_path, HANGING)
-    left = without(["matplotlib"], ["study", "scene.yaml"], tmp_path)
-    assert left.code == 2
-    assert left.ours == [
-        "lyra-petsc: study: matplotlib is not installed; get the extra: pip install 'lyra-petsc[study]'"
-    ]
-    assert not (tmp_path / "studies").exists()
 
 
 def test_a_run_imports_nothing_of_it(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import signal
 
 import pytest
-from launch import finish, lyra, without
+from launch import finish, lyra
 from written_run import Writer, written
 
 
@@ -61,14 +61,6 @@ def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
     left = lyra(["view", "nowhere"], tmp_path, ranks=2)
     assert left.code == 2
     assert len(left.ours) == 1
-
-
-def test_a_missing_package_is_one_line(tmp_path):
-    left = without(["trame_vtk"], ["view", written(tmp_path / "run")], tmp_path)
-    assert left.code == 2
-    assert left.err == (
-        "lyra-petsc: view: trame_vtk is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
-    )
 
 
 @pytest.mark.parametrize("option", [["--host", "127.0.0.1"], ["--port", "0"], ["--no-browser"]])
