@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from launch import SCENE, Left, done, lyra, without, write_scene
+from launch import SCENE, Left, done, lyra, refusal, without, write_scene
 from written_run import written
 
 GRID = "{grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}"
@@ -169,16 +169,6 @@ def set_out(folder: Path, name: str) -> tuple[list[str], str]:
     return arguments, words
 
 
-def refused(left: Left, words: str) -> None:
-    """Exit code 2 and one line of ours with these words."""
-    assert left.code == 2, left.err
-    assert len(left.ours) == 1, left.err
-    assert len(left.ours[0]) < 800
-    assert words in left.ours[0]
-    assert "Traceback" not in left.err
-    assert left.out == ""
-
-
 @pytest.mark.parametrize(
     ("package", "words", "extra"),
     [
@@ -193,7 +183,7 @@ def test_a_missing_package_is_one_line(tmp_path: Path, package: str, words: list
     before = listing(tmp_path)
     left = without([package], words, tmp_path)
     told = f"{words[0]}: {package} is not installed; get the extra: pip install 'lyra-petsc[{extra}]'"
-    refused(left, told)
+    refusal(left, told)
     assert left.err == f"lyra-petsc: {told}\n"
     assert listing(tmp_path) == before
 
@@ -214,7 +204,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)
     left = lyra(arguments, tmp_path, patience=30)
-    refused(left, words)
+    refusal(left, words)
     assert left.err.splitlines() == left.ours
     assert listing(tmp_path) == before
 
@@ -223,7 +213,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
 def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)
-    refused(lyra(arguments, tmp_path, 2, patience=30), words)
+    refusal(lyra(arguments, tmp_path, 2, patience=30), words)
     assert listing(tmp_path) == before
 
 
@@ -253,7 +243,7 @@ def together(
 @pytest.mark.parametrize("name", [name for name in MISTAKES if name not in OF_PETSC])
 def test_ranks_agree_on_a_mistake(together: dict[str, tuple[Path, Listing, list[Left]]], name: str) -> None:
     folder, before, (first, *others) = together[name]
-    refused(first, MISTAKES[name][2])
+    refusal(first, MISTAKES[name][2])
     assert first.err.splitlines() == first.ours
     assert all(other == Left(2, "", "") for other in others)
     assert listing(folder) == before

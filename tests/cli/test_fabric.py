@@ -6,7 +6,7 @@ import csv
 import json
 from pathlib import Path
 
-from launch import lyra
+from launch import done
 
 SCENE = """
 mesh: {grid: {width: 0.1, height: 0.1, nx: 1, ny: 1}}
@@ -17,8 +17,7 @@ time: {end: 1, step: 0.1}
 
 def test_a_test_leaves_table_curve_and_page(tmp_path: Path) -> None:
     (tmp_path / "cloth.yaml").write_text(SCENE, encoding="utf-8")
-    left = lyra(["fabric", "tensile", "cloth.yaml", "--out", "out"], tmp_path)
-    assert left.code == 0, left.err + left.out
+    left = done(["fabric", "tensile", "cloth.yaml", "--out", "out"], tmp_path)
     assert "2 of 2 cases passed" in left.out
     with open(tmp_path / "out" / "fabric.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from launch import SCENE, lyra, start, write_scene
+from launch import SCENE, done, lyra, start, write_scene
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
@@ -66,15 +66,12 @@ def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
     """The camera of the scene is the one of the picture; without it another picture comes out."""
     camera = "render: {camera: {position: [0.5, -3, 0], target: [0.5, 0.5, 0], angle: 30}}\n"
     write_scene(tmp_path, SCENE + camera)
-    left = lyra(["run", "scene.yaml", "--out", "run"], tmp_path)
-    assert left.code == 0, left.err
-    left = lyra(["render", "run", "--at", "0.05", "--size", "160x120"], tmp_path)
-    assert left.code == 0, left.err
+    left = done(["run", "scene.yaml", "--out", "run"], tmp_path)
+    left = done(["render", "run", "--at", "0.05", "--size", "160x120"], tmp_path)
     assert left.out == "picture  run/picture-0.05.png\n"
-    again = lyra(
+    done(
         ["render", "run", "--at", "0.05", "--size", "160x120", "--out", "other", "--set", "render="], tmp_path
     )
-    assert again.code == 0, again.err
     pictures = [(tmp_path / folder / "picture-0.05.png").read_bytes() for folder in ("run", "other")]
     assert pictures[0] != pictures[1]
 
@@ -82,10 +79,9 @@ def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
 @pytest.mark.slow
 def test_two_ranks_make_a_film_and_refuse_as_one(tmp_path):
     written(tmp_path / "run", states=4)
-    left = lyra(
+    left = done(
         ["render", "run", "--film", "film.mp4", "--size", "160x120", "--fps", "10"], tmp_path, ranks=2
     )
-    assert left.code == 0, left.err
     assert left.out == "film     film.mp4  (0.4 s, 4 frames, 10 a second)\n"
     left = lyra(["render", "run", "--at", "9"], tmp_path, ranks=2)
     assert left.code == 2

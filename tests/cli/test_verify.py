@@ -6,21 +6,19 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import PICTURES, finish, lyra, read_csv, read_json, start, wait_until, without
+from launch import PICTURES, done, finish, lyra, read_csv, read_json, start, wait_until, without
 
 from lyra_petsc.experiments.verification.cases import CASES
 
 
 def test_list_names_every_case(tmp_path: Path) -> None:
-    left = lyra(["verify", "--list"], tmp_path)
-    assert left.code == 0, left.err
+    left = done(["verify", "--list"], tmp_path)
     assert [line.split()[0] for line in left.out.splitlines()] == list(CASES.modules)
     assert f"{len(CASES.modules)} cases" in left.err
 
 
 def test_a_case_passes(tmp_path: Path) -> None:
-    left = lyra(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, 2)
-    assert left.code == 0, left.err + left.out
+    left = done(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, 2)
     assert f"2 of {len(CASES.modules)} cases\n" in left.out
     assert "2 of 2 cases passed" in left.out
     assert "order 1.00, as expected 1" in left.out
@@ -42,8 +40,7 @@ def test_a_case_passes(tmp_path: Path) -> None:
 def test_the_page_holds_its_plots_and_unused_petsc_options_are_told(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    left = lyra(["verify", "free-fall", "--quick", "--out", "out", "-snes_typo", "1"], tmp_path)
-    assert left.code == 0, left.err
+    left = done(["verify", "free-fall", "--quick", "--out", "out", "-snes_typo", "1"], tmp_path)
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/svg+xml;base64,") == 2
