@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import signal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -87,15 +88,25 @@ class OutputError(LyraError):
 
 
 class Interrupted(LyraError):
-    """A signal asked the run to stop; it finished its step and wrote a checkpoint."""
+    """A signal asked the program to stop; a run has finished its step and written a checkpoint.
 
-    def __init__(self, message: str, signal_number: int) -> None:
-        super().__init__(message)
+    Parameters
+    ----------
+    told : str
+        After the signal's name: what has been done, and how to go on.
+    signal_number : int
+    how : str
+        Before the name.
+    """
+
+    def __init__(self, told: str, signal_number: int, how: str = "stopped by") -> None:
+        super().__init__(f"{how} {signal.Signals(signal_number).name}{told}")
         self.signal_number = signal_number
-        self.exit_code = 130 if signal_number == 2 else 143
+        self.exit_code = 130 if signal_number == signal.SIGINT else 143
+        self._given = told, signal_number, how
 
     def __reduce__(self) -> tuple[object, ...]:
-        return (Interrupted, (str(self), self.signal_number))
+        return Interrupted, self._given
 
 
 _FLAGS = {"force", "resume", "sheet", "handles", "wind", "cells"}

@@ -20,6 +20,8 @@ from __future__ import annotations
 import faulthandler
 import gc
 import os
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -62,6 +64,18 @@ def petsc_options() -> Iterator[None]:
 def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty folder of this test, the same on every rank."""
     return Path(WORLD.bcast(tmp_path_factory.mktemp("shared") if WORLD.rank == 0 else None, root=0))
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 300 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(words, capture_output=True).returncode != 0:
+        pytest.skip("mounting a tmpfs is not permitted here")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @pytest.hookimpl(trylast=True)  # the terminal exists by then

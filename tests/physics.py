@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -93,6 +94,43 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
 def gathered(layout: Layout, owned: Array) -> Array:
     """Rows of the owned vertices (n_vertices or more, …) in mesh order, on every rank; collective."""
     return layout.gathered(owned)
+
+
+@contextmanager
+def options(given: Mapping[str, Any]) -> Iterator[None]:
+    """With options of PETSc: these, and all that are set meanwhile, are removed again."""
+    database = PETSc.Options()
+    before = set(database.getAll())
+    for name, value in given.items():
+        database[name] = value
+    try:
+        yield
+    finally:
+        for name in set(database.getAll()) - before:
+            database.delValue(name)
+
+
+@contextmanager
+def stepped(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Iterator[SteppedScene]:
+    """A scene, or a scene's content, with options of PETSc; freed, which is collective, unless this fails."""
+    with options(petsc):
+        simulation = SteppedScene(comm, scene if isinstance(scene, Scene) else scene_of(scene))
+        yield simulation
+        simulation.destroy()
+
+
+@contextmanager
+def finished(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Iterator[SteppedScene]:
+    """The same after all of its steps."""
+    with stepped(comm, scene, **petsc) as simulation:
+        while not simulation.finished:
+            simulation.step()
+        yield simulation
+
+
+def shape(simulation: SteppedScene) -> Array:
+    """Positions (V, 3) [m] in mesh order, on every rank."""
+    return gathered(simulation.problem.points, simulation.problem.system.x)
 
 
 class Simulation:
@@ -226,7 +264,7 @@ def end_on_one_rank(comm: MPI.Comm, scene: Scene, folder: Path, steps: int) -> A
             again.record(resumed.step())
         again.settle()
         again.close()
-        x = gathered(resumed.problem.points, resumed.problem.system.x)
+        x = shape(resumed)
         resumed.destroy()
     few.Free()
     comm.Barrier()

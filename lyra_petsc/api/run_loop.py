@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -76,9 +75,7 @@ def simulate(
             if directory.note:
                 simulation.notes.append(directory.note)
             if number := stop():
-                raise Interrupted(
-                    f"stopped by {signal.Signals(number).name} during the set-up; nothing was written", number
-                )
+                raise Interrupted(" during the set-up; nothing was written", number)
             with simulation.phases("output"):
                 directory.clean()
                 if choice.resume:
@@ -148,11 +145,8 @@ class _RunLoop:
                 if number := stop():
                     recorder.write_checkpoint()
                     recorder.settle()
-                    raise Interrupted(
-                        f"stopped by {signal.Signals(number).name} after step {simulation.step_number} "
-                        f"(t = {simulation.time:g} s); the checkpoint is written, --resume goes on",
-                        number,
-                    )
+                    told = f" after step {simulation.step_number} (t = {simulation.time:g} s)"
+                    raise Interrupted(f"{told}; the checkpoint is written, --resume goes on", number)
             with simulation.phases("output"):
                 recorder.settle()
             if simulation.note_of_repeats:

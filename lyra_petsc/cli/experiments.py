@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -44,9 +43,8 @@ def watched(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]
     stop = StopRequest(comm)
 
     def watch() -> None:
-        number = stop.signal_number()
-        if number:
-            raise Interrupted(f"stopped by {signal.Signals(number).name}{kept()}", number)
+        if number := stop.signal_number():
+            raise Interrupted(kept(), number)
 
     return watch
 

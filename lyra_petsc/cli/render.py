@@ -71,11 +71,8 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
         def show_progress(done: int, count: int) -> None:
             progress.update(done, count)
             if number := stop.signal_number():
-                raise Interrupted(
-                    f"stopped by {signal.Signals(number).name} after {done} of {count} states; a film is not "
-                    "kept in part",
-                    number,
-                )
+                told = f" after {done} of {count} states; a film is not kept in part"
+                raise Interrupted(told, number)
 
         written = draw(comm, plan, show_progress)
     if comm.rank == 0:
@@ -121,7 +118,7 @@ def export(comm: Any, /, run: Path, **asked: Any) -> None:
 def _give_up(number: int, frame: FrameType | None) -> None:
     from lyra_petsc.errors import Interrupted
 
-    raise Interrupted(f"stopped by {signal.Signals(number).name}; nothing was written", number)
+    raise Interrupted("; nothing was written", number)
 
 
 @verb("lyra-petsc report runs/flag")

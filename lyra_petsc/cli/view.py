@@ -121,4 +121,4 @@ def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:
 
     number = asyncio.run(serve(find_run(folder), served.host, served.port, ready, **look))
     if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
-        raise Interrupted(f"ended by {signal.Signals(number).name}", number)
+        raise Interrupted("", number, "ended by")

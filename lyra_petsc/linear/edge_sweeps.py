@@ -153,12 +153,16 @@ def backward_vertices(  # type: ignore[no-untyped-def]
 def forward_vertices(  # type: ignore[no-untyped-def]
     indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r, of_edges
 ):
-    """``gauss_seidel.forward`` over the owned vertices; r of them and of the edges becomes b − L x."""
+    """``gauss_seidel.forward`` over the owned vertices; r of them and of the edges becomes b − L x.
+
+    Before another such sweep that is of no use, and ``of_edges`` may be None.
+    """
     n, n_owned = Index(len(inverse)), Index(len(ends))
     for row in range(n):
         r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
-    for row in range(n, n_owned):
-        of_edges[row, 0], of_edges[row, 1], of_edges[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    if of_edges is not None:
+        for row in range(n, n_owned):
+            of_edges[row, 0], of_edges[row, 1], of_edges[row, 2] = b[row, 0], b[row, 1], b[row, 2]
     for row in range(n):
         lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
@@ -168,7 +172,8 @@ def forward_vertices(  # type: ignore[no-untyped-def]
         y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
-        scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
+        if of_edges is not None:
+            scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
 
 
 @cached(fastmath=True)
@@ -193,25 +198,6 @@ def backward_again(  # type: ignore[no-untyped-def]
         scatter(blocks, columns, r, lo, hi, (-y0, -y1, -y2))
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
         scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
-
-
-@cached(fastmath=True)
-def forward_ahead(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r
-):
-    """As ``forward_vertices``, before another such sweep: what becomes of the residuals is of no use."""
-    n = Index(len(inverse))
-    for row in range(n):
-        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
-    for row in range(n):
-        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
-        first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
-        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
-        t0, t1, t2 = gather_edges(groups, places, x, first, last, AHEAD_EDGES)
-        r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
-        y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
-        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
-        scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
 
 
 class SweepsWithEdges:
@@ -361,7 +347,7 @@ class SweepsWithEdges:
         blocks, groups, numbers = self._values
         rows = *self._rows, *self._groups, blocks, groups
         if number % EDGES_EVERY:
-            forward_ahead(*rows, self._inverse, b, x, self.r)
+            forward_vertices(*rows, self._inverse, b, x, self.r, None)
             return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
         beside = self._edges_beside

@@ -124,19 +124,13 @@ class Rows:
         ]
         return cls(bounds, vertex, vertices.owner, edge, edge_owner, component, unknowns)
 
-    def of_elements(self, elements: Elements, index: Ints) -> Ints:
-        """Rows (n, …) that the elements ``index`` (n,) touch: of their vertices, then of their edges."""
-        vertices: Ints = self.vertex[elements.stencil[index]]
-        if elements.edges is None:
-            return vertices
-        return np.concatenate([vertices, self.edge[elements.edges[index]]], axis=1)
 
-    def owners(self, elements: Elements) -> Ints:
-        """Ranks (E, …) that own the rows that each element touches."""
-        vertices: Ints = self.vertex_owner[elements.stencil]
-        if elements.edges is None:
-            return vertices
-        return np.concatenate([vertices, self.edge_owner[elements.edges]], axis=1)
+def touched_by(elements: Elements, at_vertex: Ints, at_edge: Ints, index: Ints | slice = slice(None)) -> Ints:
+    """What (n, …) vertices have, then edges, that the elements ``index`` (n,) touch."""
+    vertices: Ints = at_vertex[elements.stencil[index]]
+    if elements.edges is None:
+        return vertices
+    return np.concatenate([vertices, at_edge[elements.edges[index]]], axis=1)
 
 
 def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
@@ -193,12 +187,16 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
 
 def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
     """One picklable piece after the other, so that rank 0 holds one at a time; its own comes last."""
-    split = {name: split_elements(rows.owners(each), n_ranks) for name, each in whole.elements.items()}
+    split = {
+        name: split_elements(touched_by(each, rows.vertex_owner, rows.edge_owner), n_ranks)
+        for name, each in whole.elements.items()
+    }
     for rank in (*range(1, n_ranks), 0):
         lo, hi = rows.bounds[rank], rows.bounds[rank + 1]
         elements = {}
         touched = {
-            name: rows.of_elements(whole.elements[name], mine[rank][0]) for name, mine in split.items()
+            name: touched_by(each, rows.vertex, rows.edge, split[name][rank][0])
+            for name, each in whole.elements.items()
         }
         every = np.unique(np.concatenate([*map(np.unique, touched.values()), np.empty(0, np.int64)]))
         ghosts = every[(every < lo) | (every >= hi)]

@@ -123,8 +123,6 @@ def newton_way(force: Array, solve: Solve, skew: Callable[[Array], Array], comm:
     skew : callable
         Force by the loads' skew part on a displacement.
     """
-    if solve(force) is None:
-        return None
     local = (force.size, None)
     matrix = PETSc.Mat().createPython((local, local), _Preconditioned(solve, skew), comm)
     matrix.setUp()

@@ -1,4 +1,4 @@
-"""The matrices of Newton's linear systems: the Jacobian, and what its preconditioner is built from.
+"""The matrices of Newton's linear systems: the Jacobian, and what its preconditioner is built from, when.
 
 While the exact Hessian may be indefinite the preconditioner is built from the regularised one, so that it
 stays positive definite, and conjugate gradients see negative curvature only where there is some.
@@ -6,7 +6,7 @@ stays positive definite, and conjugate gradients see negative curvature only whe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from petsc4py import PETSc
 
@@ -16,11 +16,122 @@ from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Surface, i
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
 from lyra_petsc.linear.multigrid import Multigrid
 from lyra_petsc.linear.petsc_options import is_set
-from lyra_petsc.linear.pivots import shows_negative_curvature
+from lyra_petsc.linear.pivots import is_incomplete, shows_negative_curvature
 from lyra_petsc.phases import JACOBIAN_AGAIN, logged
-from lyra_petsc.stepping.diagonal_shift import DiagonalShift
-from lyra_petsc.stepping.reuse import Reuse
 from lyra_petsc.stepping.stage_equations import StageEquations
+
+LEAST_SHIFT, LARGEST_SHIFT = 0.01, 1.0
+"""Fractions of the diagonal blocks."""
+
+MORE, LESS = 4.0, 0.9
+"""Factors of the shift after indefinite factors, and from step to step."""
+
+INDEFINITE = (
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+    PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED,
+)
+
+
+class DiagonalShift:
+    """By how much diagonal blocks are enlarged before a matrix is factored incompletely.
+
+    Incomplete factors of a positive-definite matrix may be indefinite. Those of one with a larger diagonal
+    exist, and resemble the matrix less (Manteuffel, Math. Comp. 34, 1980, 473-497): the diagonal is enlarged
+    as little as makes the factors of a KSP's preconditioner positive definite.
+
+    Parameters
+    ----------
+    ksp : PETSc.KSP
+    acts : bool
+        The preconditioner is built from a matrix of its own.
+    """
+
+    def __init__(self, ksp: PETSc.KSP, *, acts: bool) -> None:
+        self._ksp, self._acts = ksp, acts
+        self._value = LEAST_SHIFT
+
+    @property
+    def value(self) -> float:
+        """Fraction by which diagonal blocks are to be larger; 0 where nothing is factored incompletely."""
+        return self._value if self._acts and is_incomplete(self._ksp.getPC()) else 0.0
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold to go on alike."""
+        return {"shift": self._value}
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory."""
+        self._value = float(memory.get("shift", self._value))
+
+    def begin(self) -> None:
+        """A new step: a little less than in the last one."""
+        self._value = max(LEAST_SHIFT, LESS * self._value)
+
+    def raise_(self) -> bool:
+        """Take more if the last solve failed by the factors; whether that may help."""
+        failed = self._ksp.getConvergedReason() in INDEFINITE
+        if not failed or self.value == 0.0 or self._value >= LARGEST_SHIFT:
+            return False
+        self._value = min(LARGEST_SHIFT, MORE * self._value)
+        return True
+
+
+SET_UP = 8.0
+"""Set-up of a preconditioner in linear iterations; incomplete factors take about ten, block Jacobi fewer."""
+
+SAME_STEP = 1.25
+"""Factor by which the time step may differ."""
+
+
+class Reuse:
+    """For how many steps a preconditioner serves, where a step is one linear solve (``semi-implicit``).
+
+    Setting it up costs as much as some linear iterations. It is kept until a solve takes more iterations than
+    the solves with it took on average, its set-up counted in: from there on the average would grow. After
+    that the next step sets it up anew, as it does where the time step or the prescribed unknowns are others.
+    That is decided from numbers of iterations, the same on all ranks.
+
+    Parameters
+    ----------
+    acts : bool
+        Else every solve sets up its own.
+
+    Attributes
+    ----------
+    reused : bool
+        The last solve took one of a step before.
+    """
+
+    def __init__(self, *, acts: bool) -> None:
+        self._acts = acts
+        self._for: tuple[float, object] | None = None
+        self.reused = False
+        self.renew()
+
+    def renew(self) -> None:
+        """Let the next solve set up its own preconditioner."""
+        self._solves, self._iterations = 0, SET_UP
+
+    def begin(self, equations: StageEquations) -> bool:
+        """Whether the next solve can do with the preconditioner that there is."""
+        reach, mask = equations.stage.reach, equations.prescribed.mask
+        if self._for is None or self._for[1] is not mask or not _alike(reach, self._for[0]):
+            self.renew()
+        self.reused = self._acts and self._solves > 0
+        if not self.reused:
+            self._for = reach, mask
+        return self.reused
+
+    def solved(self, iterations: int) -> None:
+        """A solve took so many linear iterations."""
+        self._solves += 1
+        self._iterations += iterations
+        if iterations * self._solves > self._iterations:
+            self.renew()
+
+
+def _alike(step: float, other: float) -> bool:
+    return other / SAME_STEP < step < other * SAME_STEP
 
 
 class LinearSystem:

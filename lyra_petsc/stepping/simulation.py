@@ -486,7 +486,7 @@ class SteppedScene:
     def _recover(self, attempt: Attempt, end: float) -> None:
         self._tried.append(FailedAttempt.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
-            previous, slow = self.stepper.preset, self.stepper.linear_solver_slow
+            previous, slow = self.stepper.preset, self.stepper.convergence.too_slow
             following = self.stepper.next_preset()
             if following is not None:
                 why = "took too many iterations" if slow else "broke down"

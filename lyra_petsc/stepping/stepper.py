@@ -433,11 +433,6 @@ class Stepper:
         return self._newton.convergence.stopped_by
 
     @property
-    def linear_solver_slow(self) -> bool:
-        """Whether it did not fail, but took more iterations than another one would cost."""
-        return self._newton.convergence.too_slow
-
-    @property
     def linear_solver_failed(self) -> bool:
         """Whether the last failed attempt might succeed with another preconditioner."""
         return self._linear_failed

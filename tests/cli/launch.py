@@ -272,3 +272,21 @@ def done(
     left = lyra(arguments, folder, ranks, extra, **keywords)
     assert left.code == 0, left.err + left.out
     return left
+
+
+def refused(arguments: Sequence[object], folder: Path, words: str, ranks: int = 1) -> None:
+    """Run the program and expect that it refuses in one line with these words, and leaves nothing."""
+    before = sorted(os.listdir(folder))
+    left = lyra(arguments, folder, ranks)
+    refusal(left, words)
+    assert sorted(os.listdir(folder)) == before
+
+
+def refusal(left: Left, words: str) -> None:
+    """Exit code 2 and one line of ours with these words."""
+    assert left.code == 2, left.err
+    assert len(left.ours) == 1, left.err
+    assert len(left.ours[0]) < 800
+    assert words in left.ours[0]
+    assert "Traceback" not in left.err
+    assert left.out == ""

@@ -7,11 +7,16 @@ import re
 from pathlib import Path
 
 import pytest
-from launch import SCENE, Left, done, lyra, write_scene
+from launch import SCENE, Left, done, lyra, refusal, without, write_scene
+from written_run import written
 
 GRID = "{grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}"
 LONG = 3000 * "x"
 EMPTY = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+FIT = (
+    "fit={parameters: {material.bending: {start: 1.0e-5, bounds: [1.0e-6, 1.0e-3]}}, "
+    "measurements: [{points: points.csv}]}"
+)
 
 # name: (change of the scene (old, new) or None, arguments after `run scene.yaml`, words in the line)
 CASES: dict[str, tuple[tuple[str, str] | None, list[str], str]] = {
@@ -51,7 +56,6 @@ CASES: dict[str, tuple[tuple[str, str] | None, list[str], str]] = {
 WORDS: list[tuple[list[str], str]] = [
     (["runn", "scene.yaml"], "runn: unknown verb, did you mean 'run'"),
     (["scene.yaml"], "give a verb first, as in: run scene.yaml"),
-    (["export", "nowhere", "--to", "obj"], "nowhere: no such folder"),
     (["run", "none.yaml"], "none.yaml"),
     (["run", "used"], "used"),
     (["check", "noise.msh"], "noise.msh"),
@@ -69,6 +73,38 @@ WORDS: list[tuple[list[str], str]] = [
     ),
     (["report", LONG], "File name too long"),
     (["check", "scene.yaml", f"--{LONG}"], "no such option"),
+    (["export", "run"], "Missing option '--to'"),
+    (["export", "run", "--to", "objj"], "--to: unknown format 'objj', did you mean 'obj'"),
+    (["export", "nowhere", "--to", "obj"], "nowhere: no such folder"),
+    (["export", "run", "--to", "obj", "--every", "x"], "Invalid value for '--every'"),
+    (["export", "run", "--to", "obj", "--out", "run"], "run: --out: exists"),
+    (["fabric", "bendin", "gray-interlock"], "did you mean 'bending'"),
+    (["fabric", "bending", "gray-interlok"], "did you mean 'gray-interlock'"),
+    (["fabric", "bending"], "give a material"),
+    (["fabric", "bending", "gray-interlock", "--cloth", "gray-interlock"], "give a material"),
+    (["fabric", "cantilever", "scene.yaml", "--set", "material.bending=0"], "does not resist"),
+    (["fit", "scene.yaml", "--set", FIT], ": measures vertex 99, but the mesh has vertices 0 to 24"),
+    (["new", "scene"], "scene.yaml: exists and is left as it is"),
+    (["new", "scene.yaml"], "scene.yaml: exists and is left as it is"),
+    (["new", "nowhere/x"], "cannot be written"),
+    (["new", ""], "must be a name"),
+    (["new", "a\nb"], "must be a name"),
+    (["new"], "Missing argument"),
+    (["new", "x", "--mesh", "none.geo"], "--mesh: no such file"),
+    (["new", "x", "--mesh", "a.stl"], "--mesh: 'a.stl' must end in"),
+    (["new", "x", "--mesh", "empty.obj"], "empty.obj"),
+    (["stress", "--quick", "--full"], "--quick"),
+    (["stress", "none.yaml"], "none.yaml"),
+    (["stress", "--set", "material.density=-1"], "density"),
+    (["stress", "--set", "time.analysis=static"], "time"),
+    (["stress", "--set", "handles=[{group: nowhere}]"], "nowhere"),
+    (["stress", "--ranks", "0"], "--ranks"),
+    (["stress", "--only", "products"], "--full"),
+    (["stress", "--only", "chain-1e6,wint"], "wint: unknown case or family, did you mean 'wind'"),
+    (["stress", "--out", "used"], "--force"),
+    (["verify", "free-fall", "patch-state"], "patch-state: unknown case, did you mean 'patch-states'"),
+    (["verify", "free-fall", "--out", "used"], "--force"),
+    (["verify", "free-fall", "--out", "empty.obj/out"], "empty.obj/out"),
 ]
 
 # name: (scene, arguments, words in the line)
@@ -127,17 +163,29 @@ def set_out(folder: Path, name: str) -> tuple[list[str], str]:
     (folder / "empty.obj").write_text(EMPTY)
     (folder / "noise.msh").write_bytes(bytes(range(256)) * 8)
     (folder / "used").mkdir()
+    (folder / "points.csv").write_text("vertex,x,uncertainty\n99,0,1\n")
+    if "run" in arguments[1:]:
+        written(folder / "run")
     return arguments, words
 
 
-def refused(left: Left, words: str) -> None:
-    """Exit code 2 and one line of ours with these words."""
-    assert left.code == 2, left.err
-    assert len(left.ours) == 1, left.err
-    assert len(left.ours[0]) < 800
-    assert words in left.ours[0]
-    assert "Traceback" not in left.err
-    assert left.out == ""
+@pytest.mark.parametrize(
+    ("package", "words", "extra"),
+    [
+        ("pyvista", ["render", "run"], "view"),
+        ("trame_vtk", ["view", "run"], "view"),
+        ("matplotlib", ["study", "scene.yaml"], "study"),
+    ],
+)
+def test_a_missing_package_is_one_line(tmp_path: Path, package: str, words: list[str], extra: str) -> None:
+    write_scene(tmp_path)
+    written(tmp_path / "run")
+    before = listing(tmp_path)
+    left = without([package], words, tmp_path)
+    told = f"{words[0]}: {package} is not installed; get the extra: pip install 'lyra-petsc[{extra}]'"
+    refusal(left, told)
+    assert left.err == f"lyra-petsc: {told}\n"
+    assert listing(tmp_path) == before
 
 
 def test_every_case_makes_a_mistake() -> None:
@@ -156,7 +204,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)
     left = lyra(arguments, tmp_path, patience=30)
-    refused(left, words)
+    refusal(left, words)
     assert left.err.splitlines() == left.ours
     assert listing(tmp_path) == before
 
@@ -165,7 +213,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
 def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)
-    refused(lyra(arguments, tmp_path, 2, patience=30), words)
+    refusal(lyra(arguments, tmp_path, 2, patience=30), words)
     assert listing(tmp_path) == before
 
 
@@ -195,7 +243,7 @@ def together(
 @pytest.mark.parametrize("name", [name for name in MISTAKES if name not in OF_PETSC])
 def test_ranks_agree_on_a_mistake(together: dict[str, tuple[Path, Listing, list[Left]]], name: str) -> None:
     folder, before, (first, *others) = together[name]
-    refused(first, MISTAKES[name][2])
+    refusal(first, MISTAKES[name][2])
     assert first.err.splitlines() == first.ours
     assert all(other == Left(2, "", "") for other in others)
     assert listing(folder) == before

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from launch import lyra
+from launch import done, lyra, refused
 from mpi4py import MPI
 
 from lyra_petsc.cli.check_run import check_run
@@ -157,15 +157,11 @@ def test_the_verb(folder: Path) -> None:
         (["other", "--crossings"], "other: no such folder; give the folder of a run"),
         (["."], ".: is not the folder of a run"),
     ):
-        refused = lyra(["check", *words], folder.parent)
-        assert refused.code == 2
-        assert len(refused.err.splitlines()) == 1
-        assert why in refused.err
+        refused(["check", *words], folder.parent, why)
 
 
 def test_a_run_of_the_program_without_crossings(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(json.dumps(BASE))
     assert lyra(["run", "scene.json", "--out", "run"], tmp_path).code == 0
-    checked = lyra(["check", "run", "--crossings"], tmp_path)
-    assert checked.code == 0, checked.err
+    checked = done(["check", "run", "--crossings"], tmp_path)
     assert checked.out.endswith("no crossings in 26 states\n")

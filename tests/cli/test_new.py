@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -91,31 +90,6 @@ def test_a_mesh_without_groups_is_held_by_its_upper_end(tmp_path: Path) -> None:
     done(["check", "bare.yaml"], tmp_path)
     done(["new", "square", "--mesh", str(ROOT / "meshes" / "square.obj")], tmp_path)  # surface groups only
     done(["run", "square.yaml", *SHORT], tmp_path)
-
-
-def test_nothing_is_overwritten_and_mistakes_are_one_line(tmp_path: Path) -> None:
-    (tmp_path / "kite.yaml").write_text("mine", encoding="utf-8")
-    (tmp_path / "empty.geo").write_text("Point(1) = {0, 0, 0};", encoding="utf-8")
-    for arguments, words in (
-        (["new", "kite"], "kite.yaml: exists and is left as it is"),
-        (["new", "kite.yaml"], "kite.yaml: exists and is left as it is"),
-        (["new", "nowhere/x"], "cannot be written"),
-        (["new", ""], "must be a name"),
-        (["new", "a\nb"], "must be a name"),
-        (["new"], "Missing argument"),
-        (["new", "x", "--mesh", "none.geo"], "--mesh: no such file"),
-        (["new", "x", "--mesh", "a.stl"], "--mesh: 'a.stl' must end in"),
-        (["new", "x", "--mesh", "empty.geo"], "empty.geo"),
-    ):
-        left = lyra(arguments, tmp_path)
-        assert left.code == 2, left.err
-        assert len(left.ours) == 1, left.err
-        assert words in left.ours[0]
-    assert (tmp_path / "kite.yaml").read_text(encoding="utf-8") == "mine"
-    assert sorted(os.listdir(tmp_path)) == ["empty.geo", "kite.yaml"]
-    left = lyra(["new", "kite"], tmp_path, ranks=2)
-    assert left.code == 2
-    assert len(left.ours) == 1
 
 
 @pytest.mark.parametrize(

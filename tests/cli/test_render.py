@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from launch import SCENE, lyra, start, without, write_scene
+from launch import SCENE, done, lyra, start, write_scene
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
@@ -66,15 +66,12 @@ def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
     """The camera of the scene is the one of the picture; without it another picture comes out."""
     camera = "render: {camera: {position: [0.5, -3, 0], target: [0.5, 0.5, 0], angle: 30}}\n"
     write_scene(tmp_path, SCENE + camera)
-    left = lyra(["run", "scene.yaml", "--out", "run"], tmp_path)
-    assert left.code == 0, left.err
-    left = lyra(["render", "run", "--at", "0.05", "--size", "160x120"], tmp_path)
-    assert left.code == 0, left.err
+    left = done(["run", "scene.yaml", "--out", "run"], tmp_path)
+    left = done(["render", "run", "--at", "0.05", "--size", "160x120"], tmp_path)
     assert left.out == "picture  run/picture-0.05.png\n"
-    again = lyra(
+    done(
         ["render", "run", "--at", "0.05", "--size", "160x120", "--out", "other", "--set", "render="], tmp_path
     )
-    assert again.code == 0, again.err
     pictures = [(tmp_path / folder / "picture-0.05.png").read_bytes() for folder in ("run", "other")]
     assert pictures[0] != pictures[1]
 
@@ -82,10 +79,9 @@ def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
 @pytest.mark.slow
 def test_two_ranks_make_a_film_and_refuse_as_one(tmp_path):
     written(tmp_path / "run", states=4)
-    left = lyra(
+    left = done(
         ["render", "run", "--film", "film.mp4", "--size", "160x120", "--fps", "10"], tmp_path, ranks=2
     )
-    assert left.code == 0, left.err
     assert left.out == "film     film.mp4  (0.4 s, 4 frames, 10 a second)\n"
     left = lyra(["render", "run", "--at", "9"], tmp_path, ranks=2)
     assert left.code == 2
@@ -103,16 +99,6 @@ def test_a_signal_ends_a_film_without_a_trace(tmp_path):
     assert process.returncode == 143, err
     assert "stopped by SIGTERM after" in err
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_a_missing_package_is_one_line(tmp_path):
-    written(tmp_path / "run")
-    left = without(["pyvista"], ["render", "run"], tmp_path)
-    assert left.code == 2
-    assert (
-        left.err
-        == "lyra-petsc: render: pyvista is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
-    )
 
 
 def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):

@@ -149,27 +149,6 @@ def test_reactions_of_a_sheet_at_rest_carry_its_weight(tmp_path: Path) -> None:
     assert force == pytest.approx([0, -0.15 * 9.81, 0], abs=1e-4 * 0.15 * 9.81)
 
 
-def test_a_membrane_only_scene_imports_no_other_term(tmp_path: Path) -> None:
-    scene = SCENE.replace("bending: 2.0e-5", "bending: 0").replace("gravity: [0, 0, -9.81]\n", "")
-    scene = scene.replace("handles: [{nodes: [0, 4]}]\n", "")
-    code = (
-        "import sys\n"
-        "from lyra_petsc.cli.app import run_command_line\n"
-        "code = run_command_line(sys.argv)\n"
-        "terms = sorted(name for name in sys.modules if name.startswith('lyra_petsc.terms.'))\n"
-        "print('imported', code, *terms)\n"
-    )
-    left = done(["check", write_scene(tmp_path, scene)], tmp_path, program=("-c", code))
-    # PETSc may say more when it ends: to it -c is an option that nothing used
-    line = next(line for line in left.out.splitlines() if line.startswith("imported "))
-    _, code_left, *modules = line.split()
-    assert code_left == "0"
-    assert "lyra_petsc.terms.membrane" in modules
-    others = {"bending", "gravity", "wind", "spring", "clamp", "pressure", "force"}
-    assert not others & {name.rsplit(".", 1)[1] for name in modules}
-    assert list(tmp_path.iterdir()) == [tmp_path / "scene.yaml"]
-
-
 def on_a_terminal(folder: Path, *options: str) -> str:
     """All that a run prints to a terminal of 120 columns."""
     master, slave = pty.openpty()

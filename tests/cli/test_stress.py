@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 from launch import (
-    PICTURES,
     REDUNDANT,
+    done,
     finish,
     lyra,
     read_csv,
     read_json,
+    refused,
     start,
     wait_until,
-    without,
     write_scene,
 )
 
@@ -26,8 +26,7 @@ TWO = ["--only", "one-triangle,chain-1e6"]
 
 
 def test_list_names_families_and_cases(tmp_path: Path) -> None:
-    left = lyra(["stress", "--full", "--list"], tmp_path)
-    assert left.code == 0, left.err
+    left = done(["stress", "--full", "--list"], tmp_path)
     words = [line.split()[0].rstrip(":") for line in left.out.splitlines()]
     assert words == [name for f in FAMILIES.all() for name in (f.name, *(case.name for case in f.cases))]
     count = sum(len(family.cases) for family in FAMILIES.all())
@@ -41,8 +40,7 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
 def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    left = lyra(["stress", "--quick", *TWO], tmp_path)
-    assert left.code == 0, left.err + left.out
+    left = done(["stress", "--quick", *TWO], tmp_path)
     assert "2 of 2 cases passed" in left.out
     folder = tmp_path / "stress" / "sheet"
     rows = read_csv(folder / "stress.csv")
@@ -67,25 +65,12 @@ def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) ->
         assert (folder / "plots" / f"{name}.png").stat().st_size > 1000
 
 
-def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
-    left = without(PICTURES, ["stress", "--quick", "--only", "free", "--out", "out"], tmp_path)
-    assert left.code == 0, left.err
-    assert "1 of 1 cases passed" in left.out
-    assert "pip install 'lyra-petsc[study]'" in left.out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "report.md",
-        "stress.csv",
-        "stress.json",
-    ]
-
-
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: int) -> None:
     scene = write_scene(tmp_path)
     names = "bending-1e6,jump,slivers"
     words = ["stress", scene, "--quick", "--only", names, "--set", "gravity=[0, 0, -5]"]
-    left = lyra([*words, *REDUNDANT], tmp_path, ranks)
-    assert left.code == 0, left.err + left.out
+    left = done([*words, *REDUNDANT], tmp_path, ranks)
     assert "slivers: left out" in left.out
     assert "2 of 2 cases passed" in left.out
     content = read_json(tmp_path / "stress" / "scene" / "stress.json")
@@ -96,8 +81,7 @@ def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: i
 def test_a_second_time_takes_another_folder(tmp_path: Path) -> None:
     (tmp_path / "stress" / "scene").mkdir(parents=True)
     (tmp_path / "stress" / "scene" / "stress.csv").write_text("")
-    left = lyra(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path)
-    assert left.code == 0, left.err + left.out
+    done(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path)
     assert (tmp_path / "stress" / "scene-2" / "stress.csv").exists()
 
 
@@ -122,38 +106,6 @@ def test_a_base_that_does_not_run_is_exit_code_3(tmp_path: Path, ranks: int) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path) -> None:
-    left = lyra(["stress", "--only", "chain-1e6,wint", "--out", "out"], tmp_path)
-    assert left.code == 2
-    [line] = left.ours
-    assert line.startswith("lyra-petsc: wint: unknown case or family, did you mean 'wind'")
-    assert left.out == ""
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--quick", "--full"], "--quick"),
-        (["none.yaml"], "none.yaml"),
-        (["--set", "material.density=-1"], "density"),
-        (["--set", "time.analysis=static"], "time"),
-        (["--set", "handles=[{group: nowhere}]"], "nowhere"),
-        (["--ranks", "0"], "--ranks"),
-        (["--only", "products"], "--full"),
-        (["--out", "taken"], "--force"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: str) -> None:
-    (tmp_path / "taken").mkdir()
-    left = lyra(["stress", *arguments], tmp_path)
-    assert left.code == 2, left.err
-    [line] = left.ours
-    assert words in line
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
-    assert list((tmp_path / "taken").iterdir()) == []
-
-
 def test_ranks_start_an_mpirun(tmp_path: Path) -> None:
     """One for each case: see the tests of study."""
     scene = write_scene(tmp_path)
@@ -169,9 +121,7 @@ def test_ranks_start_an_mpirun(tmp_path: Path) -> None:
 
 
 def test_ranks_under_mpirun_are_refused(tmp_path: Path) -> None:
-    left = lyra(["stress", "--quick", "--ranks", "2"], tmp_path, 2)
-    assert left.code == 2
-    assert "--ranks" in left.ours[0]
+    refused(["stress", "--quick", "--ranks", "2"], tmp_path, "--ranks", ranks=2)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -10,7 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, without, write_scene
+from launch import done, finish, lyra, read_csv, read_json, refused, start, wait_until, write_scene
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -191,10 +191,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
     assert [row["ranks"] for row in rows] == ["2", "2"]
     assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
     assert not list(tmp_path.glob("two/cases/*.json"))
-    inside = lyra([*words, "--out", "inside"], tmp_path, ranks=2)
-    assert inside.code == 2
-    assert len(inside.ours) == 1
-    assert "--ranks: starts one mpirun per case" in inside.ours[0]
+    refused([*words, "--out", "inside"], tmp_path, "--ranks: starts one mpirun per case", ranks=2)
     assert not (tmp_path / "inside").exists()
 
 
@@ -218,9 +215,7 @@ def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
     with (tmp_path / "out" / "study.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         for more in ("--resume", "--force"):
-            left = lyra([*words, more], tmp_path)
-            assert left.code == 2
-            assert "another study is at work" in left.ours[0]
+            refused([*words, more], tmp_path, "another study is at work")
     before = results(tmp_path / "out")
     (tmp_path / "out" / "mine.txt").write_text("kept")
     done([*words, "--force"], tmp_path)
@@ -243,17 +238,7 @@ def test_a_run_as_reference(tmp_path: Path) -> None:
         ("output.every=0.02", "has no state at t = 0.02 s"),
         ("time.end=0.12", "has no state at t = 0.12 s"),
     ):
-        refused(tmp_path, [*words[:-1], "new", "--reference", "run:fine", "--set", change], words_of_it)
-
-
-def refused(folder: Path, words: list[str], because: str, ranks: int = 1) -> Left:
-    before = sorted(path.name for path in folder.iterdir())
-    left = lyra(words, folder, ranks=ranks)
-    assert left.code == 2, left.err
-    assert len(left.ours) == 1
-    assert because in left.ours[0]
-    assert sorted(path.name for path in folder.iterdir()) == before
-    return left
+        refused([*words[:-1], "new", "--reference", "run:fine", "--set", change], tmp_path, words_of_it)
 
 
 @pytest.mark.parametrize(
@@ -270,22 +255,12 @@ def refused(folder: Path, words: list[str], because: str, ranks: int = 1) -> Lef
 )
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, words: list[str], because: str) -> None:
     write_scene(tmp_path, HANGING)
-    refused(tmp_path, ["study", "scene.yaml", *words], because)
+    refused(["study", "scene.yaml", *words], tmp_path, because)
 
 
 def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
-    refused(tmp_path, ["study", "scene.yaml", "--vary", "dt=0.01,0.01"], "twice", ranks=2)
-
-
-def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
-    write_scene(tmp_path, HANGING)
-    left = without(["matplotlib"], ["study", "scene.yaml"], tmp_path)
-    assert left.code == 2
-    assert left.ours == [
-        "lyra-petsc: study: matplotlib is not installed; get the extra: pip install 'lyra-petsc[study]'"
-    ]
-    assert not (tmp_path / "studies").exists()
+    refused(["study", "scene.yaml", "--vary", "dt=0.01,0.01"], tmp_path, "twice", ranks=2)
 
 
 def test_a_run_imports_nothing_of_it(tmp_path: Path) -> None:

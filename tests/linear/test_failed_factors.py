@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import gathered, grid, scene_of
+from physics import grid, shape, stepped
 
 from lyra_petsc.linear.failed_factors import MARGIN, forget
 from lyra_petsc.linear.hierarchy import Level
@@ -14,7 +14,6 @@ from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.linear.vcycle import Coarsest
 from lyra_petsc.mesh.points import Points
-from lyra_petsc.stepping.simulation import SteppedScene
 
 FAILED = PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
 WORKSPACE = "mat_mumps_icntl_14"
@@ -107,21 +106,13 @@ def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
         "time": {"end": 0.02, "step": 0.01, "integrator": integrator},
     }
     asked = {"mat_type": "aij", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
-    database = PETSc.Options()
     ends = []
     for margin in (200, -50):
-        for name, value in {**asked, WORKSPACE: margin}.items():
-            database.setValue(name, value)
-        try:
-            simulation = SteppedScene(comm, scene_of(scene))
+        with stepped(comm, scene, **asked, **{WORKSPACE: margin}) as simulation:
             simulation.step()
             simulation.step()
             assert simulation.notes == []
-            used = database.getInt(WORKSPACE)
+            used = PETSc.Options().getInt(WORKSPACE)
             assert used == margin if margin > 0 else used >= MARGIN
-            ends.append(gathered(simulation.problem.points, simulation.problem.system.x))
-            simulation.destroy()
-        finally:
-            for name in [*asked, WORKSPACE, *simulation.stepper.our_options]:
-                database.delValue(name)
+            ends.append(shape(simulation))
     np.testing.assert_allclose(*ends, atol=1e-9)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from oracle import blocks_of, expanded, summed
-from petsc4py import PETSc
-from physics import CLOTH, Simulation, grid, rotation
+from physics import CLOTH, Simulation, grid, options, rotation
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
@@ -72,12 +71,8 @@ def matrix_of(simulation: Simulation, kind: str) -> Matrix:
     points, pattern = simulation.problem.points, simulation.problem.pattern
     if kind == "python":
         return BlockMatrix(points, pattern)
-    database = PETSc.Options()
-    database.setValue("mat_type", kind)
-    try:
+    with options({"mat_type": kind}):
         return AssembledMatrix(points, pattern, "aij")
-    finally:
-        database.delValue("mat_type")
 
 
 def product(matrix: Matrix, direction: Array) -> Array:

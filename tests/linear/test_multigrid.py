@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import gathered
+from physics import shape, stepped
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear import presets
@@ -17,7 +17,6 @@ from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import SteppedScene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,29 +41,17 @@ def hanging(cells: int, **time: Any) -> dict[str, Any]:
     }
 
 
-def stepped(
+def iterated(
     comm: MPI.Comm, content: dict[str, Any], steps: int, pc_type: str, **petsc: Any
 ) -> tuple[np.ndarray, list[int]]:
     """Positions in mesh order, and linear iterations of each step, or the mean of its attempts."""
-    options = PETSc.Options()
-    given, filled = {"pc_type": pc_type, **petsc}, []
-    for name, value in given.items():
-        options[name] = value
-    try:
-        simulation = SteppedScene(comm, Scene.model_validate(content))
-        filled = simulation.stepper.our_options
+    with stepped(comm, Scene.model_validate(content), pc_type=pc_type, **petsc) as simulation:
         reports = [simulation.step() for _ in range(steps)]
-        counts = [report.linear_iterations // (1 + report.rejected) for report in reports]
-        x = gathered(simulation.problem.points, simulation.problem.system.x)
-        simulation.destroy()
-    finally:
-        for name in [*given, *filled]:
-            options.delValue(name)
-    return x, counts
+        return shape(simulation), [r.linear_iterations // (1 + r.rejected) for r in reports]
 
 
 def test_iterations_hardly_grow_with_the_mesh(kind: str, comm: MPI.Comm) -> None:
-    coarse, fine = (max(stepped(comm, hanging(cells), 3, kind)[1]) for cells in (25, 75))
+    coarse, fine = (max(iterated(comm, hanging(cells), 3, kind)[1]) for cells in (25, 75))
     assert 3 <= coarse <= 9
     assert fine <= 1.5 * coarse + 1
 
@@ -80,26 +67,26 @@ def test_unknowns_of_edges_cost_few_iterations(scheme: str, clamped: bool, comm:
         content["material"] |= {"bending_model": model, "bending_scale": 100.0}
         if clamped:
             content["handles"] = [{"box": [[-1, -1, -1], [0.001, 2, 1]], "clamp": True}]
-        counts.append(max(stepped(comm, content, 2, "python")[1]))
+        counts.append(max(iterated(comm, content, 2, "python")[1]))
     assert counts[1] <= 1.4 * counts[0] + 1
 
 
 def test_stiff_cloth_and_long_steps(kind: str, comm: MPI.Comm) -> None:
     content = hanging(50, step=0.04)
     content["material"]["stretching_scale"] = 1000.0
-    assert max(stepped(comm, content, 3, kind)[1]) <= 30
+    assert max(iterated(comm, content, 3, kind)[1]) <= 30
 
 
 def test_the_answer_is_that_of_a_factorisation(kind: str, comm: MPI.Comm) -> None:
     tight = {"ksp_rtol": 1e-11}
-    x, _ = stepped(comm, hanging(25), 5, kind, **tight)
-    direct, _ = stepped(comm, hanging(25), 5, "cholesky", **tight)
+    x, _ = iterated(comm, hanging(25), 5, kind, **tight)
+    direct, _ = iterated(comm, hanging(25), 5, "cholesky", **tight)
     assert np.abs(x - direct).max() < 1e-10
 
 
 def test_newton_with_an_exact_hessian(kind: str, comm: MPI.Comm) -> None:
-    x, counts = stepped(comm, hanging(25, integrator="beuler"), 4, kind)
-    other, _ = stepped(comm, hanging(25, integrator="beuler"), 4, "pbjacobi")
+    x, counts = iterated(comm, hanging(25, integrator="beuler"), 4, kind)
+    other, _ = iterated(comm, hanging(25, integrator="beuler"), 4, "pbjacobi")
     assert max(counts) < 40
     assert np.abs(x - other).max() < 1e-6
 
@@ -107,15 +94,15 @@ def test_newton_with_an_exact_hessian(kind: str, comm: MPI.Comm) -> None:
 def test_handles_that_let_go(kind: str, comm: MPI.Comm) -> None:
     content = hanging(25)
     content["handles"][0]["until"] = 0.015
-    x, counts = stepped(comm, content, 8, kind)
-    direct, _ = stepped(comm, content, 8, "cholesky")
+    x, counts = iterated(comm, content, 8, kind)
+    direct, _ = iterated(comm, content, 8, "cholesky")
     assert max(counts) <= 10
     assert np.abs(x - direct).max() < 1e-6
 
 
 def test_a_mesh_of_a_few_triangles(kind: str, comm: MPI.Comm) -> None:
-    x, counts = stepped(comm, hanging(2), 4, kind)
-    direct, _ = stepped(comm, hanging(2), 4, "cholesky")
+    x, counts = iterated(comm, hanging(2), 4, kind)
+    direct, _ = iterated(comm, hanging(2), 4, "cholesky")
     assert max(counts) <= 10
     assert np.abs(x - direct).max() < 1e-6
 
@@ -136,21 +123,21 @@ def test_a_mesh_of_a_few_triangles(kind: str, comm: MPI.Comm) -> None:
 def test_options_reach_it(options: dict[str, Any], kind: str, comm: MPI.Comm) -> None:
     if comm.size > 1 and "mg_coarse_pc_type" in options:
         options = {"mg_coarse_redundant_pc_type": "svd"}
-    _, counts = stepped(comm, hanging(25), 2, kind, **options)
+    _, counts = iterated(comm, hanging(25), 2, kind, **options)
     assert 0 < max(counts) < 20
 
 
 def test_levels_visited_twice(comm: MPI.Comm) -> None:
     content = hanging(75)
     content["material"] |= {"stretching_scale": 1000.0, "bending_scale": 1000.0}
-    once, counts = stepped(comm, content, 3, "python")
-    twice, fewer = stepped(comm, content, 3, "python", pc_mg_w_from=1)
+    once, counts = iterated(comm, content, 3, "python")
+    twice, fewer = iterated(comm, content, 3, "python", pc_mg_w_from=1)
     assert max(fewer) < max(counts)
     assert np.abs(once - twice).max() < 1e-6
 
 
 def test_our_cycle_stands_in_the_solvers_view(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
-    stepped(comm, hanging(25), 1, "python", ksp_view="")
+    iterated(comm, hanging(25), 1, "python", ksp_view="")
     if comm.rank == 0:
         assert "cycles=V" in capfd.readouterr().out
 
@@ -161,9 +148,9 @@ def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
     content = hanging(40)
     content["material"]["bending_model"] = "midedge"
     content["material"]["bending_scale"] = 1000.0
-    once, counts = stepped(comm, content, 3, "python", pc_mg_vertex_sweeps=1)
+    once, counts = iterated(comm, content, 3, "python", pc_mg_vertex_sweeps=1)
     assert "3 of each" not in capfd.readouterr().out
-    often, fewer = stepped(comm, content, 3, "python", ksp_view="")
+    often, fewer = iterated(comm, content, 3, "python", ksp_view="")
     assert sum(fewer) < 0.8 * sum(counts)
     assert np.abs(once - often).max() < 1e-6
     if comm.rank == 0:
@@ -176,7 +163,7 @@ def test_the_stiffer_bending_the_more_sweeps(
 ) -> None:
     content = hanging(12)
     content["material"] |= {"bending_model": "midedge", "bending_scale": bending}
-    stepped(comm, content, 1, "python", ksp_view="")
+    iterated(comm, content, 1, "python", ksp_view="")
     if comm.rank == 0:
         said = capfd.readouterr().out
         assert [number for number in (2, 3) if f"  {number} of each" in said] == [sweeps] * (sweeps > 1)
@@ -184,22 +171,22 @@ def test_the_stiffer_bending_the_more_sweeps(
 
 def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
     own = {"pc_python_type": f"{__name__}.Scaling"}
-    x, counts = stepped(comm, hanging(8), 2, "python", **own)
-    direct, _ = stepped(comm, hanging(8), 2, "cholesky")
+    x, counts = iterated(comm, hanging(8), 2, "python", **own)
+    direct, _ = iterated(comm, hanging(8), 2, "cholesky")
     assert max(counts) > 20
     assert np.abs(x - direct).max() < 1e-6
 
 
 def test_as_a_part_of_another_preconditioner_it_is_refused(comm: MPI.Comm) -> None:
     with pytest.raises(InputError, match="main preconditioner only") as caught:
-        stepped(comm, hanging(8), 1, "bjacobi", sub_pc_type="python", sub_pc_python_type=PYTHON_TYPE)
+        iterated(comm, hanging(8), 1, "bjacobi", sub_pc_type="python", sub_pc_python_type=PYTHON_TYPE)
     assert caught.value.key == "-sub_pc_python_type"
 
 
 def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
-    _, counts = stepped(comm, hanging(50), 3, "python")
+    _, counts = iterated(comm, hanging(50), 3, "python")
     alone = comm.Split(comm.rank, 0)
-    _, serial = stepped(alone, hanging(50), 3, "python")
+    _, serial = iterated(alone, hanging(50), 3, "python")
     alone.Free()
     # but for sweeps, which see the values of other ranks later
     assert max(counts) <= max(serial) + 2
@@ -213,11 +200,8 @@ def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm
     content["mesh"]["grid"] |= {"ny": 1, "height": 1.0 / 12.0, "pattern": pattern}
     content["handles"] = [{"nodes": [0]}]
     content["material"] |= {"bending_scale": 1000.0, "bending_model": model}
-    options, given = PETSc.Options(), {"pc_type": "python", "mat_partitioning_type": "average"}
-    for name, value in given.items():
-        options[name] = value
-    simulation = SteppedScene(comm, Scene.model_validate(content))
-    try:
+    given = {"pc_type": "python", "mat_partitioning_type": "average"}
+    with stepped(comm, Scene.model_validate(content), **given) as simulation:
         simulation.step()
         pc = simulation.stepper.snes.getKSP().getPC()
         b, x = pc.getOperators()[0].createVecs()
@@ -230,10 +214,6 @@ def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm
             pc.apply(b, x)
             columns.append(np.concatenate(comm.allgather(x.getArray())))
         cycle = np.array(columns)
-    finally:
-        for name in [*given, *simulation.stepper.our_options]:
-            options.delValue(name)
-    simulation.destroy()
     assert np.abs(cycle - cycle.T).max() < 1e-5 * np.abs(cycle).max()
     assert np.linalg.eigvalsh(cycle)[0] > 0.0
 
@@ -252,12 +232,11 @@ def test_sweeps_that_grow_without_bound_are_negative_curvature(
     """In the sixth step the exact Hessian, tried as its own preconditioner, is indefinite."""
     monkeypatch.setattr(presets, "TWICE_FROM", 30.0)
     settings = ("time.integrator=alpha2", "time.step=0.01")
-    simulation = SteppedScene(comm, load_scene(ROOT / "configs" / "swing.yaml", settings))
-    for _ in range(7):
-        simulation.step()
-    assert simulation.stepper.preset == "multigrid-w"
-    assert not simulation.notes
-    simulation.destroy()
+    with stepped(comm, load_scene(ROOT / "configs" / "swing.yaml", settings)) as simulation:
+        for _ in range(7):
+            simulation.step()
+        assert simulation.stepper.preset == "multigrid-w"
+        assert not simulation.notes
 
 
 def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
@@ -266,10 +245,7 @@ def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
     """Its block rows stand where the sweeps keep theirs afterwards, where edges carry unknowns."""
     content = hanging(12, integrator="beuler")
     content["material"]["bending_model"] = "midedge"
-    options = PETSc.Options()
-    options["pc_type"] = "python"
-    simulation = SteppedScene(comm, Scene.model_validate(content))
-    try:
+    with stepped(comm, Scene.model_validate(content), pc_type="python") as simulation:
         simulation.step()
         ksp, linear = simulation.stepper.ksp, simulation.stepper.linear
 
@@ -283,10 +259,6 @@ def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         ksp.setUp()
         after = shown("after")
-    finally:
-        for name in ["pc_type", *simulation.stepper.our_options]:
-            options.delValue(name)
-    simulation.destroy()
     size = before.norm(PETSc.NormType.INFINITY)
     after.axpy(-1.0, before)
     assert 0.0 < after.norm(PETSc.NormType.INFINITY) < 1e-6 * size  # which is single precision
@@ -295,12 +267,8 @@ def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
 def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm) -> None:
     """PETSc only multiplies by our rows; ``-mat_type`` makes a matrix with entries."""
     for asked, with_entries in (({}, False), ({"mat_type": "aij"}, True)):
-        database = PETSc.Options()
         given = asked | {"pc_type": "python", "pc_python_type": PYTHON_TYPE}
-        for name, value in given.items():
-            database[name] = value
-        try:
-            simulation = SteppedScene(comm, Scene.model_validate(hanging(25)))
+        with stepped(comm, Scene.model_validate(hanging(25)), **given) as simulation:
             simulation.step()
             linear = simulation.stepper.linear
             assert isinstance(linear.operator, AssembledMatrix if with_entries else BlockMatrix)
@@ -311,7 +279,3 @@ def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm
             else:
                 assert linear.operator.mat.getType() == PETSc.Mat.Type.PYTHON
                 assert linear.preconditioner is linear.operator
-            simulation.destroy()
-        finally:
-            for name in [*given, *simulation.stepper.our_options]:
-                database.delValue(name)

@@ -163,12 +163,8 @@ def test_bisection_is_even_and_across_the_longest_side(ranks: int) -> None:
 
 def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
     graph = vertex_graph([np.array([[i, i + 1] for i in range(11)])], 12) if comm.rank == 0 else None
-    database = PETSc.Options()
-    database.setValue("mat_partitioning_type", "average")
-    try:
-        owner, name = partition(comm, graph, 12)
-    finally:
-        database.delValue("mat_partitioning_type")
+    PETSc.Options()["mat_partitioning_type"] = "average"
+    owner, name = partition(comm, graph, 12)
     if comm.size > 1:
         assert name == "average"
     if comm.rank == 0:
@@ -178,13 +174,9 @@ def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
 def test_a_partitioner_that_petsc_has_not_is_refused(comm: MPI.Comm) -> None:
     if comm.size == 1:  # nothing is cut, hence nothing asked for
         return
-    database = PETSc.Options()
-    database.setValue("mat_partitioning_type", "scissors")
-    try:
-        with pytest.raises(InputError, match="scissors"):
-            partition(comm, vertex_graph([np.array([[0, 1]])], 2) if comm.rank == 0 else None, 2)
-    finally:
-        database.delValue("mat_partitioning_type")
+    PETSc.Options()["mat_partitioning_type"] = "scissors"
+    with pytest.raises(InputError, match="scissors"):
+        partition(comm, vertex_graph([np.array([[0, 1]])], 2) if comm.rank == 0 else None, 2)
 
 
 def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, direct_solver, grid, scene_of
+from physics import CLOTH, direct_solver, grid, options, scene_of
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.arrays import Array
@@ -75,11 +74,8 @@ def journey(
     comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
 ) -> tuple[int, float]:
     """A run (up to step ``stop``) with a direct solver and files in ``folder``: step number and time."""
-    options = direct_solver(comm) | {"ksp_rtol": "1e-12"}
-    for name, value in options.items():
-        PETSc.Options().setValue(name, value)
     asked = itertools.count(last(folder)[0] if resume else 0)  # before the first step, and after each
-    with suppress(Interrupted):
+    with suppress(Interrupted), options(direct_solver(comm) | {"ksp_rtol": "1e-12"}):
         simulate(
             comm,
             scene_of(scene),
@@ -87,8 +83,6 @@ def journey(
             ProgressCallbacks(),
             lambda: signal.SIGINT if next(asked) == stop else 0,
         )
-    for name in options:
-        PETSc.Options().delValue(name)
     comm.Barrier()
     return last(folder)
 

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from module_of import module_of
 from mpi4py import MPI
-from physics import reference
+from physics import finished, reference
 
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.stepping.simulation import SteppedScene
 
 ROOT = Path(__file__).resolve().parents[2]
 ANSWERS = reference("paper")
@@ -24,16 +23,11 @@ ANSWERS = reference("paper")
 def end_of(integrator: str, step: float) -> tuple[float, float]:
     """Relative error of the kinetic energy and distance [m] of the centre of mass at t = 0.48 s."""
     settings = (f"time.integrator={integrator}", f"time.step={step}")
-    simulation = SteppedScene(MPI.COMM_SELF, load_scene(ROOT / "configs" / "paper.yaml", settings))
-    try:
-        while not simulation.finished:
-            simulation.step()
+    with finished(MPI.COMM_SELF, load_scene(ROOT / "configs" / "paper.yaml", settings)) as simulation:
         system, mean = simulation.problem.system, ANSWERS["mean"]
         centre = system.mass @ system.x / system.mass.sum()
         apart = np.linalg.norm(centre[1:] - [mean["mean_y"][-1], mean["mean_z"][-1]])
         return simulation.budget.kinetic / mean["kinetic_energy"][-1] - 1.0, float(apart)
-    finally:
-        simulation.destroy()
 
 
 @pytest.mark.slow

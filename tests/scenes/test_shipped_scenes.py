@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
+from physics import finished
 
 from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.scene.load import load_scene
@@ -21,16 +21,9 @@ OF_CONTACT = ("flag-contact", "reef-knot", "stack", "tablecloth", "wring")
 """In ``test_contact_scenes.py``."""
 
 
-@contextmanager
-def simulated(name: str, *settings: str) -> Iterator[SteppedScene]:
+def simulated(name: str, *settings: str) -> AbstractContextManager[SteppedScene]:
     """A shipped scene with settings, run to its end on one rank."""
-    simulation = SteppedScene(MPI.COMM_SELF, load_scene(CONFIGS / f"{name}.yaml", settings))
-    try:
-        while not simulation.finished:
-            simulation.step()
-        yield simulation
-    finally:
-        simulation.destroy()
+    return finished(MPI.COMM_SELF, load_scene(CONFIGS / f"{name}.yaml", settings))
 
 
 def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:

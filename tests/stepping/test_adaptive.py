@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import gathered, grid, scene_of
+from physics import grid, shape, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -29,26 +27,10 @@ END = 0.2
 SIZE = float(np.hypot(0.5, 0.1))
 
 
-@contextmanager
 def simulated(
-    comm: MPI.Comm, options: dict[str, str] | None = None, **content: Any
-) -> Iterator[SteppedScene]:
-    """A scene that is set up; the options are removed again."""
-    tight = {"ksp_rtol": "1e-8"} | (options or {})
-    database = PETSc.Options()
-    for name, value in tight.items():
-        database.setValue(name, value)
-    simulation = SteppedScene(comm, scene_of(SWING | content))
-    try:
-        yield simulation
-        simulation.destroy()
-    finally:
-        for name in [*tight, *simulation.stepper.our_options]:
-            database.delValue(name)
-
-
-def positions(simulation: SteppedScene) -> Array:
-    return gathered(simulation.problem.points, simulation.problem.system.x)
+    comm: MPI.Comm, petsc: dict[str, str] | None = None, **content: Any
+) -> AbstractContextManager[SteppedScene]:
+    return stepped(comm, SWING | content, **{"ksp_rtol": "1e-8"} | (petsc or {}))
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +42,7 @@ def converged() -> Array:
         with simulated(comm, time=time) as simulation:
             while not simulation.finished:
                 simulation.step()
-            shapes.append(positions(simulation))
+            shapes.append(shape(simulation))
     return (4.0 * shapes[1] - shapes[0]) / 3.0
 
 
@@ -76,7 +58,7 @@ def test_the_error_keeps_the_tolerance(
         lengths = []
         while not simulation.finished:
             lengths.append(simulation.step().dt)
-        error = np.linalg.norm(positions(simulation) - converged, axis=1).max() / SIZE
+        error = np.linalg.norm(shape(simulation) - converged, axis=1).max() / SIZE
         assert 0.05 * tolerance < error < 2.0 * tolerance
         assert simulation.estimated_error < tolerance
     assert max(lengths) > 1.5 * min(lengths)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, gathered, grid, scene_of
+from physics import CLOTH, finished, grid, scene_of, shape
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -27,13 +26,8 @@ WEIGHT = 0.2 * 0.8 * 9.81
 STATIC = {"analysis": "static"}
 
 
-@contextmanager
-def done(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
-    simulation = SteppedScene(comm, scene_of(SHEET | content))
-    while not simulation.finished:
-        simulation.step()
-    yield simulation
-    simulation.destroy()
+def done(comm: MPI.Comm, **content: Any) -> AbstractContextManager[SteppedScene]:
+    return finished(comm, SHEET | content)
 
 
 def handle_sums(comm: MPI.Comm, handles: list[dict[str, Any]]) -> Array:
@@ -90,7 +84,7 @@ def test_the_first_order_estimate_is_the_error_of_free_fall(comm: MPI.Comm) -> N
     time = {"end": 0.2, "step": "auto", "tolerance": 0.02}
     with done(comm, time=time) as simulation:
         size = simulation.problem.outline.size
-        fallen = gathered(simulation.problem.points, simulation.problem.system.x)[:, 2]
+        fallen = shape(simulation)[:, 2]
         error = np.abs(fallen + 0.5 * 9.81 * 0.2**2).max() / size
         assert simulation.estimated_error == pytest.approx(error, rel=0.02)
         assert error < 1.2 * 0.02
@@ -124,7 +118,7 @@ def test_a_load_that_switches_begins_the_scheme_anew() -> None:
     for step in (0.004, 0.002, 0.0005):
         time = {"end": 0.12, "step": step, "integrator": "alpha2"}
         with done(MPI.COMM_SELF, **content, time=time) as simulation:
-            shapes.append(gathered(simulation.problem.points, simulation.problem.system.x))
+            shapes.append(shape(simulation))
     coarse, fine = (np.abs(shape - shapes[-1]).max() for shape in shapes[:2])
     assert coarse / fine == pytest.approx(4.06, abs=0.3)  # 3.2 where it is not
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, SOLVERS, gathered, grid, scene_of
+from physics import CLOTH, SOLVERS, finished, gathered, grid, options, scene_of, shape
 from repulsion_term import DISTANCE, REPULSION, Repulsion
 
 from lyra_petsc.arrays import Array
@@ -77,20 +76,15 @@ def flown(
     **petsc: Any,
 ) -> tuple[Array, float, float]:
     """Positions in mesh order, mean upward speed of the upper sheet, and most pairs, of a whole run."""
-    database = PETSc.Options()
-    for name, value in petsc.items():
-        database[name] = value
-    simulation = thrown(comm, scene)
-    pairs = 0.0
-    while not simulation.finished:
-        simulation.step()
-        watch(simulation)
-        pairs = max(pairs, simulation.ledger.columns()["pairs"])
-    layout = simulation.problem.points
-    x, v = (gathered(layout, rows) for rows in (simulation.problem.system.x, simulation.problem.system.v))
-    for name in [*petsc, *simulation.stepper.our_options]:
-        database.delValue(name)
-    simulation.destroy()
+    with options(petsc):
+        simulation = thrown(comm, scene)
+        pairs = 0.0
+        while not simulation.finished:
+            simulation.step()
+            watch(simulation)
+            pairs = max(pairs, simulation.ledger.columns()["pairs"])
+        x, v = shape(simulation), gathered(simulation.problem.points, simulation.problem.system.v)
+        simulation.destroy()
     return x, float(v[30:, 2].mean()), pairs
 
 
@@ -187,16 +181,13 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
         "loads": [{"box": [[-1, -1, 0.01], [2, 2, 1]], "force": [0, 0, -3.0]}],
         "time": {"analysis": "static", "end": 1.0, "step": 0.5},
     }
-    simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | pressed))
-    while not simulation.finished:
-        simulation.step()
-    system = simulation.problem.system
-    force = np.zeros((system.points.n_local, 3))
-    term_of(simulation).add_gradient(system.x, None, force)
-    upper = system.x[: system.points.n_owned, 2] > 0.01
-    (carried,) = system.points.summed(float(-force[: system.points.n_owned][upper, 2].sum()))
-    assert carried == pytest.approx(3.0, rel=1e-6)
-    simulation.destroy()
+    with finished(comm, SCENE | {"solver": TIGHT} | pressed) as simulation:
+        system = simulation.problem.system
+        force = np.zeros((system.points.n_local, 3))
+        term_of(simulation).add_gradient(system.x, None, force)
+        upper = system.x[: system.points.n_owned, 2] > 0.01
+        (carried,) = system.points.summed(float(-force[: system.points.n_owned][upper, 2].sum()))
+        assert carried == pytest.approx(3.0, rel=1e-6)
 
 
 def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +222,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
     assert touched.max() > 1.0
     while not simulation.finished:
         simulation.step()
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    x = shape(simulation)
     at_end = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
     simulation.destroy()
     if comm.rank == 0:
@@ -249,9 +240,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
             again.record(resumed.step())
         again.settle()
         again.close()
-        np.testing.assert_allclose(
-            gathered(resumed.problem.points, resumed.problem.system.x), x, rtol=0, atol=1e-8
-        )
+        np.testing.assert_allclose(shape(resumed), x, rtol=0, atol=1e-8)
         np.testing.assert_array_equal(
             gathered(resumed.problem.points, term_of(resumed).state()["touched"]), at_end
         )

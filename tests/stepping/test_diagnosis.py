@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, direct_solver, gathered, grid, scene_of
+from physics import CLOTH, direct_solver, gathered, grid, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
@@ -41,35 +40,29 @@ def failing(
     comm: MPI.Comm,
     scene: Mapping[str, Any],
     spoil: Spoil | None = None,
-    options: Mapping[str, str] = ONE_ATTEMPT,
+    petsc: Mapping[str, str] = ONE_ATTEMPT,
 ) -> Iterator[tuple[SteppedScene, SolverError, Failure]]:
     """A simulation whose step fails, and what it says of that."""
     direct = direct_solver(comm) | {"ksp_rtol": "1e-12"}
-    database = PETSc.Options()
-    for name, value in (direct | dict(options)).items():
-        database.setValue(name, value)
-    simulation = SteppedScene(comm, scene_of({**SCENE, **scene}))
-    if spoil is not None:
-        system = simulation.problem.system
-        plain = system.residual
+    with stepped(comm, {**SCENE, **scene}, **direct | dict(petsc)) as simulation:
+        if spoil is not None:
+            system = simulation.problem.system
+            plain = system.residual
 
-        def spoiled(v: Array, vdot: Array, out: Array) -> None:
-            plain(v, vdot, out)
-            spoil(simulation, out)
+            def spoiled(v: Array, vdot: Array, out: Array) -> None:
+                plain(v, vdot, out)
+                spoil(simulation, out)
 
-        system.residual = spoiled  # type: ignore[method-assign]
+            system.residual = spoiled  # type: ignore[method-assign]
 
-    def run() -> None:
-        while not simulation.finished:
-            simulation.step()
+        def run() -> None:
+            while not simulation.finished:
+                simulation.step()
 
-    with pytest.raises(SolverError) as caught:
-        run()
-    assert simulation.failure is not None
-    yield simulation, caught.value, simulation.failure
-    simulation.destroy()
-    for name in [*direct, *options, *simulation.stepper.our_options]:
-        database.delValue(name)
+        with pytest.raises(SolverError) as caught:
+            run()
+        assert simulation.failure is not None
+        yield simulation, caught.value, simulation.failure
 
 
 def pushed(vertex: int, value: float) -> Spoil:
@@ -141,7 +134,7 @@ def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
 def test_earlier_attempts_are_told(comm: MPI.Comm) -> None:
     time = {"end": 1.0, "step": 0.04}
     scene = {"material": STIFF, "solver": {"max_iterations": 1}, "time": time}
-    with failing(comm, scene, options={"ts_adapt_dt_min": "0.005"}) as (_, error, failure):
+    with failing(comm, scene, petsc={"ts_adapt_dt_min": "0.005"}) as (_, error, failure):
         assert [tried.dt for tried in failure.tried] == pytest.approx([0.04, 0.02, 0.01, 0.005])
         assert all(tried.newton_iterations == 1 and tried.residual > 0.0 for tried in failure.tried)
         (line,) = [line for line in error.details if line.startswith("attempts before")]
@@ -165,7 +158,7 @@ def test_a_handle_that_jumps_is_named(comm: MPI.Comm) -> None:
 def test_a_linear_solver_that_fails_is_told_apart(comm: MPI.Comm) -> None:
     scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}, "material": STIFF}
     iterative = ONE_ATTEMPT | {"pc_type": "jacobi", "ksp_max_it": "2"}
-    with failing(comm, scene, options=iterative) as (_, error, failure):
+    with failing(comm, scene, petsc=iterative) as (_, error, failure):
         assert failure.kind == "linear trouble"
         assert "the linear solve failed: too many linear iterations (linear trouble)" in str(error)
         assert "try -ksp_max_it above 2" in str(error)

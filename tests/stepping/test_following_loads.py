@@ -110,13 +110,13 @@ def test_a_skew_stiffness_is_solved_with() -> None:
     skew = 3.0 * (skew - skew.T)  # more than the symmetric part: a fixed point would run away
     size = random.uniform(1.0, 2.0, 6)
     force = random.normal(size=(2, 3))
-    way = newton_way(
-        force,
-        lambda force: force / size.reshape(2, 3),
-        lambda way: (skew @ way.ravel()).reshape(2, 3),
-        MPI.COMM_SELF,
-    )
+
+    def of_skew(way: Array) -> Array:
+        return (skew @ way.ravel()).reshape(2, 3)
+
+    way = newton_way(force, lambda force: force / size.reshape(2, 3), of_skew, MPI.COMM_SELF)
     assert way is not None
+    assert newton_way(force, lambda force: None, of_skew, MPI.COMM_SELF) is None  # there are no factors
     np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
 
 

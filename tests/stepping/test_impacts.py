@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, end_on_one_rank, gathered, grid, scene_of
+from physics import CLOTH, end_on_one_rank, finished, grid, scene_of, shape
 
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -81,10 +81,7 @@ def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
 @pytest.mark.parallel(alone=False)
 def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = scene_of(impact("bdf2", 1e-3, floor_moves=True))
-    simulation = SteppedScene(comm, scene)
-    while not simulation.finished:
-        simulation.step()
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
-    simulation.destroy()
+    with finished(comm, scene) as simulation:
+        x = shape(simulation)
     if (alone := end_on_one_rank(comm, scene, shared_tmp / "run", 20)) is not None:
         np.testing.assert_allclose(x, alone, rtol=0.0, atol=1e-9)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import CLOTH, gathered, grid, scene_of
+from physics import CLOTH, grid, options, scene_of, shape, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
@@ -28,32 +28,28 @@ SCENE: dict[str, Any] = {
 def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int] = frozenset()) -> Any:
     """Positions at the end and rejected steps; attempts of these numbers are made to fail."""
     time = {"end": 0.12, "step": step, "integrator": integrator}
-    simulation = SteppedScene(comm, scene_of(SCENE | {"time": time}))
-    system, attempts = simulation.problem.system, 0
-    residual = system.residual
+    with stepped(comm, SCENE | {"time": time}) as simulation:
+        system, attempts = simulation.problem.system, 0
+        residual = system.residual
 
-    def spoiled(v: Array, vdot: Array, out: Array) -> None:
-        residual(v, vdot, out)
-        if attempts in fail:
-            out[:] = np.nan
+        def spoiled(v: Array, vdot: Array, out: Array) -> None:
+            residual(v, vdot, out)
+            if attempts in fail:
+                out[:] = np.nan
 
-    system.residual = spoiled  # type: ignore[method-assign]
-    begin = system.begin_step
+        system.residual = spoiled  # type: ignore[method-assign]
+        begin = system.begin_step
 
-    def counted(t0: float, t1: float) -> None:
-        nonlocal attempts
-        attempts += 1
-        begin(t0, t1)
+        def counted(t0: float, t1: float) -> None:
+            nonlocal attempts
+            attempts += 1
+            begin(t0, t1)
 
-    system.begin_step = counted  # type: ignore[method-assign]
-    rejected = 0
-    while not simulation.finished:
-        rejected += simulation.step().rejected
-    x = gathered(simulation.problem.points, system.x)
-    simulation.destroy()
-    for name in simulation.stepper.our_options:
-        PETSc.Options().delValue(name)
-    return x, rejected
+        system.begin_step = counted  # type: ignore[method-assign]
+        rejected = 0
+        while not simulation.finished:
+            rejected += simulation.step().rejected
+        return shape(simulation), rejected
 
 
 @pytest.mark.parallel(2)
@@ -69,13 +65,10 @@ def test_a_failed_step_is_repeated_and_does_no_harm(integrator: str, comm: MPI.C
 
 
 def test_spectral_radius_by_petsc_option() -> None:
-    PETSc.Options().setValue("ts_alpha_radius", "1.5")
-    try:
+    with options({"ts_alpha_radius": "1.5"}):
         with pytest.raises(InputError, match="-ts_alpha_radius: must be from 0 to 1"):
             journey("alpha2", 0.004, MPI.COMM_SELF)
         journey("bdf2", 0.02, MPI.COMM_SELF)  # not asked for
-    finally:
-        PETSc.Options().delValue("ts_alpha_radius")
 
 
 @pytest.mark.parallel(2)

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, gathered, grid, scene_of
+from physics import CLOTH, grid, shape, stepped
 
-from lyra_petsc.stepping.reuse import SET_UP, Reuse
-from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping.linear_system import SET_UP, Reuse
 
 MASK = np.zeros((1, 3), dtype=bool)
 
@@ -53,20 +51,15 @@ def test_steps_are_those_of_a_preconditioner_each(comm: MPI.Comm, kind: str) -> 
         "handles": [{"nodes": [0]}, {"nodes": [6], "from": 0.05, "until": 0.15}],
         "time": {"end": 0.3, "step": 0.01, "integrator": "semi-implicit"},
     }
-    options, ends = PETSc.Options(), []
+    ends = []
     for lag in (None, 1):
         given = ({"pc_type": kind} if kind else {}) | ({"snes_lag_preconditioner": lag} if lag else {})
-        for name, value in given.items():
-            options.setValue(name, value)
-        simulation = SteppedScene(comm, scene_of(scene))
-        reused = 0
-        while not simulation.finished:
-            simulation.step()
-            reused += simulation.stepper.linear.reuse.reused
-        assert (reused > 10) == (lag is None)
-        ends.append(gathered(simulation.problem.points, simulation.problem.system.x))
-        for name in [*simulation.stepper.our_options, *given]:
-            options.delValue(name)
-        simulation.destroy()
+        with stepped(comm, scene, **given) as simulation:
+            reused = 0
+            while not simulation.finished:
+                simulation.step()
+                reused += simulation.stepper.linear.reuse.reused
+            assert (reused > 10) == (lag is None)
+            ends.append(shape(simulation))
     # the linear tolerance of a step is 1e-6 of its change of velocities
     np.testing.assert_allclose(*ends, atol=1e-6)

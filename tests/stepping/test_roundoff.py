@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, gathered, grid, scene_of
-
-from lyra_petsc.stepping.simulation import SteppedScene
+from physics import CLOTH, finished, gathered, grid
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -26,13 +24,10 @@ def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
         "handles": [{"nodes": [0, 8]}],
         "time": {"end": 0.005, "step": 0.005},
     }
-    simulation = SteppedScene(comm, scene_of(scene))
-    while not simulation.finished:
-        simulation.step()
-    points = simulation.problem.points
-    lowest = float(gathered(points, simulation.problem.system.x)[:, 2].min())
-    notes = [note for note in simulation.notes if "round-off" in note]
-    simulation.destroy()
+    with finished(comm, scene) as simulation:
+        points = simulation.problem.points
+        lowest = float(gathered(points, simulation.problem.system.x)[:, 2].min())
+        notes = [note for note in simulation.notes if "round-off" in note]
     return lowest, notes
 
 
@@ -68,13 +63,10 @@ def test_what_is_pressed_hard_takes_the_steps_planned(comm: MPI.Comm) -> None:
         "time": {"end": 0.35, "step": 0.01},
         "solver": {},
     }
-    simulation = SteppedScene(comm, scene_of(scene))
-    while not simulation.finished:
-        simulation.step()
-    force = simulation.ledger.obstacle_forces(2)[:, 2]
-    newton, steps = simulation.totals["newton_iterations"], simulation.step_number
-    notes = [note for note in simulation.notes if "round-off" in note]
-    simulation.destroy()
+    with finished(comm, scene) as simulation:
+        force = simulation.ledger.obstacle_forces(2)[:, 2]
+        newton, steps = simulation.totals["newton_iterations"], simulation.step_number
+        notes = [note for note in simulation.notes if "round-off" in note]
     assert force[1] > 2e4
     assert np.isclose(force[0], -force[1], rtol=1e-4)
     assert steps <= 40

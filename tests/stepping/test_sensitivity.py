@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import grid
+from physics import finished, grid
 
 import lyra_petsc
 from lyra_petsc.arrays import Array
@@ -154,13 +154,10 @@ def of_integrator(integrator: str, numbers: Mapping[str, float]) -> dict[str, fl
 
 def end(scene: Scene) -> Array:
     """Positions [m] where a scene ends, of this rank's vertices."""
-    simulation = SteppedScene(MPI.COMM_WORLD, scene)
-    while not simulation.finished:
-        simulation.step()
-    points = simulation.problem.points
-    x: Array = simulation.problem.system.x[: points.n_vertices].copy()
-    order = np.argsort(points.original)
-    simulation.destroy()
+    with finished(MPI.COMM_WORLD, scene) as simulation:
+        points = simulation.problem.points
+        x: Array = simulation.problem.system.x[: points.n_vertices].copy()
+        order = np.argsort(points.original)
     return x[order]
 
 

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import gathered, grid, scene_of
+from physics import grid, options, scene_of, shape, stepped
 
 from lyra_petsc import phases as profiling
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import INCOMPLETE
-from lyra_petsc.stepping import diagonal_shift as shift
-from lyra_petsc.stepping.diagonal_shift import LARGEST, LEAST, DiagonalShift
-from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping import linear_system
+from lyra_petsc.stepping.linear_system import LARGEST_SHIFT, LEAST_SHIFT, DiagonalShift
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
 """Positive definite, while its incomplete factors are not (Kershaw, J. Comput. Phys. 26, 1978, 43-65)."""
@@ -51,7 +50,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
     growing = DiagonalShift(ksp, acts=True)
-    assert growing.value == LEAST
+    assert growing.value == LEAST_SHIFT
     tries = 0
     while True:
         diagonal = np.diag(KERSHAW) * (1.0 + growing.value)
@@ -64,13 +63,13 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
         tries += 1
         assert growing.raise_()
     assert tries > 0
-    assert LEAST < growing.value <= LARGEST
+    assert LEAST_SHIFT < growing.value <= LARGEST_SHIFT
     np.testing.assert_allclose(KERSHAW @ y.getArray(), b.getArray(), atol=1e-4)
     # what did not fail asks for no more
     assert not growing.raise_()
     before = growing.value
     growing.begin()
-    assert LEAST <= growing.value < before
+    assert LEAST_SHIFT <= growing.value < before
 
 
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
@@ -84,15 +83,11 @@ def test_nothing_is_enlarged_where_it_has_no_sense(kind: str, acts: bool) -> Non
 def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, list[str], str]:
     """Positions after 25 steps, notes on the solver, and the linear solver at the end."""
     scene = scene_of(HANGING | {"time": {"end": 1.0, "step": step, "integrator": integrator}})
-    if integrator == "semi-implicit":
-        PETSc.Options().setValue("ksp_rtol", "1e-10")
-    simulation = SteppedScene(comm, scene)
-    for _ in range(25):
-        simulation.step()
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
-    simulation.destroy()
-    for name in ["ksp_rtol", *simulation.stepper.our_options]:
-        PETSc.Options().delValue(name)
+    tight = {"ksp_rtol": "1e-10"} if integrator == "semi-implicit" else {}
+    with stepped(comm, scene, **tight) as simulation:
+        for _ in range(25):
+            simulation.step()
+        x = shape(simulation)
     # semi-implicit steps as long as these make energy, which is noted too
     notes = [note for note in simulation.notes if "energy" not in note]
     return x, notes, simulation.stepper.preset
@@ -104,7 +99,7 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
     x, notes, preset = journey(comm, "semi-implicit")
     assert (notes, preset) == ([], incomplete)
     if comm.size == 1:
-        monkeypatch.setattr(shift, "LEAST", 0.0)
+        monkeypatch.setattr(linear_system, "LEAST_SHIFT", 0.0)
         monkeypatch.setattr(DiagonalShift, "raise_", lambda self: False)
         other, notes, preset = journey(comm, "semi-implicit")
         assert preset != "ilu"
@@ -116,11 +111,8 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
 def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> None:
     ends = []
     for kind in ("cholesky", "ilu" if comm.size == 1 else "bjacobi"):
-        PETSc.Options().setValue("pc_type", kind)
-        try:
+        with options({"pc_type": kind}):
             x, notes, preset = journey(comm, "beuler", 0.005)
-        finally:
-            PETSc.Options().delValue("pc_type")
         assert (notes, preset) == ([], "user")
         ends.append(x)
     np.testing.assert_allclose(*ends, atol=1e-5)
@@ -131,13 +123,10 @@ def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> 
 def test_how_often_factors_are_made_of_the_jacobian_itself(comm: MPI.Comm, lag: int | None) -> None:
     scene = HANGING | {"time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"}}
     # SNES decides after the Jacobian whether factors are due
-    options = {"snes_lag_preconditioner": f"{lag}", "snes_lag_preconditioner_persists": "true"} if lag else {}
+    given = {"snes_lag_preconditioner": f"{lag}", "snes_lag_preconditioner_persists": "true"} if lag else {}
     PETSc.Log.begin()
     made, stage = PETSc.Log.Event("MatLUFactorNum"), profiling.STAGES["solve"].id
-    for name, value in options.items():
-        PETSc.Options().setValue(name, value)
-    try:
-        simulation = SteppedScene(comm, scene_of(scene))
+    with stepped(comm, scene, **given) as simulation:
         assert simulation.stepper.preset in INCOMPLETE
         linear = simulation.stepper.linear
         assert isinstance(linear.operator, BlockMatrix)
@@ -148,7 +137,3 @@ def test_how_often_factors_are_made_of_the_jacobian_itself(comm: MPI.Comm, lag: 
         times = made.getPerfInfo(stage)["count"] - before
         # without the option as often as iterations ask for it
         assert times == 12 / lag if lag else 1 <= times <= 6
-        simulation.destroy()
-    finally:
-        for name in [*options, *simulation.stepper.our_options]:
-            PETSc.Options().delValue(name)

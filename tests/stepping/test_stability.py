@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
-from physics import CLOTH, gathered, grid, scene_of
+from physics import CLOTH, finished, grid, scene_of, shape
 
-from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stability import Examination
@@ -39,22 +36,8 @@ def strip(weight: float) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def at_rest(comm: MPI.Comm, content: dict[str, Any]) -> Iterator[SteppedScene]:
-    """A scene's static analysis, done."""
-    simulation = SteppedScene(comm, scene_of(content))
-    while not simulation.finished:
-        simulation.step()
-    yield simulation
-    simulation.destroy()
-
-
-def shape(simulation: SteppedScene) -> Array:
-    return gathered(simulation.problem.points, simulation.problem.system.x)
-
-
 def test_a_strip_below_its_critical_weight_stands(comm: MPI.Comm) -> None:
-    with at_rest(comm, strip(0.95)) as simulation:
+    with finished(comm, strip(0.95)) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
         assert not simulation.notes
         assert np.abs(shape(simulation)[:, 1]).max() < 1e-6 * LENGTH
@@ -64,7 +47,7 @@ def test_a_strip_below_its_critical_weight_stands(comm: MPI.Comm) -> None:
     "weight", [1.2, *(pytest.param(w, marks=pytest.mark.parallel(1)) for w in (1.05, 1.5))]
 )
 def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
-    with at_rest(comm, strip(weight)) as simulation:
+    with finished(comm, strip(weight)) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
         assert "its lowest mode was followed once" in simulation.notes[0]
         tip = shape(simulation)[-1]
@@ -76,7 +59,7 @@ def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
 
 def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(equilibrium, "MOST_DESCENTS", 0)
-    with at_rest(comm, strip(1.5)) as simulation:
+    with finished(comm, strip(1.5)) as simulation:
         assert simulation.stability == {"stable": False, "negative_pivots": 1, "neutral_pivots": 0}
         assert "unstable" in simulation.notes[0]
         assert "followed 0 times" in simulation.notes[0]
@@ -87,7 +70,7 @@ def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: p
     counts = []
     for terms in (registry.REGISTRY, IN_PLACE_OF_HINGES):
         monkeypatch.setattr(registry, "REGISTRY", terms)
-        with at_rest(comm, strip(12.0)) as simulation:  # its second mode is critical at 7.1 times
+        with finished(comm, strip(12.0)) as simulation:  # its second mode is critical at 7.1 times
             counts.append(simulation.stability)
             assert (simulation.problem.points.n_edges_global > 0) == (terms is IN_PLACE_OF_HINGES)
     assert counts[0] == counts[1]
@@ -96,10 +79,10 @@ def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: p
 
 @pytest.mark.parallel(1)
 def test_with_unknowns_of_edges_the_strip_falls_over(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    with at_rest(comm, strip(1.2)) as simulation:
+    with finished(comm, strip(1.2)) as simulation:
         hinges = np.abs(shape(simulation))
     monkeypatch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
-    with at_rest(comm, strip(1.2)) as simulation:
+    with finished(comm, strip(1.2)) as simulation:
         assert simulation.stability["stable"]
         np.testing.assert_allclose(np.abs(shape(simulation)), hinges, rtol=0, atol=1e-5)
 
@@ -114,7 +97,7 @@ PRESSED = {
 
 
 def test_wrinkles_of_a_sheet_without_bending_are_told_not_followed(comm: MPI.Comm) -> None:
-    with at_rest(comm, PRESSED) as simulation:
+    with finished(comm, PRESSED) as simulation:
         assert simulation.stability["stable"] is False
         assert simulation.stability["negative_pivots"] == 15  # every free vertex gives way across the sheet
         assert "without bending" in simulation.notes[-1]
@@ -123,14 +106,14 @@ def test_wrinkles_of_a_sheet_without_bending_are_told_not_followed(comm: MPI.Com
 
 def test_what_nothing_resists_is_neutral(comm: MPI.Comm) -> None:
     still = PRESSED | {"motions": {"in": [{"time": 0}]}}
-    with at_rest(comm, still) as simulation:
+    with finished(comm, still) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 15}
         assert "nothing resists 15 motions" in simulation.notes[-1]
 
 
 def test_too_many_vertices_are_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyra_petsc.stepping.stability.MOST_VERTICES", 10)
-    with at_rest(comm, strip(0.5)) as simulation:
+    with finished(comm, strip(0.5)) as simulation:
         assert simulation.stability["stable"] is None
         assert simulation.stability["negative_pivots"] is None
         assert "more than the 10" in simulation.stability["stability_unknown"]

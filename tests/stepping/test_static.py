@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, gathered, grid, obj_file, scene_of
+from physics import CLOTH, grid, obj_file, shape, stepped
 
-from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.linear import presets
-from lyra_petsc.stepping.exact_hessian import add_exact_hessian
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping.stability import add_exact_hessian
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -42,23 +40,14 @@ def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
         yield simulation
 
 
-@contextmanager
-def motion(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
-    simulation = SteppedScene(comm, scene_of(SHEET | content))
-    yield simulation
-    simulation.destroy()
-    for name in simulation.stepper.our_options:
-        PETSc.Options().delValue(name)
+def motion(comm: MPI.Comm, **content: Any) -> AbstractContextManager[SteppedScene]:
+    return stepped(comm, SHEET | content)
 
 
 def out_of_balance(simulation: SteppedScene) -> float:
     """Largest force [N] on a free coordinate."""
     system = simulation.problem.system
     return float(simulation.comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
-
-
-def shape(simulation: SteppedScene) -> Array:
-    return gathered(simulation.problem.points, simulation.problem.system.x)
 
 
 MOVED = {

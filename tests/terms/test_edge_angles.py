@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
-from petsc4py import PETSc
-from physics import CLOTH, SOLVERS, end_on_one_rank, gathered, grid, rotation, scene_of
+from physics import CLOTH, SOLVERS, end_on_one_rank, finished, grid, rotation, scene_of, shape
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -41,21 +40,12 @@ def on_edges(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array, Array, Array, int]:
     """Positions in mesh order, energies, reactions, and unknowns of edges after a whole run."""
-    database = PETSc.Options()
-    for name, value in petsc.items():
-        database[name] = value
-    simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
-    while not simulation.finished:
-        simulation.step()
-    budget, layout = simulation.budget, simulation.problem.points
-    bending = budget.bending + budget.more.get("angle_energy", 0.0)
-    energies = np.array([budget.kinetic, budget.membrane, bending, budget.potential])
-    reactions = np.array(simulation.ledger.handle_forces(1))
-    found = gathered(layout, simulation.problem.system.x), energies, reactions, layout.n_edges_global
-    for name in [*petsc, *simulation.stepper.our_options]:
-        database.delValue(name)
-    simulation.destroy()
-    return found
+    with finished(comm, SCENE | {"solver": TIGHT} | scene, **petsc) as simulation:
+        budget, layout = simulation.budget, simulation.problem.points
+        bending = budget.bending + budget.more.get("angle_energy", 0.0)
+        energies = np.array([budget.kinetic, budget.membrane, bending, budget.potential])
+        reactions = np.array(simulation.ledger.handle_forces(1))
+        return shape(simulation), energies, reactions, layout.n_edges_global
 
 
 def compare(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, scene: dict[str, Any], **petsc: Any) -> None:

@@ -15,9 +15,6 @@ from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.scene.text import parse_yaml
 
-GF_PER_CM = 0.980665
-"""N/m"""
-
 G = 9.80665
 """m/s², to which weights in grams-force belong"""
 

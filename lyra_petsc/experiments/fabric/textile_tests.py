@@ -41,10 +41,10 @@ from lyra_petsc.experiments.fabric.records import (
     outcome_of,
     restore,
 )
-from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
+from lyra_petsc.experiments.fabric.specimens import Fabric, G
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rounded
 from lyra_petsc.scene.materials.curves import force_at
-from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.scene.materials.library import GF_PER_CM, ShellMaterial
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.stepping.simulation import SteppedScene
 

@@ -287,24 +287,20 @@ def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]
     return factor, 1.0 / abs(deflection)
 
 
-def pressed_tip(load: float, steps: int = 1000) -> tuple[float, float]:
+def pressed_tip(load: float) -> tuple[float, float]:
     """Where the tip (x, z) of an inextensible cantilever of length 1 along x is under a pressure of ``load``
     B/L³ that follows it and lifts it at first.
 
     With θ, κ, N and Q the angle, the curvature and the tension and shear over B/L², from the tip on, where
-    the last three are 0: θ' = κ, κ' = −Q, N' = Q κ, Q' = −N κ − load; by Runge and Kutta.
+    the last three are 0: θ' = κ, κ' = −Q, N' = Q κ, Q' = −N κ − load.
     """
+    from scipy.integrate import solve_ivp
 
-    def rates(y: Array) -> Array:
+    def rates(s: float, y: Array) -> list[float]:
         angle, curvature, tension, shear = y[:4]
         turned = [curvature, -shear, shear * curvature, -tension * curvature - load]
-        return np.array([*turned, math.cos(angle), math.sin(angle)])
+        return [*turned, math.cos(angle), math.sin(angle)]
 
-    y, h = np.zeros(6), -1.0 / steps
-    for _ in range(steps):
-        a = rates(y)
-        b = rates(y + 0.5 * h * a)
-        c = rates(y + 0.5 * h * b)
-        y = y + h / 6.0 * (a + 2.0 * (b + c) + rates(y + h * c))
+    y = solve_ivp(rates, (1.0, 0.0), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     cos, sin = math.cos(y[0]), math.sin(y[0])
     return float(-cos * y[4] - sin * y[5]), float(sin * y[4] - cos * y[5])

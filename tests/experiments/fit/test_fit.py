@@ -100,11 +100,8 @@ def test_search_and_conclusion(kind: str) -> None:
     rng = np.random.default_rng(3)
     matrix, right = rng.standard_normal((12, 3)), rng.standard_normal(12)
     unknowns = [Unknown(name, 0.5, -10.0, 10.0) for name in "abc"]
-    PETSc.Options().setValue("tao_type", kind)
-    try:
-        best, words = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
-    finally:
-        PETSc.Options().delValue("tao_type")
+    PETSc.Options()["tao_type"] = kind
+    best, words = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
     exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
     covariance = np.linalg.inv(matrix.T @ matrix)
     deviation = np.sqrt(np.diag(covariance))

@@ -3,7 +3,7 @@
 import signal
 
 import pytest
-from launch import finish, lyra, without
+from launch import finish, lyra, refused
 from written_run import Writer, written
 
 
@@ -31,12 +31,7 @@ def test_bad_input_is_one_line(tmp_path, arguments, says):
     (tmp_path / "empty" / "run.lock").touch()
     (written(tmp_path / "cut") / "states-0000.h5").write_bytes(b"HDF")
 
-    left = lyra(["view", *arguments], tmp_path)
-
-    assert left.code == 2
-    assert len(left.ours) == 1
-    assert says in left.ours[0]
-    assert left.out == ""
+    refused(["view", *arguments], tmp_path, says)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
@@ -63,21 +58,9 @@ def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
     assert len(left.ours) == 1
 
 
-def test_a_missing_package_is_one_line(tmp_path):
-    left = without(["trame_vtk"], ["view", written(tmp_path / "run")], tmp_path)
-    assert left.code == 2
-    assert left.err == (
-        "lyra-petsc: view: trame_vtk is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
-    )
-
-
 @pytest.mark.parametrize("option", [["--host", "127.0.0.1"], ["--port", "0"], ["--no-browser"]])
 def test_options_of_the_page_without_a_page(tmp_path, option):
-    left = lyra(["run", *option], tmp_path)
-
-    assert left.code == 2
-    assert len(left.ours) == 1
-    assert f"{option[0]}: says where the page of --live is" in left.ours[0]
+    refused(["run", *option], tmp_path, f"{option[0]}: says where the page of --live is")
     assert not (tmp_path / "runs").exists()
 
 
