@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -601,12 +602,15 @@ def noted(content: dict[str, Any], words: str) -> list[str]:
     return found
 
 
+THIN = {"young": 1e6, "poisson": 0.3, "thickness": 0.01, "density": 1.0}
+
+
 @pytest.mark.parametrize("thickness", [0.01, 0.1])
 def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     """Ten times as wide as thick they twist 0.63/10 too little; clamped and symmetric edges are not free."""
     content = {
         "mesh": grid(8.0, 1.0, 16, 2),
-        "material": {"young": 1e6, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+        "material": THIN | {"thickness": thickness},
         "handles": [{"group": "left", "clamp": True}, {"group": "right", "symmetry": "x"}],
     }
     found = noted(content, "transverse shear")
@@ -614,6 +618,49 @@ def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     assert all("resist twist by 6% too much" in note for note in found)
     everywhere = [{"group": "sheet", "clamp": True}]
     assert not noted(content | {"handles": everywhere}, "transverse shear")
+
+
+def test_supported_edges_are_not_free() -> None:
+    content = {"mesh": grid(8.0, 1.0, 16, 2), "material": THIN | {"thickness": 0.1}}
+    rim = [{"group": group, "axes": ["z"]} for group in ("left", "right", "top", "bottom")]
+    assert noted(content, "transverse shear")
+    assert not noted(content | {"handles": rim}, "transverse shear")
+
+
+@pytest.mark.parametrize(
+    ("degrees", "power", "hold", "corner"),
+    [
+        (30, 1, {"axes": ["z"]}, "the corner of 150° .* 1 more"),
+        (30, 4, {"axes": ["z"]}, ""),  # graded towards its corners
+        (90, 1, {"axes": ["z"]}, ""),
+        (30, 1, {"clamp": True}, ""),
+        (30, 1, {"axes": ["x", "y"]}, ""),  # free
+    ],
+)
+def test_obtuse_corners_of_supports_are_noted(
+    degrees: float, power: int, hold: dict[str, Any], corner: str, tmp_path: Path
+) -> None:
+    """Moments grow as r^(π/ω − 2) at a corner of angle ω between two simple supports."""
+    n = 12
+    flat, faces = rectangle(n, n, 1.0, 1.0)
+    near = 0.5 * (2.0 * np.minimum(flat, 1.0 - flat)) ** power
+    x, y = np.where(flat < 0.5, near, 1.0 - near)[:, :2].T
+    angle = np.radians(degrees)
+    vertices = np.column_stack([x + np.cos(angle) * y, np.sin(angle) * y, 0.0 * x])
+    rim = np.flatnonzero(np.isclose(flat[:, :2] % 1.0, 0.0).any(axis=1)).tolist()
+    content = {"mesh": obj_file(tmp_path / "skew.obj", vertices, faces), "material": THIN}
+    found = noted(content | {"handles": [{"nodes": rim} | hold]}, "unbounded moments")
+    assert len(found) == (1 if corner else 0)
+    assert all(re.search(corner, note) for note in found)
+
+
+def test_a_polygon_for_a_disc_has_no_corners(tmp_path: Path) -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+    ring = np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
+    faces = [(0, 1 + k, 1 + (k + 1) % 12) for k in range(12)]
+    mesh = obj_file(tmp_path / "disc.obj", np.vstack([np.zeros((1, 3)), ring]), np.array(faces))
+    rim = [{"nodes": list(range(1, 13)), "axes": ["z"]}]
+    assert not noted({"mesh": mesh, "material": THIN, "handles": rim}, "unbounded moments")
 
 
 def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
