@@ -459,7 +459,7 @@ def elements(rest: RestShape) -> Elements:
         director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges, UPRIGHT, 2)
         _mirror(director, rest, triangles, number, mesh.rest)
         angle[surface] = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
-        rest.notes += midedge_mesh.coarse(rest, chosen, curvature, angle, size.max(axis=1))
+        rest.notes += midedge_mesh.coarse(rest, chosen, number, size, curvature, angle)
     tilt = np.stack([np.cos(angle), np.sin(angle)], axis=2)
     at_rest = np.zeros_like(size)
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]

@@ -23,20 +23,28 @@ CORNER = np.radians(20.0)
 OBTUSE = np.radians(100.0)
 """Angle between supported edges from which on moments in the corner matter."""
 
+LOCAL = 1.8
+"""Measured at the vertices of four triangles in spheres of two meshes."""
+
+NOTABLE = 0.03
+"""Error of a vertex's displacement from which on it is noted."""
+
 UNRESOLVED = 0.065
 """(h/L)^p from which on it is said that edges h at a corner are long for a sheet of size L: about 1 % of the
 deflection of skew plates of 30 and 60 degrees."""
 
 
-def coarse(rest: RestShape, chosen: Ints, of_tangents: Array, angle: Array, longest: Array) -> list[str]:
-    """What to say of triangles ``chosen`` with these curvatures of tangents (n, 3, 3), angles (n, 3) at rest
-    and longest edges (n,) [m].
+def coarse(
+    rest: RestShape, chosen: Ints, number: Ints, size: Array, of_tangents: Array, angle: Array
+) -> list[str]:
+    """What to say of triangles ``chosen`` with these edges, their lengths (n, 3) [m], curvatures of tangents
+    (n, 3, 3) and angles (n, 3) at rest.
 
     Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
     that of a sheet of bending stiffness B and membrane stiffness C. Where walls meet they count as a crease:
     a smooth surface bends at most triangles about each corner.
     """
-    creased = np.abs(angle).max(axis=1) >= CREASED
+    creased, longest = np.abs(angle).max(axis=1) >= CREASED, size.max(axis=1)
     curvature = np.einsum("eki,ei->ek", of_tangents, np.tan(np.where(creased[:, None], 0.0, angle)))
     mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
     largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
@@ -49,12 +57,50 @@ def coarse(rest: RestShape, chosen: Ints, of_tangents: Array, angle: Array, long
     bent &= (2 * about[1] > about[0])[corners].all(axis=1)
     coarse = bent & (largest * longest**2 > thickness)
     if not 2 * coarse.sum() > bent.sum():
-        return []
+        return _irregular(rest, chosen, number, size, np.where(bent, largest / thickness, 0.0))
     fine = float(np.median(np.sqrt(thickness[coarse] / largest[coarse])))
     return [
         f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
         f"{np.median(longest[coarse]):.3g} m: flat triangles make such a shell too stiff, or too soft under "
         f"point loads, unless their edges are well below √(t R) = {fine:.3g} m"
+    ]
+
+
+def _irregular(rest: RestShape, chosen: Ints, number: Ints, size: Array, sharpness: Array) -> list[str]:
+    """What to say of vertices where three or four triangles of a curved surface meet, among others where six
+    do; ``sharpness`` (n,) is 1/(t R) [1/m²], 0 where the surface is flat.
+
+    In a sphere under pressure p the tension of n alike triangles holds 3 p / (4 cos²(π/n)) a vertex, p where
+    n = 6. The rest acts as a force on a point: of the shell's displacement the vertex lacks that force over
+    p h² times ``LOCAL`` h²/(t R). Where vertices of four and eight triangles take turns, as in patterns of
+    grids, the forces cancel.
+    """
+    mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
+    n, sides = mesh.n_vertices, triangles[:, [[1, 2], [2, 0], [0, 1]]]
+
+    def mean(values: Array) -> Array:
+        """Mean (V,) of the values (F, 3) of sides at their ends."""
+        count = np.maximum(np.bincount(sides.ravel(), minlength=n), 1)
+        return np.bincount(sides.ravel(), np.repeat(values.ravel(), 2), n) / count
+
+    opening = np.maximum(_openings(triangles, size, n), 1e-9)
+    meet = 2.0 * np.pi / opening * np.bincount(triangles.ravel(), minlength=n)  # images by symmetry, too
+    alone = mean(meet[sides].sum(axis=2)) - meet < 7.0
+    free = (np.bincount(number.ravel())[number] == 1) & ~_held(rest, triangles)[1]
+    alone[sides[free]] = False
+    found = np.flatnonzero(alone & (meet > 2.5) & (meet < 4.5))
+    half = np.pi / meet[found]
+    load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * meet[found]
+    error = LOCAL * load * (mean(size) ** 2 * mean(np.repeat(sharpness[:, None], 3, axis=1)))[found]
+    if not (error > NOTABLE).any():
+        return []
+    worst = int(np.argmax(error))
+    count = np.sum(error > NOTABLE)
+    more = f" (and {count - 1} more)" if count > 1 else ""
+    return [
+        f"at vertex {found[worst]}{more} only {meet[found[worst]]:.0f} triangles of a curved shell meet: "
+        f"under pressure it moves by about {min(error[worst], 1.0):.0%} too little; let five to seven meet, "
+        "or refine"
     ]
 
 
