@@ -154,6 +154,7 @@ def corners(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
         np.maximum.at(nearby, ends[boundary][:, one], turn[ends[boundary][:, other]])
     simple = np.bincount(ends[boundary & supported & ~clamped].ravel(), minlength=n) == 2
     simple &= np.bincount(ends[boundary].ravel(), minlength=n) == 2
+    simple &= np.bincount(ends[~boundary & ~supported].ravel(), minlength=n) > 0  # no sheet held in its plane
     found = np.flatnonzero(simple & (opening > OBTUSE) & (turn > np.maximum(CORNER, 2.0 * nearby)))
     length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[found]
     fine = np.sqrt(area.sum()) * UNRESOLVED ** (0.5 / np.abs(1.0 - np.pi / opening[found]))

@@ -675,6 +675,7 @@ def test_supported_edges_are_not_free() -> None:
         (90, 1, {"axes": ["z"]}, ""),
         (30, 1, {"clamp": True}, ""),
         (30, 1, {"axes": ["x", "y"]}, ""),  # free
+        (30, 1, {"axes": ["z"], "nodes": list(range(169))}, ""),  # held in its plane
     ],
 )
 def test_obtuse_corners_of_supports_are_noted(
