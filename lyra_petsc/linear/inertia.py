@@ -96,6 +96,17 @@ class Inertia:
         ksp.setUp()
         return factors
 
+    def solve(self, right: Array) -> Array:
+        """Solution (n_owned, 3) for a right side by the factors of the last ``pivots``; collective."""
+        assert self._ksp is not None
+        x, b = self._matrix.mat.createVecs()
+        b.setArray(right.ravel())
+        self._ksp.solve(b, x)
+        found = x.getArray(readonly=True).reshape(right.shape).copy()
+        x.destroy()
+        b.destroy()
+        return found
+
     def lowest_mode(self, start: Array) -> tuple[float, Array] | None:
         """Lowest eigenvalue [N/m] and its vector (n_owned, 3) of length one, by inverse iteration.
 

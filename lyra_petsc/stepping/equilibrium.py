@@ -68,6 +68,17 @@ LONGEST = 1e7
 ANY = float(np.finfo(np.float64).max)
 """Beyond all Δτ."""
 
+MOST_ITERATIONS, GIVEN_UP = 20, 1e6
+"""Of Newton's method with all of the stiffness, and the growth of the force in one, by stretching, at which
+it is given up."""
+
+HARD = 40
+"""Newton iterations of a load step after which all of the stiffness is tried first in the next one."""
+
+NO_POTENTIAL = (
+    "pressure beside free edges has no potential, and the symmetric part of the stiffness is indefinite"
+)
+
 NUDGE = 1e-6
 """Of an edge, by which handles are moved to see what force that takes."""
 
@@ -118,6 +129,7 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
+        self._whole = False  # whether all of the stiffness is tried first
         # the last equilibrium, how it changes with the load factor [m], and what loads change by [N]
         self._found, self._pull = 0.0, np.zeros((system.points.n_owned, 3))
         self._rate: Array | None = None
@@ -134,6 +146,101 @@ class Equilibrium:
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""
+        found = self._by_whole_stiffness(before, factor) if self._whole else None
+        if found is not None:
+            return found
+        attempt = self._by_proximal_steps(before, factor)
+        hard = not attempt.converged or attempt.newton_iterations > HARD
+        if not (attempt.converged or self._whole or self._stepper.stopped_by):
+            found = self._by_whole_stiffness(before, factor)
+        self._whole = hard
+        if found is None:
+            return attempt
+        newton = found.newton_iterations + attempt.newton_iterations
+        return dataclasses.replace(
+            found, newton_iterations=newton, linear_iterations=attempt.linear_iterations
+        )
+
+    def _by_whole_stiffness(self, before: float, factor: float) -> Attempt | None:
+        """Seek it by Newton's method with all of the stiffness of pressures, where they have no potential.
+
+        Beside free edges there may be an equilibrium where the symmetric part of the stiffness, and with it
+        the potential that solves minimise, is indefinite. Otherwise none that is unstable is taken. On
+        failure the state is the one before; collective.
+        """
+        system, n = self._system, self._system.points.n_owned
+        if not system.active.following or system.active.viscous or system.discretisation.guards:
+            return None
+        x = system.x[:n].copy()
+        system.applied.factor = factor
+        guess = self._extrapolation.to(factor, before, x)
+        last, frozen, anchored, balanced, scale = np.inf, None, 0.0, False, self._scale
+        for iteration in range(MOST_ITERATIONS):
+            force = self._out_of_balance(before, factor, first=False)
+            self._scale = scale  # forces on the way may be large
+            if frozen is None:
+                frozen, anchored = system.active.frozen, system.moving_energy_before
+                system.prescribed.targets(before, factor, factor, guess)
+                system.state.set(guess, np.zeros_like(x))
+                system.active.carry_frames(system.x)
+                continue
+            if iteration > 1 and self._balanced(force, last):
+                balanced = True
+                break
+            off = system.out_of_balance()[0]
+            way = self._whole_way(off, factor) if np.isfinite(force) else None
+            if way is None or force > GIVEN_UP * last:
+                break
+            last = force
+            system.state.set(system.x[:n] + way, np.zeros_like(x))
+            system.active.carry_frames(system.x)
+        if not balanced or not self._stands(factor):
+            system.state.set(x, np.zeros_like(x))
+            system.active.carry_frames(system.x, frozen)
+            return None
+        system.stay()
+        system.moving_energy_before = anchored
+        self._in_vain, self._found, self._rate = 0, factor, None
+        return Attempt(True, iteration - 1, 0, force)
+
+    def _stands(self, factor: float) -> bool:
+        """Whether the equilibrium is stable, or has no potential that would tell; collective."""
+        examination = Examination(self._system, self._spacing, self._size)
+        try:
+            found = examination.stability
+            return found.stable is not False or self._skew_holds(found, examination.mode(), factor)
+        finally:
+            examination.destroy()
+
+    def _skew_holds(self, found: Stability, mode: Array | None, factor: float) -> bool:
+        """Whether the skew part of the pressures' stiffness holds what the symmetric part S lets go by
+        ``mode`` u.
+
+        With one negative eigenvalue of S the determinant of all of the stiffness K has the sign of uᵀK⁻¹u, as
+        the rest of S, and so of K, is positive definite; collective.
+        """
+        if mode is None or found.negative != 1 or self._system.active.viscous:
+            return False
+        way = self._whole_way(mode, factor)
+        return way is not None and self._system.points.summed(float(np.vdot(mode, way)))[0] > 0.0
+
+    def _whole_way(self, force: Array, factor: float) -> Array | None:
+        """The displacement (n_owned, 3) [m] to which a force (n_owned, 3) [N] leads with all of the
+        stiffness, if pressures have a part in it; collective.
+        """
+        from lyra_petsc.stepping.following_loads import newton_way
+
+        known, comm = self._linearised(factor, factor), self._system.points.comm
+        if known is None:
+            return None
+        examination = Examination(self._system, self._spacing, self._size)
+        try:
+            return newton_way(force, examination.solve, lambda way: self._skew_force(known, way), comm)
+        finally:
+            examination.destroy()
+
+    def _by_proximal_steps(self, before: float, factor: float) -> Attempt:
+        """Seek it as the module's head says."""
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
         system.applied.factor = factor
@@ -324,6 +431,8 @@ class Equilibrium:
                 mode, way = examination.mode(), None
                 if mode is None:
                     words = "its lowest mode was not found"
+                elif self._skew_holds(found, mode, factor):
+                    found = Stability(reason=NO_POTENTIAL)
                 elif examination.wrinkles(mode):
                     words = (
                         "sheets without bending wrinkle as finely as the mesh, which is not followed; give a "

@@ -126,6 +126,11 @@ class Examination:
             return Stability(reason="there is no memory for the factors")
         return Stability(pivots.negative == 0, pivots.negative, pivots.neutral)
 
+    def solve(self, force: Array) -> Array | None:
+        """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the exact Hessian, until ``mode`` is
+        called; None where there are no factors; collective."""
+        return None if self.stability.stable is None or self._inertia is None else self._inertia.solve(force)
+
     def mode(self) -> Array | None:
         """The unstable mode (n_owned, 3) of length one with the lowest eigenvalue, if it can be had."""
         assert self._inertia is not None

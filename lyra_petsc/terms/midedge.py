@@ -32,12 +32,12 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.scene.materials.library import is_isotropic
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
-from lyra_petsc.terms import midedge_energy
+from lyra_petsc.terms import midedge_energy, midedge_mesh
 from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.midedge_mesh import CREASED
 from lyra_petsc.terms.midedge_shape import (
     Frames,
     against,
@@ -68,12 +68,6 @@ UPRIGHT = np.empty((0, 3, 2))
 
 CANCELLED = 1e-4
 """Length of a sum of unit normals below which rounding would tell its direction."""
-
-NARROW = 0.02
-"""Part of the stiffness against twist from which on it is said that free edges would have less."""
-
-CREASED = np.radians(30.0)
-"""α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
 
 
 class Edges(NamedTuple):
@@ -452,7 +446,8 @@ def elements(rest: RestShape) -> Elements:
     curvature = curvatures_of_tangents(material)
     stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
-    rest.notes += _narrow(rest, chosen, number, size, area)
+    rest.notes += midedge_mesh.narrow(rest, chosen, number, size, area)
+    rest.notes += midedge_mesh.corners(rest, chosen, number, size, area)
     # the two faces of a seam may have edges of different lengths
     count = np.bincount(number.ravel(), minlength=n_edges)
     length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
@@ -464,7 +459,7 @@ def elements(rest: RestShape) -> Elements:
         director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges, UPRIGHT, 2)
         _mirror(director, rest, triangles, number, mesh.rest)
         angle[surface] = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
-        rest.notes += _coarse(rest, chosen, curvature, angle, size.max(axis=1))
+        rest.notes += midedge_mesh.coarse(rest, chosen, number, size, curvature, angle)
     tilt = np.stack([np.cos(angle), np.sin(angle)], axis=2)
     at_rest = np.zeros_like(size)
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
@@ -491,68 +486,6 @@ def elements(rest: RestShape) -> Elements:
         "damping": rest.per_triangle("damping")[chosen],
     }
     return Elements(triangles, data, edges=number)
-
-
-def _coarse(rest: RestShape, chosen: Ints, of_tangents: Array, angle: Array, longest: Array) -> list[str]:
-    """What to say of triangles ``chosen`` with these curvatures of tangents (n, 3, 3), angles (n, 3) at rest
-    and longest edges (n,) [m].
-
-    Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
-    that of a sheet of bending stiffness B and membrane stiffness C. Where walls meet they count as a crease:
-    a smooth surface bends at most triangles about each corner.
-    """
-    creased = np.abs(angle).max(axis=1) >= CREASED
-    curvature = np.einsum("eki,ei->ek", of_tangents, np.tan(np.where(creased[:, None], 0.0, angle)))
-    mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
-    largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
-    thickness = np.array(
-        [np.sqrt(12.0 * max(s.plate[0], s.plate[2]) / max(s.c11, s.c22)) for s in rest.shells]
-    )[rest.shell_of[chosen]]
-    bent = largest * longest > 1e-3
-    corners, n = rest.mesh.triangles[chosen], rest.mesh.n_vertices
-    about = np.bincount(corners.ravel(), minlength=n), np.bincount(corners[bent].ravel(), minlength=n)
-    bent &= (2 * about[1] > about[0])[corners].all(axis=1)
-    coarse = bent & (largest * longest**2 > thickness)
-    if not 2 * coarse.sum() > bent.sum():
-        return []
-    fine = float(np.median(np.sqrt(thickness[coarse] / largest[coarse])))
-    return [
-        f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
-        f"{np.median(longest[coarse]):.3g} m: flat triangles make such a shell too stiff, or too soft under "
-        f"point loads, unless their edges are well below √(t R) = {fine:.3g} m"
-    ]
-
-
-def _narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
-    """What to say of sheets with free edges that are hardly wider than thick.
-
-    Beside a free edge a shell of thickness t twists as if 0.315 t of its width were missing, which needs
-    transverse shear: a strip of width b has the torsional stiffness G b t³/3 (1 − 0.63 t/b).
-
-    Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity, 3rd ed. 1970, § 109.
-    """
-    mesh, materials = rest.mesh, rest.scene.material
-    thickness = np.array(
-        [
-            np.sqrt(12.0 * shell.plate[0] / shell.c11)
-            if material.young is not None or is_isotropic(material.cloth)
-            else 0.0
-            for shell, material in zip(rest.shells, materials, strict=True)
-        ]
-    )[rest.shell_of[chosen]]
-    free = np.bincount(number.ravel())[number] == 1
-    for handle, each in enumerate(rest.scene.handles):
-        if each.clamp or each.symmetry is not None:
-            held = select_vertices(mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
-            ends = mesh.triangles[chosen][:, [[1, 2], [2, 0], [0, 1]]]
-            free &= ~np.isin(ends, held).all(axis=2)
-    lost = 0.315 * float(thickness @ np.sum(size * free, axis=1)) / float(area[thickness > 0.0].sum() or 1.0)
-    if lost < NARROW:
-        return []
-    return [
-        f"sheets as thick for their width as these resist twist by {lost:.0%} too much: without transverse "
-        "shear, which is left out, they are not softer beside free edges"
-    ]
 
 
 def _mirror(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +29,11 @@ from physics import (
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle, walls
-from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
+from lyra_petsc.experiments.verification.cases.shells import (
+    open_cylinder_scene,
+    slit_annulus_scene,
+    symmetric,
+)
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
 from lyra_petsc.terms import midedge, midedge_energy
@@ -571,16 +576,52 @@ def test_curvature_that_no_edge_can_turn_is_refused() -> None:
     assert caught.value.key == "material[0].rest_curvature"
 
 
-@pytest.mark.parametrize("n", [8, 24])
-def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
-    """A quarter of a cylinder of radius 1 and thickness 0.01, √(t R) = 0.1."""
-    flat, faces = rectangle(n, n, 0.5 * np.pi, 1.0)
+@pytest.mark.parametrize(("n", "alternating"), [(8, False), (24, False), (24, True)])
+def test_a_coarse_shell_is_noted(tmp_path: Path, n: int, alternating: bool) -> None:
+    """A quarter of a cylinder of radius 1 and thickness 0.01, √(t R) = 0.1; alternately four and eight of its
+    triangles meet."""
+    flat, faces = rectangle(n, n, 0.5 * np.pi, 1.0, alternating=alternating)
     bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
     content = {"mesh": obj_file(tmp_path / "shell.obj", bent, faces), "material": material}
     found = coarse(content)
     assert len(found) == (1 if n == 8 else 0)
+    assert not noted(content, "triangles of a curved shell")
     assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in found)
+
+
+def octant(path: Path, n: int) -> dict[str, Any]:
+    """An eighth of a sphere of radius 1 whose edges have n cells; four triangles meet at its corners."""
+    row, place = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]).T
+    x = np.column_stack([row, place, n - row - place]) / n
+    number = {(i, j): k for k, (i, j) in enumerate(zip(row.tolist(), place.tolist(), strict=True))}
+    up = [((i, j), (i + 1, j), (i, j + 1)) for i, j in number if i + j < n]
+    down = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in number if i + j < n - 1]
+    faces = np.array([[number[corner] for corner in triangle] for triangle in up + down])
+    return obj_file(path, x / np.linalg.norm(x, axis=1, keepdims=True), faces)
+
+
+BALL = {"young": 1e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0}
+
+
+def test_vertices_of_four_triangles_in_a_curved_shell_are_noted(tmp_path: Path) -> None:
+    """Under pressure they lack what is said; neither are free corners nor those of finer meshes."""
+    pressure = 10.0
+    ball = {"mesh": octant(tmp_path / "ball.obj", 16), "material": BALL, "handles": symmetric("xyz", 1.0)}
+    load = {"loads": [{"pressure": pressure}], "time": {"analysis": "static", "step": 1.0}}
+    run = Run(MPI.COMM_SELF, scene_of(ball | load))
+    (said,) = (re.search(r"vertex (\d+) \(and 2 more\) only 4 .* about (\d+)% too", n) for n in run.notes)
+    assert said is not None
+    run.step()
+    radius = np.linalg.norm(run.problem.system.x[: run.problem.points.n_vertices], axis=1)
+    run.destroy()
+    given = pressure * (1.0 - BALL["poisson"]) / (2.0 * BALL["young"] * BALL["thickness"])
+    lacking = 1.0 - (radius - 1.0) / given
+    assert np.argmax(lacking) in (0, 16, len(radius) - 1)
+    assert abs(lacking.max() - 0.01 * int(said[2])) < 0.02
+    assert not noted(ball | {"handles": []}, "triangles of a curved shell")
+    finer = {"mesh": octant(tmp_path / "finer.obj", 32)}
+    assert not noted(ball | finer, "triangles of a curved shell")
 
 
 def test_creases_are_not_noted(tmp_path: Path) -> None:
@@ -601,12 +642,15 @@ def noted(content: dict[str, Any], words: str) -> list[str]:
     return found
 
 
+THIN = {"young": 1e6, "poisson": 0.3, "thickness": 0.01, "density": 1.0}
+
+
 @pytest.mark.parametrize("thickness", [0.01, 0.1])
 def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     """Ten times as wide as thick they twist 0.63/10 too little; clamped and symmetric edges are not free."""
     content = {
         "mesh": grid(8.0, 1.0, 16, 2),
-        "material": {"young": 1e6, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+        "material": THIN | {"thickness": thickness},
         "handles": [{"group": "left", "clamp": True}, {"group": "right", "symmetry": "x"}],
     }
     found = noted(content, "transverse shear")
@@ -614,6 +658,50 @@ def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     assert all("resist twist by 6% too much" in note for note in found)
     everywhere = [{"group": "sheet", "clamp": True}]
     assert not noted(content | {"handles": everywhere}, "transverse shear")
+
+
+def test_supported_edges_are_not_free() -> None:
+    content = {"mesh": grid(8.0, 1.0, 16, 2), "material": THIN | {"thickness": 0.1}}
+    rim = [{"group": group, "axes": ["z"]} for group in ("left", "right", "top", "bottom")]
+    assert noted(content, "transverse shear")
+    assert not noted(content | {"handles": rim}, "transverse shear")
+
+
+@pytest.mark.parametrize(
+    ("degrees", "power", "hold", "corner"),
+    [
+        (30, 1, {"axes": ["z"]}, "the corner of 150° .* 1 more"),
+        (30, 4, {"axes": ["z"]}, ""),  # graded towards its corners
+        (90, 1, {"axes": ["z"]}, ""),
+        (30, 1, {"clamp": True}, ""),
+        (30, 1, {"axes": ["x", "y"]}, ""),  # free
+        (30, 1, {"axes": ["z"], "nodes": list(range(169))}, ""),  # held in its plane
+    ],
+)
+def test_obtuse_corners_of_supports_are_noted(
+    degrees: float, power: int, hold: dict[str, Any], corner: str, tmp_path: Path
+) -> None:
+    """Moments grow as r^(π/ω − 2) at a corner of angle ω between two simple supports."""
+    n = 12
+    flat, faces = rectangle(n, n, 1.0, 1.0)
+    near = 0.5 * (2.0 * np.minimum(flat, 1.0 - flat)) ** power
+    x, y = np.where(flat < 0.5, near, 1.0 - near)[:, :2].T
+    angle = np.radians(degrees)
+    vertices = np.column_stack([x + np.cos(angle) * y, np.sin(angle) * y, 0.0 * x])
+    rim = np.flatnonzero(np.isclose(flat[:, :2] % 1.0, 0.0).any(axis=1)).tolist()
+    content = {"mesh": obj_file(tmp_path / "skew.obj", vertices, faces), "material": THIN}
+    found = noted(content | {"handles": [{"nodes": rim} | hold]}, "unbounded moments")
+    assert len(found) == (1 if corner else 0)
+    assert all(re.search(corner, note) for note in found)
+
+
+def test_a_polygon_for_a_disc_has_no_corners(tmp_path: Path) -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+    ring = np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
+    faces = [(0, 1 + k, 1 + (k + 1) % 12) for k in range(12)]
+    mesh = obj_file(tmp_path / "disc.obj", np.vstack([np.zeros((1, 3)), ring]), np.array(faces))
+    rim = [{"nodes": list(range(1, 13)), "axes": ["z"]}]
+    assert not noted({"mesh": mesh, "material": THIN, "handles": rim}, "unbounded moments")
 
 
 def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
