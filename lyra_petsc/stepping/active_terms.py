@@ -85,6 +85,10 @@ class ActiveTerms:
         for term in self.near:
             term.on_the_way(x, self.frozen[term])
 
+    def lagging(self, x: Array) -> dict[str, Array]:
+        """See `Elastic.lagging`."""
+        return {name: sums for t in self.near for name, sums in t.lagging(x, self.frozen[t]).items()}
+
     def touched(self) -> dict[Elastic, Any]:
         """What terms know of what touches, to come back to by `touch_again`."""
         return {term: term.touched() for term in self.near}

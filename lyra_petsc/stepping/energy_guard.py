@@ -15,6 +15,7 @@ against the scale ::
 
     S = largest so far of T + U + |V − V₀| + Σ|W| + ΣD
 
+in which T is also that of what handles drive: where they start gently, hardly anything else moves yet.
 G < 0 is numerical dissipation: allowed, and summed up.
 
 Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
@@ -110,7 +111,7 @@ class Balance:
     potential_before, potential : float
         V at its ends.
     stored_before, stored : float
-        T + U at its ends.
+        T + U at its ends, with what handles drive.
     inertia, bracket : float
         ½ ‖Δv‖²_M, and what the work of the stage's forces leaves unexplained but for it.
     noise : float
@@ -177,7 +178,8 @@ class EnergyGuard:
         plain = after.elastic - before.elastic - moving
         heat, fall = works.heat + heat_beside, after.potential - before.potential
         gain = faster - slower + plain + rise + fall + heat - work
-        energy, energy_before = faster + after.elastic + springs[1], slower + before.elastic + springs[0]
+        energy = after.kinetic + after.elastic + springs[1]
+        energy_before = before.kinetic + before.elastic + springs[0]
         sizes = energy + energy_before + before.kinetic + after.kinetic
         sizes += abs(work) + abs(heat) + abs(before.potential) + abs(after.potential)
         noise = ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy) * stiff) + ROUND_OFF * stiff)

@@ -5,8 +5,8 @@ Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²),
 where the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy,
 until the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
 are taken anew before every solve, under-relaxed; pressures change in it along their own stiffness. Friction
-is taken anew, too, where obstacles stand still: a sheet that comes to lie on something in a load step is held
-there by the forces found on the way.
+is taken anew, too: a sheet that comes to lie on something in a load step is held there by the forces found on
+the way, and in equilibrium by what normal forces there allow.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -82,6 +82,14 @@ NO_POTENTIAL = (
 NUDGE = 1e-6
 """Of an edge, by which handles are moved to see what force that takes."""
 
+LAG, MOST_ROUNDS = 1e-3, 10
+"""Part of the friction that may be other than normal forces in the equilibrium allow; how often it is taken
+anew for that, at most."""
+
+SLIDES, SLIDING, MOST_SLID = 0.95, 5, 3
+"""Part of the friction allowed from which on all slides; in how many proximal steps that lead farther off it
+does in vain; and after how many load steps without an equilibrium where it does a smaller one is no help."""
+
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
 
@@ -128,8 +136,10 @@ class Equilibrium:
         self._system, self._stepper, self._integrator = system, stepper, system.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
-        self._in_vain = 0
         self._whole = False  # whether all of the stiffness is tried first
+        self._in_vain = self._slid = 0
+        self._slid_in = 0.0  # the last increment of the load factor in which all slid
+        self._lag = 0.0  # of the last equilibrium
         # the last equilibrium, how it changes with the load factor [m], and what loads change by [N]
         self._found, self._pull = 0.0, np.zeros((system.points.n_owned, 3))
         self._rate: Array | None = None
@@ -244,7 +254,7 @@ class Equilibrium:
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
         system.applied.factor = factor
-        newton = linear = solves = 0
+        newton = linear = solves = rounds = anew = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
         touched = system.active.touched()
@@ -258,13 +268,20 @@ class Equilibrium:
                 self._look_ahead(before, factor)
                 anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
-            if arrived and self._balanced(force, last):
+            balanced = arrived and self._balanced(force, last)
+            self._lag = self._friction()[0] if balanced else 0.0
+            if balanced and (rounds == MOST_ROUNDS or self._lag <= LAG):
+                if factor - before >= self._slid_in:
+                    self._slid, self._slid_in = 0, 0.0
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
                 linear += self._learn_rate(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
-            lessened = _last_lessened([each.residual for each in history])
+            lessened = anew + _last_lessened([each.residual for each in history[anew:]])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
+            farther = force > WORSE * history[lessened].residual
+            if not words and arrived and farther and solves - lessened >= SLIDING and self._friction()[1]:
+                words = "no equilibrium: proximal steps lead farther off"
             if words:
                 break
             if force > WORSE * last:
@@ -272,6 +289,11 @@ class Equilibrium:
             last = force
             if attempt.converged:
                 system.active.on_the_way(system.x)
+            if balanced:  # but for friction
+                rounds, anew = rounds + 1, len(history)
+                longest, leaps = self._integrator.pseudo, not system.active.viscous
+                last = self._out_of_balance(before, factor, first=True)
+                self._integrator.pseudo = longest
             if self._follows:
                 linear += self._take_loads(relaxation, before, factor, first=solves == 0)
             leap = leaps and self._integrator.pseudo > self._careful
@@ -299,6 +321,9 @@ class Equilibrium:
                 ceiling = self._integrator.pseudo if touches else ceiling
                 self._integrator.pseudo *= SHRINK
                 leaps = False
+        slides = self._friction()[1] if words and arrived else ""
+        if slides:
+            self._slid, self._slid_in, words = self._slid + 1, factor - before, f"{words}; {slides}"
         self._sufficed = 0.0
         self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
@@ -311,7 +336,7 @@ class Equilibrium:
             converged=False,
             newton_iterations=newton,
             linear_iterations=linear,
-            words=attempt.words or words,
+            words=words if slides else attempt.words or words,
             stuck=stuck,
         )
 
@@ -460,13 +485,18 @@ class Equilibrium:
                 break
             followed += 1
         system.moving_energy_before = anchored
-        return EquilibriumReport(found, newton, linear, _note(found, followed, words))
+        note = _note(found, followed, words)
+        if self._lag > LAG:
+            note += "; " if note else ""
+            note += f"friction is known to {100.0 * self._lag:.1g} % of what normal forces allow"
+        return EquilibriumReport(found, newton, linear, note)
 
     def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers to go on with from the equilibrium at ``factor``; collective."""
         self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned])
         arrays, past = self._extrapolation.memory()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
+        numbers |= {"slid": self._slid, "slid_in": self._slid_in}
         if self._rate is not None:
             arrays["rate"] = self._rate
         return arrays, numbers | {"extrapolation": past}
@@ -475,6 +505,8 @@ class Equilibrium:
         """Go on with a memory; an older one is empty."""
         self._scale = float(memory.get("scale", self._scale))
         self._in_vain = int(memory.get("in_vain", self._in_vain))
+        self._slid = int(memory.get("slid", self._slid))
+        self._slid_in = float(memory.get("slid_in", self._slid_in))
         self._sufficed = float(memory.get("sufficed", self._sufficed))
         self._found = factor
         self._rate = np.array(arrays["rate"]) if "rate" in arrays else None
@@ -484,7 +516,7 @@ class Equilibrium:
     @property
     def in_vain(self) -> bool:
         """Whether so much led nowhere since the last equilibrium that a smaller increment is no help."""
-        return self._in_vain >= MOST_IN_VAIN
+        return self._in_vain >= MOST_IN_VAIN or self._slid >= MOST_SLID
 
     def _hopeless(self, solves: int, lessened: int, before: Array, *, arrived: bool) -> str:
         """Why no more proximal steps are taken, or nothing; ``before`` is where they began; collective."""
@@ -551,6 +583,23 @@ class Equilibrium:
         if force <= self._tolerances.force_tolerance * self._scale:
             return True
         return LESS * last <= force <= self._floor
+
+    def _friction(self) -> tuple[float, str]:
+        """Friction that normal forces now do not allow, over what they allow, and in words what slides;
+        collective.
+        """
+        sums = self._system.active.lagging(self._system.x)
+        if not sums:
+            return 0.0, ""
+        each = self._system.points.summed(*np.concatenate(list(sums.values()))).reshape(-1, 3)
+        slides = [
+            f"it slides on {name}" if name else "sheets slide on each other"
+            for name, (_, friction, allowed) in zip(sums, each, strict=True)
+            if friction > SLIDES * allowed > 0.0
+        ]
+        wrong, friction, allowed = each.sum(axis=0)
+        words = f"{' and '.join(slides)}, with {friction:.3g} N of friction" if slides else ""
+        return float(wrong / max(allowed, np.finfo(float).tiny)), words
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))

@@ -73,15 +73,18 @@ class ObstacleMoves(NamedTuple):
 
     Attributes
     ----------
+    time : float
+        The end of the step [s].
     part : float
         Of the step, up to its stage; 1 also at its start.
     stage, end : list of (3, 3) and (3,)
-        Rotation and translation [m] of each from the start of the step to where friction is asked, and to the
-        end.
+        Rotation and translation [m] of each from where pairs were taken, the start of the step but on the way
+        of a static load step, to where friction is asked, and to the end.
     now, places : (m, 3)
         Their points and normals at the stage, and at the end.
     """
 
+    time: float
     part: float
     stage: list[tuple[Array, Array]]
     end: list[tuple[Array, Array]]
@@ -115,6 +118,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
+        self._taken_at: float | None = None  # [s], where obstacles stood on the way of a load step
         self._owed: Array | None = None  # after the step, until that is accepted
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
@@ -199,14 +203,15 @@ class CoulombFriction(Elastic):
 
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles, part = self._contact.obstacles, 1.0
-        end = stage = obstacles.moved(step.start, step.end)
+        start = step.start if self._taken_at is None else self._taken_at
+        end = stage = obstacles.moved(start, step.end)
         if step.start < step.at < step.end:
             part = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
-            stage = obstacles.moved(step.start, step.at)
+            stage = obstacles.moved(start, step.at)
         places = obstacles.at(step.end)
         now = obstacles.at(step.at) if obstacles.moving else places
-        return ObstacleMoves(part, stage, end, now, places)
+        return ObstacleMoves(step.end, part, stage, end, now, places)
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so, and what sticks to them."""
@@ -273,6 +278,8 @@ class CoulombFriction(Elastic):
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         state = self._at_stage(frozen)
+        # it is convex as it is; a secant for what slides lets equilibria converge linearly
+        blend = 0.0 if self._contact.static else blend
         friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
 
     def sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
@@ -290,6 +297,7 @@ class CoulombFriction(Elastic):
         return self._spring * size
 
     def accept(self, x: Array, frozen: ObstacleMoves) -> None:
+        self._taken_at = None
         self._heat[:, OWED], self._owed = (0.0 if self._owed is None else self._owed), None
         if not self.n_elements:
             self._on_obstacles = np.zeros_like(self._on_obstacles)
@@ -340,15 +348,37 @@ class CoulombFriction(Elastic):
         return Rubbing(points, beta, along, more, obstacle, moved)
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
-        # what obstacles take along in the load step would go that way twice
-        if all((turn == np.eye(3)).all() and not way.any() for turn, way in frozen.end):
-            self.accept(x, frozen)
+        self.accept(x, frozen)
+        self._taken_at = frozen.time  # else what obstacles take along would go that way twice
 
-    def touched(self) -> tuple[Pairs, Array, Array]:
-        return self._pairs, self._heat.copy(), self._on_obstacles
+    def lagging(self, x: Array, frozen: ObstacleMoves) -> dict[str, Array]:
+        names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
+        state, count = list(self._state(frozen.end)), len(names)
+        state[SLIP] = slip = state[SLIP].copy()
+        slides = np.empty(self.n_elements, dtype=np.bool_)
+        friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
+        mine, pull = slice(self.n_owned), self._spring * np.linalg.norm(slip, axis=1)
+        *_, force, at = self._contact.touching(x, frozen.places, self._contact.n_owned)
 
-    def touch_again(self, touched: tuple[Pairs, Array, Array]) -> None:
-        self._pairs, self._heat, self._on_obstacles = touched
+        def by_vertex(vertex: NDArray[np.int32], obstacle: Ints, each: Array) -> Array:
+            places, size = vertex.astype(np.int64) * count + obstacle % count, len(self._heat) * count
+            return np.bincount(places, each, size).reshape(-1, count).astype(np.float64)
+
+        acting = by_vertex(self._contact.stencil[at, 0], self._contact.obstacle[at], force)
+        given, limit, pull, sliding = (
+            by_vertex(self.stencil[mine, 0], self._obstacle[mine], each[mine])
+            for each in (self._force, self._limit, pull, np.where(slides, pull, 0.0))
+        )
+        more = acting / np.maximum(given, np.finfo(float).tiny)
+        wrong = np.maximum(pull - more * limit, np.maximum(more - 1.0, 0.0) * sliding)
+        sums = np.stack([wrong.sum(axis=0), pull.sum(axis=0), (more * limit).sum(axis=0)], axis=1)
+        return dict(zip(names, sums, strict=True))
+
+    def touched(self) -> tuple[Pairs, Array, Array, float | None]:
+        return self._pairs, self._heat.copy(), self._on_obstacles, self._taken_at
+
+    def touch_again(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
+        self._pairs, self._heat, self._on_obstacles, self._taken_at = touched
         self.stale = True
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:

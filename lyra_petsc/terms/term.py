@@ -461,6 +461,13 @@ class Elastic(Term):
     def on_the_way(self, x: Array, frozen: Any) -> None:
         """A part of a static load step led to positions x; for terms that take up there what touches."""
 
+    def lagging(self, x: Array, frozen: Any) -> Mapping[str, Array]:
+        """Sums [N] of friction at positions x (n_local, 3), of this rank's vertices, on each obstacle and of
+        sheets (no name), (3,): by how much it is more than the normal forces there allow, or less where parts
+        slide; friction; and what these allow.
+        """
+        return {}
+
     def touched(self) -> Any:
         """What it knows of what touches, which `touch_again` goes back to."""
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import gathered, grid, scene_of
 
+from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.mesh.start_crossings import overlaps_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.contact import ContactBarrier
 
 Array = NDArray[np.float64]
 
@@ -95,3 +98,96 @@ def test_without_friction_the_proximal_term_holds_what_nothing_else_does(comm: M
     assert any("nothing resists 3 motions" in note for note in simulation.notes)
     np.testing.assert_allclose(x[:, :2].mean(axis=0), 0.0, atol=1e-6)
     simulation.destroy()
+
+
+RADIUS, MU, LENGTH, WIDTH, LONG = 0.05, 0.3, 0.5, 0.02, 80
+
+
+def over_a_rod(comm: MPI.Comm, folder: Path, ratio: float, pressed: float) -> SteppedScene:
+    """A strip that hangs over a rod, ``ratio`` as long on one side as on the other, and begins so far above
+    it, over the gap.
+    """
+    gap = 5e-4
+    radius, hangs = RADIUS + pressed * gap, LENGTH - np.pi * RADIUS
+    s = np.linspace(0.0, LENGTH, LONG + 1)
+    t = s - hangs / (1.0 + ratio)
+    angle = np.clip(t / radius, 0.0, np.pi)
+    below = np.minimum(t, np.pi * radius - t)
+    x, z = -radius * np.cos(angle), np.where(below < 0.0, below, radius * np.sin(angle))
+    lines = [f"v {a} {y} {b}" for y in (0.0, 0.5 * WIDTH, WIDTH) for a, b in zip(x, z, strict=True)]
+    lines += [f"vt {a} {y}" for y in (0.0, 0.5 * WIDTH, WIDTH) for a in s]
+    for first in (1, LONG + 2):
+        for a in range(first, first + LONG):
+            b, c, d = a + 1, a + LONG + 2, a + LONG + 1
+            lines += [f"f {a}/{a} {b}/{b} {c}/{c}", f"f {a}/{a} {c}/{c} {d}/{d}"]
+    if comm.rank == 0:
+        (folder / "strip.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    comm.barrier()
+    content = {
+        "mesh": {"file": str(folder / "strip.obj")},
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0, 0, -9.81],
+        "contact": {"gap": gap, "friction": MU, "self": False},
+        "obstacles": {"rod": {"capsule": {"from": [0, -0.5, 0], "to": [0, 0.5, 0], "radius": RADIUS}}},
+        "time": STATIC,
+    }
+    return SteppedScene(comm, scene_of(content))
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize(("ratio", "pressed"), [(2.0, 0.95), (2.5, 0.4)])
+def test_a_strip_is_held_by_what_its_normal_forces_allow(
+    tmp_path: Path, ratio: float, pressed: float
+) -> None:
+    """Where it is pressed into the barrier at the start, it is so no longer in equilibrium."""
+    simulation = over_a_rod(MPI.COMM_SELF, tmp_path, ratio, pressed)
+    newton = 0
+    while not simulation.finished:
+        newton += simulation.step().newton_iterations
+    term, system = simulation.problem.terms["contact"], simulation.problem.system
+    assert isinstance(term, ContactBarrier)
+    torque = abs(simulation.ledger.obstacle_forces(1)[0, 4])
+    allowed = (
+        MU * RADIUS * float(term.touching(system.x, system.active.frozen[term].now, term.n_owned)[2].sum())
+    )
+    simulation.destroy()
+    assert newton < 250
+    assert 0.0 < torque < 1.01 * allowed
+
+
+@pytest.mark.parallel(1)
+def test_that_it_slides_is_told(tmp_path: Path) -> None:
+    simulation = over_a_rod(MPI.COMM_SELF, tmp_path, 6.0, 0.4)
+
+    def to_the_end() -> None:
+        while not simulation.finished:
+            simulation.step()
+
+    with pytest.raises(SolverError, match=r"it slides on rod, with 0\.00\d+ N of friction"):
+        to_the_end()
+    assert simulation.totals["rejected"] <= 5
+    simulation.destroy()
+
+
+def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
+    """A ball comes up and turns in each load step against a sheet whose ends are held: what touches it sticks
+    to it, or slides by the normal forces that there are at last.
+    """
+    turned = {"axis": [0.0, 0.0, 1.0], "degrees": 20.0}
+    ball = {
+        "sphere": {"center": [0, 0, -0.12], "radius": 0.1},
+        "motion": [{"time": 0.0}, {"time": 1.0, "rotate": turned, "translate": [0.0, 0.0, 0.05]}],
+    }
+    scene = laid(0.4, [-0.2, -0.2, 0.0], {"ball": ball}, 0.3, {"step": 0.25})
+    scene["handles"] = [{"group": "left"}, {"group": "right"}]
+    simulation = SteppedScene(comm, scene_of(scene))
+    while not simulation.finished:
+        simulation.step()
+    torque, weight = simulation.ledger.obstacle_forces(1)[0, 5], WEIGHT * 0.4**2
+    # the forces with the friction that the normal forces in the equilibrium allow
+    system, end = simulation.problem.system, simulation.time
+    system.begin_step(end, end + 1e-9)
+    left = system.points.summed(float(np.sum(system.out_of_balance()[0] ** 2)))[0] ** 0.5
+    simulation.destroy()
+    assert left < 1e-3 * weight
+    assert torque < -1e-3 * weight
