@@ -148,23 +148,33 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     """Give what slides the friction that it lacks, or take back what it had too much, by impulses; what all
     impulses of the step did; collective.
 
-    No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`.
+    No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`. Friction
+    has no moment where the step begins; what it and these impulses have of it elsewhere is taken back under
+    the midpoint rule, so that angular momentum stays as it is.
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
     rubbing = term.rubbing(stage, x, frozen, damped.felt, dt, sheets=sheets)
-    points, beta, along, more, obstacle, moved = rubbing
-    if not any(system.points.largest(float(np.abs(more).max(initial=0.0)))):
+    points, beta, along, ways, more, obstacle, moved = rubbing
+    pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
+    if system.integrator.by_stage:
+        pairs, moments = term.moments(stage, frozen)
+    if not any(system.points.largest(float(np.abs(more).max(initial=0.0)), len(pairs))):
         return damped
     impulse = np.zeros_like(x)
-    inverse = _inverse_masses(system, [(points, beta, more > 0.0)])
-    rows, of_sheet = np.maximum(points, 0), np.where(points >= 0, beta, 0.0)
-    speed = np.einsum("ei,eik,ek->e", of_sheet, system.v[rows], along)
-    speed -= np.einsum("ek,ek->e", moved, along) / dt
-    most = np.where((of_sheet != 0.0)[:, :, None], inverse[rows], 0.0).max(axis=(1, 2), initial=0.0)
+    size = np.linalg.norm(ways, axis=2)
+    inverse = _inverse_masses(system, [(points, size, more > 0.0)])
+    speed = np.einsum("eik,eik->e", system.v[points], ways) - np.einsum("ek,ek->e", moved, along) / dt
+    most = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
     stops = np.divide(speed, dt * most, out=np.zeros_like(speed), where=most > 0.0)
-    force = -np.minimum(more, np.maximum(stops, 0.0))[:, None] * along
-    np.add.at(impulse, rows, dt * of_sheet[:, :, None] * force[:, None, :])
+    push = -np.minimum(more, np.maximum(stops, 0.0))
+    force, impulses = push[:, None] * along, (dt * push)[:, None, None] * ways
+    np.add.at(impulse, points, impulses)
+    if system.integrator.by_stage:
+        between = obstacle < 0
+        theirs = np.cross(x[points[between]], impulses[between]).sum(axis=1)
+        pairs, moments = np.concatenate([pairs, points[between]]), np.concatenate([dt * moments, theirs])
+        dashpots.add_couples(x, pairs, -moments, impulse)
     work, on = float(np.vdot(force, moved)), obstacle >= 0
     pushed = _on_obstacles(system, points[on], beta[on], obstacle[on], force[on])
     held, heat = _give(system, impulse, work)

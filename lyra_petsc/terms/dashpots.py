@@ -1,6 +1,6 @@
-"""Kernels of the dashpots between nearest points: shares of masses, and impulses.
+"""Kernels of the impulses between nearest points: shares of masses, dashpots, and what keeps moments.
 
-Pairs are as `term.Elastic.dashpots` gives them; only those of this rank, ``mine``, count.
+Pairs of dashpots are as `term.Elastic.dashpots` gives them; only those of this rank, ``mine``, count.
 """
 
 from __future__ import annotations
@@ -11,6 +11,10 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.hinge import cross, dot, minus, point
+
+LINE = 1e-12
+"""Determinant of the inertia of four points over the cube of its trace below which they are on a line."""
 
 
 @kernel()
@@ -66,3 +70,31 @@ def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping,
                 if points[e, i] >= 0:
                     for k in range(3):
                         out[Index(points[e, i]), k] += push[e] * beta[e, i] * normal[e, k]
+
+
+@kernel()
+def add_couples(x, points, moment, out):  # type: ignore[no-untyped-def]
+    """Add impulses [N s] with these moments (m, 3) [N m s] and without resultant to out (n_local, 3): as in a
+    rigid rotation of each four points of equal masses. Points on a line get none.
+    """
+    for e in range(len(points)):
+        mean = 0.0, 0.0, 0.0
+        for i in range(4):
+            p = point(x, points[e, i])
+            mean = mean[0] + 0.25 * p[0], mean[1] + 0.25 * p[1], mean[2] + 0.25 * p[2]
+        xx = xy = xz = yy = yz = zz = 0.0
+        for i in range(4):
+            a, b, c = minus(point(x, points[e, i]), mean)
+            xx, yy, zz = xx + b * b + c * c, yy + a * a + c * c, zz + a * a + b * b
+            xy, xz, yz = xy - a * b, xz - a * c, yz - b * c
+        one, two, three = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        u, v, w = cross(two, three), cross(three, one), cross(one, two)
+        det, given = dot(one, u), (moment[e, 0], moment[e, 1], moment[e, 2])
+        if not det > LINE * (xx + yy + zz) ** 3:
+            continue
+        turn = dot(u, given) / det, dot(v, given) / det, dot(w, given) / det
+        for i in range(4):
+            row = Index(points[e, i])
+            push = cross(turn, minus(point(x, row), mean))
+            for k in range(3):
+                out[row, k] += push[k]

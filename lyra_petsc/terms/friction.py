@@ -27,7 +27,7 @@ from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
-from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, SLID
+from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, GRIP, SLID
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Rubbing, UpcomingStep
 
@@ -41,7 +41,7 @@ HEAT = np.arange(3) == WORK
 PAID = 0.25
 """Part of that which is made up for in a step: all at once would make friction tremble."""
 
-SLIP = 4
+SLIP = 5
 """Place of the elastic parts of the ways among what the kernels take."""
 
 ELASTIC = 0.01
@@ -58,14 +58,17 @@ class Pairs(NamedTuple):
     ----------
     key : (E, 10)
         Numbers of the vertices, kind, obstacle, its points (0 for vertices): what tells a pair from others.
-    what : (E, 24)
+    what : (E, 34)
         The key without the vertices; elastic part of the way so far [m]; 1 if it slid in the last step; β (0
-        for obstacles' points), unit normals, Σ β_i x_i [m], where an obstacle is touched [m], normal
-        force [N].
+        for obstacles' points), unit normals, Σ β_i x_i [m] and, between sheets, Σ d_i (n · x_i), where an
+        obstacle is touched [m], normal force [N], the part of it that rubs, d_i of all but the first [m/m].
+    stencil : (E, 4)
+        Numbers of all vertices of the triangle, or of both edges.
     """
 
     key: Ints
     what: Array
+    stencil: Ints
 
 
 class ObstacleMoves(NamedTuple):
@@ -93,7 +96,7 @@ class ObstacleMoves(NamedTuple):
 
 
 def _no_pairs() -> Pairs:
-    return Pairs(np.empty((0, 10), dtype=np.int64), np.empty((0, COLUMNS)))
+    return Pairs(np.empty((0, 10), np.int64), np.empty((0, COLUMNS)), np.empty((0, 4), np.int64))
 
 
 def _order(key: Ints) -> Ints:
@@ -135,9 +138,10 @@ class CoulombFriction(Elastic):
         super().take(elements)
         what = elements.data["what"].reshape(-1, COLUMNS)
         n = len(what)
-        self._beta, vectors = np.empty((n, 4)), np.empty((4, n, 3))
+        self._beta, vectors, self._turn = np.empty((n, 4)), np.empty((4, n, 3)), np.empty((n, 4, 3))
         self._normal, self._still, self._slip, self._foot = vectors
-        friction_pairs.unpack(what, self._beta, self._normal, self._still, self._slip, self._foot)
+        taken = self._beta, self._normal, self._turn, self._still, self._slip, self._foot
+        friction_pairs.unpack(what, *taken)
         self._obstacle = what[:, 1].astype(np.int64)
         of_vertex = (what[:, 0] != EDGE_EDGE) & (what[:, 2] == 0.0)
         self._vertex = np.where(of_vertex, self.stencil[:, 0], -1)
@@ -149,6 +153,7 @@ class CoulombFriction(Elastic):
             self._spring = np.maximum(self._stiffest, self._limit / longest)
             drops = kinetic < static
             self._spring[drops] = static[drops] * self._force[drops] / longest
+            self._limit, self._spring = (what[:, GRIP] * each for each in (self._limit, self._spring))
         self._of: ObstacleMoves | None = None  # what is remembered of a stage
 
     @property
@@ -159,7 +164,7 @@ class CoulombFriction(Elastic):
 
     def known(self) -> tuple[Ints, Array]:
         self.stale, self._known = False, self._pairs
-        return self._pairs.key[:, :4], self._pairs.what
+        return self._pairs.stencil, self._pairs.what
 
     def _renew(self, x: Array, places: Array, old: Pairs) -> None:
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
@@ -168,13 +173,15 @@ class CoulombFriction(Elastic):
             return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
-        friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
+        pairs = contact.points, contact.number, contact.kind, contact.obstacle
+        friction_pairs.choose(x, contact.stencil, *pairs, beta, normal, at)
+        friction_pairs.keys(*pairs, beta, at, key)
         order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
         touching = at[order], beta[order], normal[order], force[order]
         friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
-        self._pairs, self.stale = Pairs(key, what), True
+        self._pairs, self.stale = Pairs(key, what, contact.number[at[order]]), True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
         self._renew(x, frozen.places, self._pairs)
@@ -197,7 +204,8 @@ class CoulombFriction(Elastic):
         order = _order(key)
         # `take_pairs` finds the rest
         rest = np.zeros((len(key), COLUMNS - values.shape[1]))
-        self._pairs = Pairs(key[order], np.column_stack([what, slip, values[:, 9], rest])[order])
+        rows = np.column_stack([what, slip, values[:, 9], rest])
+        self._pairs = Pairs(key[order], rows[order], vertices[order])
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -225,7 +233,8 @@ class CoulombFriction(Elastic):
             side, foot = self._beta[mine].sum(axis=1), foot[mine]
             start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
             slip[mine] = slip[mine] @ rotation.T
-        return self.stencil, self._beta, self._normal, start, slip, self._spring, self._limit
+        state = self._beta, self._normal, self._turn, start, slip, self._spring, self._limit
+        return self.stencil, *state
 
     def _at_stage(self, frozen: ObstacleMoves) -> tuple[NDArray[Any], ...]:
         """The same for positions of the stage, a part a of the way to the end: a D, with D there, has the
@@ -233,11 +242,11 @@ class CoulombFriction(Elastic):
         """
         if self._of is not frozen:
             self._of, part = frozen, frozen.part
-            stencil, beta, normal, start, slip, spring, limit = self._state(frozen.stage)
+            stencil, beta, normal, turn, start, slip, spring, limit = self._state(frozen.stage)
             if part != 1.0:
                 start = start + (1.0 / part - 1.0) * self._still
-                beta, spring, limit = beta / part, part * spring, part * limit
-            self._stage = stencil, beta, normal, start, slip, spring, limit
+                beta, turn, spring, limit = beta / part, turn / part, part * spring, part * limit
+            self._stage = stencil, beta, normal, turn, start, slip, spring, limit
         return self._stage
 
     def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
@@ -253,10 +262,10 @@ class CoulombFriction(Elastic):
         # by forces: an obstacle goes many times as far as what sticks, over which energies tell nothing
         work = 0.0
         if self._contact.obstacles.moving and self.n_elements:
-            _, _, _, before, *_ = self._at_stage(frozen[0])
-            _, _, _, after, *_ = self._at_stage(frozen[1])
+            _, _, _, _, before, *_ = self._at_stage(frozen[0])
+            _, _, _, _, after, *_ = self._at_stage(frozen[1])
             for x, at in zip(ends, frozen, strict=True):
-                stencil, beta, normal, start, slip, spring, limit = self._at_stage(at)
+                stencil, beta, normal, _, start, slip, spring, limit = self._at_stage(at)
                 u = np.einsum("ei,eik->ek", beta, x[stencil]) - start
                 u += slip - np.einsum("ek,ek->e", u, normal)[:, None] * normal
                 pull = np.minimum(spring, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))[:, None] * u
@@ -313,7 +322,7 @@ class CoulombFriction(Elastic):
         np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
         old = self._known.what.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
-        self._renew(x, frozen.places, Pairs(self._known.key, old))
+        self._renew(x, frozen.places, self._known._replace(what=old))
 
     def rubbing(
         self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
@@ -343,9 +352,19 @@ class CoulombFriction(Elastic):
         points, beta, obstacle = self.stencil[rub], self._beta[rub], self._obstacle[rub]
         length = np.linalg.norm(slip[rub], axis=1, keepdims=True)
         along = np.divide(slip[rub], length, out=np.zeros((len(rub), 3)), where=length > 0.0)
+        ways = beta[:, :, None] * along[:, None, :]
+        couple = np.einsum("eik,ek->ei", self._turn[rub], along)
+        ways += couple[:, :, None] * self._normal[rub][:, None, :]
         more = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
         moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
-        return Rubbing(points, beta, along, more, obstacle, moved)
+        return Rubbing(points, beta, along, ways, more, obstacle, moved)
+
+    def moments(self, x: Array, frozen: ObstacleMoves) -> tuple[Ints, Array]:
+        of = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
+        stencil, *state = (part[of] for part in self._at_stage(frozen))
+        moments = np.zeros((len(of), 3))
+        friction_pairs.add_moments(x, stencil, *state, moments)
+        return stencil, -moments
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
         self.accept(x, frozen)

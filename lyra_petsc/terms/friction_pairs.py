@@ -3,10 +3,14 @@
 With the normal n, the normal force N and the barycentric coefficients β of the last accepted state, the
 tangential way that a pair has gone, elastic part ξ of the steps before included, is
 
-    u = (I − n nᵀ) (Σ β_i x_i − c) + ξ,
+    u = (I − n nᵀ) (Σ β_i x_i − c) + Σ d_i (n · x_i − h_i) + ξ,
 
-c what the sum was and, of an obstacle that moves, will be if the pair sticks. Up to the force μ N the pair
-sticks like a spring of stiffness k, beyond it slides. The potential of this force is convex::
+c and h_i what the sum and n · x_i were; of an obstacle that moves c is what it will be if the pair sticks,
+and d_i = 0. Between sheets the second sum takes away that they turn together: n does so with the triangle
+or with both edges, which tell the vectors d_i across n (`frame`). Nearest points are a distance apart;
+without it any rotation would be a slip, and forces at them would have a moment. With it forces have none
+where the state was accepted. Up to the force μ N the pair sticks like a spring of stiffness k, beyond it
+slides. The potential of this force is convex::
 
     D = ½ k |u|²  for k |u| ≤ μ N,  else  μ N |u| − (μ N)² / 2k
 
@@ -24,17 +28,94 @@ from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_outer
-from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.hinge import cross, dot, minus, point
 
-SLIP, SLID, BETA, NORMAL, START, FOOT, FORCE, COLUMNS = 6, 9, 10, 14, 17, 20, 23, 24
+SLIP, SLID, BETA, NORMAL, START, FOOT, FORCE, GRIP, TURN, COLUMNS = 6, 9, 10, 14, 17, 20, 23, 24, 25, 34
 """Where each begins in a row of what is known of pairs, `friction.Pairs`, and how long it is."""
+
+LEVER = 0.25
+"""Of the vertices around nearest points, in the direction in which it is least, over the distance of these:
+below, the couple would be large, and friction is less, so that it is not; none where there is no lever."""
+
+UPRIGHT = 0.7
+"""Cosine of the angle of two normals from which on they are near each other."""
+
+FLAT = 1e-12
+"""Product of the squared levers over the square of their sum below which there is none in some direction."""
+
+LAST = np.int64(np.iinfo(np.int64).max)
+"""No vertex has a higher number."""
 
 EQUAL = 1e-6
 """Relative difference of squared lengths up to which which is longer is a matter of rounding."""
 
 
 @leaf()
-def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped-def]
+def frame(p, kind, n, turn):  # type: ignore[no-untyped-def]
+    """Let turn (4, 3) be the d_i of a pair between sheets at p (4, 3), without the distance as a factor; the
+    square [m²] of the lever that p has in the direction in which it is least.
+
+    The normal n (3,) turns with the sheet, by the gradients of barycentric coordinates with the triangle, or
+    with both edges: Σ d_i = 0 on each side, Σ d_i ⊗ p_i = I in the plane, and these are the least.
+    """
+    first = 0 if kind == EDGE_EDGE else 1
+    xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(first, 4):
+        low, high = (0, 2) if i < 2 and first == 0 else (2 - first, 4)
+        height, size = 0.0, high - low
+        for k in range(3):
+            mean = 0.0
+            for j in range(low, high):
+                mean += p[j, k]
+            turn[i, k] = p[i, k] - mean / size
+            height += turn[i, k] * n[k]
+        for k in range(3):
+            turn[i, k] -= height * n[k]
+        a, b, c = turn[i, 0], turn[i, 1], turn[i, 2]
+        xx, xy, xz, yy, yz, zz = xx + a * a, xy + a * b, xz + a * c, yy + b * b, yz + b * c, zz + c * c
+    for k in range(3):
+        turn[0, k] = turn[0, k] if first == 0 else 0.0
+    total = xx + yy + zz
+    # along n, too, there shall be something to be inverted
+    one = xx + total * n[0] * n[0], xy + total * n[0] * n[1], xz + total * n[0] * n[2]
+    two = one[1], yy + total * n[1] * n[1], yz + total * n[1] * n[2]
+    three = one[2], two[2], zz + total * n[2] * n[2]
+    u, v, w = cross(two, three), cross(three, one), cross(one, two)
+    det = dot(one, u)
+    product = det / total if total > 0.0 else 0.0
+    if not product > FLAT * total * total:
+        turn[:] = 0.0
+        return 0.0
+    for i in range(first, 4):
+        r = turn[i, 0], turn[i, 1], turn[i, 2]
+        turn[i, 0], turn[i, 1], turn[i, 2] = dot(u, r) / det, dot(v, r) / det, dot(w, r) / det
+    return product / (0.5 * total + math.sqrt(max(0.25 * total * total - product, 0.0)))
+
+
+@leaf()
+def _height(x, stencil, normal, e, i):  # type: ignore[no-untyped-def]
+    """How far vertex i of pair e is along n beyond its first vertex."""
+    one, other, out = Index(stencil[e, i]), Index(stencil[e, 0]), 0.0
+    for k in range(3):
+        out += normal[e, k] * (x[one, k] - x[other, k])
+    return out
+
+
+@leaf()
+def _turns(turn, e):  # type: ignore[no-untyped-def]
+    """Whether the turning of pair e is none of its way: where it touches no obstacle."""
+    return turn[e, 3, 0] != 0.0 or turn[e, 3, 1] != 0.0 or turn[e, 3, 2] != 0.0
+
+
+@leaf()
+def _turn_of(turn, e, i):  # type: ignore[no-untyped-def]
+    """d_i of pair e."""
+    return turn[e, i, 0], turn[e, i, 1], turn[e, i, 2]
+
+
+@leaf()
+def way(x, e, stencil, beta, normal, turn, start, slip, u):  # type: ignore[no-untyped-def]
     """u of pair e into u (3,); |u|."""
     along = 0.0
     for k in range(3):
@@ -43,6 +124,11 @@ def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped
             at += beta[e, i] * x[Index(stencil[e, i]), k]
         u[k] = at
         along += normal[e, k] * at
+    if _turns(turn, e):
+        for i in range(1, 4):
+            height = _height(x, stencil, normal, e, i)
+            for k in range(3):
+                u[k] += turn[e, i, k] * height
     square = 0.0
     for k in range(3):
         u[k] += slip[e, k] - along * normal[e, k]
@@ -51,30 +137,52 @@ def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped
 
 
 @kernel()
-def energies(x, stencil, beta, normal, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+def energies(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
     """D [J] of the first len(out) pairs."""
     u = np.empty(3)
     for e in range(len(out)):
-        m = way(x, e, stencil, beta, normal, start, slip, u)
+        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
         k, most = stiffness[e], limit[e]
         out[e] = 0.5 * k * m * m if k * m <= most else most * (m - 0.5 * most / k)
 
 
 @kernel()
-def add_gradient(x, stencil, beta, normal, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
     """Add the gradient [N] to rows of out (n_local, 3)."""
     u = np.empty(3)
     for e in range(len(stencil)):
-        m = way(x, e, stencil, beta, normal, start, slip, u)
+        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
         factor = stiffness[e] if stiffness[e] * m <= limit[e] else limit[e] / m
+        turns = _turns(turn, e)
         for i in range(4):
+            row, couple = Index(stencil[e, i]), 0.0
+            if turns:
+                couple = factor * dot(_turn_of(turn, e, i), u)
             for k in range(3):
-                out[Index(stencil[e, i]), k] += factor * beta[e, i] * u[k]
+                out[row, k] += factor * beta[e, i] * u[k] + couple * normal[e, k]
+
+
+@kernel()
+def add_moments(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+    """Add the moments [N m] of the gradients of pairs between sheets to out (E, 3)."""
+    u = np.empty(3)
+    for e in range(len(stencil)):
+        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
+        factor = stiffness[e] if stiffness[e] * m <= limit[e] else limit[e] / m
+        pull = factor * u[0], factor * u[1], factor * u[2]
+        n, foot = (normal[e, 0], normal[e, 1], normal[e, 2]), point(x, stencil[e, 0])
+        for i in range(1, 4):
+            arm, couple = minus(point(x, stencil[e, i]), foot), dot(_turn_of(turn, e, i), pull)
+            b = beta[e, i]
+            force = b * pull[0] + couple * n[0], b * pull[1] + couple * n[1], b * pull[2] + couple * n[2]
+            moment = cross(arm, force)
+            for k in range(3):
+                out[e, k] += moment[k]
 
 
 @kernel()
 def add_hessians(  # type: ignore[no-untyped-def]
-    x, stencil, beta, normal, start, slip, stiffness, limit, weight, blend, offsets, values
+    x, stencil, beta, normal, turn, start, slip, stiffness, limit, weight, blend, offsets, values
 ):  # fmt: skip
     """Add weight (E,) times the Hessians [N/m], all positive semidefinite, to block rows values (n, 3, 3).
 
@@ -84,20 +192,40 @@ def add_hessians(  # type: ignore[no-untyped-def]
     u, blocks = np.empty(3), values.reshape(-1, 9)
     for e in range(len(stencil)):
         fetch_ahead(e, offsets, blocks, 10)
-        m = way(x, e, stencil, beta, normal, start, slip, u)
-        _add_hessian(e, m, u, beta, normal, stiffness[e], limit[e], weight[e], blend, offsets, blocks)
+        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
+        pair = e, m, u, beta, normal, turn, stiffness[e], limit[e], weight[e]
+        _add_hessian(*pair, blend, offsets, blocks)
 
 
 @leaf()
-def _add_hessian(e, m, u, beta, normal, stiffness, limit, weight, blend, offsets, blocks):  # type: ignore[no-untyped-def]  # fmt: skip
+def _add_hessian(e, m, u, beta, normal, turn, stiffness, limit, weight, blend, offsets, blocks):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add that of pair e with the way u (3,), of length m, to blocks (n_blocks, 9)."""
     sticks = stiffness * m <= limit
     factor = stiffness if sticks else limit / m
     less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
-    n, along = (normal[e, 0], normal[e, 1], normal[e, 2]), (u[0], u[1], u[2])
+    n, along, turns = (normal[e, 0], normal[e, 1], normal[e, 2]), (u[0], u[1], u[2]), _turns(turn, e)
     for a in range(4):
         for b in range(a, 4):
             both, to = weight * beta[e, a] * beta[e, b], offsets[e, (7 - a) * a // 2 + b]
+            if turns:
+                c, d = weight * beta[e, a], weight * beta[e, b]
+                f, g = _turn_of(turn, e, a), _turn_of(turn, e, b)
+                own = factor * (weight * dot(f, g) - both)
+                left = (
+                    factor * c * g[0] + own * n[0],
+                    factor * c * g[1] + own * n[1],
+                    factor * c * g[2] + own * n[2],
+                )
+                add_outer(blocks, to, factor * both, left, n)
+                add_outer(blocks, to, 0.0, n, (factor * d * f[0], factor * d * f[1], factor * d * f[2]))
+                if less != 0.0:
+                    p, q = weight * dot(f, along), dot(g, along)
+                    c, d = -less * c, beta[e, b]
+                    p *= -less
+                    left = c * u[0] + p * n[0], c * u[1] + p * n[1], c * u[2] + p * n[2]
+                    right = d * u[0] + q * n[0], d * u[1] + q * n[1], d * u[2] + q * n[2]
+                    add_outer(blocks, to, 0.0, left, right)
+                continue
             if both == 0.0:
                 continue
             own, by = both * factor, -both * less
@@ -107,11 +235,11 @@ def _add_hessian(e, m, u, beta, normal, stiffness, limit, weight, blend, offsets
 
 
 @kernel()
-def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides):  # type: ignore[no-untyped-def]
+def slide(x, stencil, beta, normal, turn, start, slip, stiffness, limit, heat, slides):  # type: ignore[no-untyped-def]
     """Let ``slip`` be the elastic part of u; the work [J] that sliding takes and whether pairs do, (E,)."""
     u = np.empty(3)
     for e in range(len(stencil)):
-        m = way(x, e, stencil, beta, normal, start, slip, u)
+        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
         elastic = limit[e] / stiffness[e]
         heat[e], slides[e] = 0.0, m > elastic
         if m > elastic:
@@ -120,6 +248,70 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
                 u[k] *= elastic / m
         for k in range(3):
             slip[e, k] = u[k]
+
+
+@kernel()
+def choose(x, stencil, points, number, kind, obstacle, beta, normal, at):  # type: ignore[no-untyped-def]
+    """Of pairs ``at`` (E,) between a vertex and an edge or vertex of a sheet take the one with the triangle
+    around that whose plane turns with them, and its β (E, 4): one with a normal near theirs, and of these the
+    one with the lowest numbers, on any ranks.
+    """
+    ours = np.empty(4)
+    for m in range(len(at)):
+        e = at[m]
+        nearest = 0
+        for i in range(1, 4):
+            nearest += 1 if beta[m, i] != 0.0 else 0
+        if kind[e] != VERTEX_TRIANGLE or obstacle[e] >= 0 or nearest == 3:
+            continue
+        best, least, one = -1.0, LAST, e
+        begin = e
+        while begin > 0 and _before_sheet(kind, obstacle, points, begin - 1, points[e, 0]):
+            begin -= 1
+        other = begin
+        while other < len(kind) and _before_sheet(kind, obstacle, points, other, points[e, 0]):
+            common, lo, hi = 0, LAST, np.int64(-1)
+            for i in range(1, 4):
+                here = _beta_of(number, beta, m, e, number[other, i])
+                if here != 0.0:
+                    common += 1
+                else:
+                    lo, hi = min(lo, number[other, i]), max(hi, number[other, i])
+            if common == nearest:
+                cosine, rest = _cosine(x, stencil, other, normal, m), (lo << 32) | hi
+                if (cosine > best and best < UPRIGHT) or (cosine >= UPRIGHT and rest < least):
+                    best, least, one = cosine, rest, other
+            other += 1
+        for i in range(4):
+            ours[i] = beta[m, 0] if i == 0 else _beta_of(number, beta, m, e, number[one, i])
+        for i in range(4):
+            beta[m, i] = ours[i]
+        at[m] = one
+
+
+@leaf()
+def _before_sheet(kind, obstacle, points, e, vertex):  # type: ignore[no-untyped-def]
+    """Whether pair e is one of this vertex and a triangle of a sheet."""
+    return kind[e] == VERTEX_TRIANGLE and obstacle[e] < 0 and points[e, 0] == vertex
+
+
+@leaf()
+def _beta_of(number, beta, m, e, vertex):  # type: ignore[no-untyped-def]
+    """β of a vertex of the triangle of pair e, from row m; 0 of others."""
+    for i in range(1, 4):
+        if number[e, i] == vertex:
+            return beta[m, i]
+    return 0.0
+
+
+@leaf()
+def _cosine(x, stencil, e, normal, m):  # type: ignore[no-untyped-def]
+    """|cos| of the angle between the normal in row m and that of the triangle of pair e."""
+    a, b, c = point(x, stencil[e, 1]), point(x, stencil[e, 2]), point(x, stencil[e, 3])
+    out = cross(minus(b, a), minus(c, a))
+    size = math.sqrt(dot(out, out))
+    along = out[0] * normal[m, 0] + out[1] * normal[m, 1] + out[2] * normal[m, 2]
+    return abs(along) / size if size > 0.0 else 0.0
 
 
 @kernel()
@@ -142,12 +334,13 @@ def keys(points, number, kind, obstacle, beta, at, out):  # type: ignore[no-unty
 
 @kernel()
 def describe(x, stencil, points, keys, touching, same, old, what):  # type: ignore[no-untyped-def]
-    """What is known of pairs with keys (E, 10), into what (E, 24), at positions x (n_local, 3).
+    """What is known of pairs with keys (E, 10), into what (E, 34), at positions x (n_local, 3).
 
     ``touching`` are their numbers among ``stencil`` and ``points``, β, unit normals and normal forces; those
-    with a number in ``same`` (E,) of 0 or more go on that row of ``old`` (M, 24).
+    with a number in ``same`` (E,) of 0 or more go on that row of ``old`` (M, 34).
     """
     numbers, beta, normal, force = touching
+    p, turn = np.empty((4, 3)), np.empty((4, 3))
     for m in range(len(numbers)):
         e, side, along = numbers[m], 0.0, 0.0
         for k in range(6):
@@ -156,6 +349,7 @@ def describe(x, stencil, points, keys, touching, same, old, what):  # type: igno
             share = beta[m, i] if points[e, i] >= 0 else 0.0
             what[m, BETA + i] = share
             side += share
+        distance = 0.0
         for k in range(3):
             start = 0.0
             for i in range(4):
@@ -164,20 +358,40 @@ def describe(x, stencil, points, keys, touching, same, old, what):  # type: igno
             what[m, FOOT + k] = side * start if abs(side) > 0.5 else 0.0  # where the other is an obstacle
             what[m, SLIP + k] = old[same[m], SLIP + k] if same[m] >= 0 else 0.0
             along += what[m, SLIP + k] * normal[m, k]
+            distance += start * normal[m, k]
+        what[m, GRIP], turn[:] = 1.0, 0.0
+        if keys[m, 5] < 0:
+            for i in range(4):
+                for k in range(3):
+                    p[i, k] = x[Index(stencil[e, i]), k]
+            lever = frame(p, keys[m, 4], normal[m], turn)
+            what[m, GRIP] = min(lever / (LEVER * distance) ** 2, 1.0)
+        for i in range(1, 4):
+            height = 0.0
+            for k in range(3):
+                turn[i, k] *= distance
+                height += normal[m, k] * (x[Index(stencil[e, i]), k] - x[Index(stencil[e, 0]), k])
+            for k in range(3):
+                what[m, TURN + 3 * i - 3 + k] = turn[i, k]
+                what[m, START + k] += height * turn[i, k]
         for k in range(3):
             what[m, SLIP + k] -= along * normal[m, k]
         what[m, SLID], what[m, FORCE] = old[same[m], SLID] if same[m] >= 0 else 0.0, force[m]
 
 
 @kernel()
-def unpack(what, beta, normal, start, slip, foot):  # type: ignore[no-untyped-def]
-    """Columns of what (E, 24) into arrays of their own, (E, 4) and (E, 3)."""
+def unpack(what, beta, normal, turn, start, slip, foot):  # type: ignore[no-untyped-def]
+    """Columns of what (E, 34) into arrays of their own, (E, 4) and (E, 3)."""
     for e in range(len(what)):
         for i in range(4):
             beta[e, i] = what[e, BETA + i]
         for k in range(3):
             normal[e, k], start[e, k] = what[e, NORMAL + k], what[e, START + k]
             slip[e, k], foot[e, k] = what[e, SLIP + k], what[e, FOOT + k]
+            turn[e, 0, k] = 0.0
+            for i in range(1, 4):
+                turn[e, i, k] = what[e, TURN + 3 * i - 3 + k]
+                turn[e, 0, k] -= turn[e, i, k]
 
 
 @leaf()
@@ -216,7 +430,7 @@ def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
 def find(keys, among, what, place):  # type: ignore[no-untyped-def]
     """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does.
 
-    Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 24);
+    Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 34);
     of those that slide, whose elastic parts are equally long, the one with the larger normal force.
     """
     room = 1

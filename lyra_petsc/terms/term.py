@@ -222,6 +222,8 @@ class Rubbing(NamedTuple):
         As `Elastic.touching_points` has them.
     along : (m, 3)
         Unit vectors of the ways that they slid.
+    ways : (m, 4, 3)
+        Gradients of the lengths of these by the positions of the points.
     more : (m,)
         By how much friction [N] was too small in one step; below 0, too large.
     obstacle : (m,)
@@ -233,6 +235,7 @@ class Rubbing(NamedTuple):
     points: Ints
     beta: Array
     along: Array
+    ways: Array
     more: Array
     obstacle: Ints
     moved: Array
@@ -521,6 +524,12 @@ class Elastic(Term):
         which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that `slips`.
 
         On obstacles, and with ``sheets`` on sheets.
+        """
+        raise NotImplementedError
+
+    def moments(self, x: Array, frozen: Any) -> tuple[Ints, Array]:
+        """Vertices (m, 4) of the counted pairs between sheets, and the moments (m, 3) [N m] that their forces
+        have at positions x (n_local, 3); of a term that `slips`.
         """
         raise NotImplementedError
 

@@ -260,6 +260,39 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=6e-3)
 
 
+def test_sheets_that_rub_keep_their_angular_momentum(comm: MPI.Comm) -> None:
+    """Thrown at each other, and spinning against each other, under the midpoint rule."""
+    side, gap, low = 0.2, 0.004, 49
+    turn = {"axis": [0.3, 1.0, 0.2], "degrees": 40.0}
+    upper = {"transform": {"rotate": turn, "translate": [0.02, 0.04, 0.13]}}
+    content = {
+        "mesh": [grid(side, side, 6, 6, "alternating"), grid(0.8 * side, 0.7 * side, 5, 4) | upper],
+        "material": {"cloth": "gray-interlock"},
+        "contact": {"gap": gap, "friction": 0.6},
+        "time": {"end": 0.04, "step": 0.002, "integrator": "midpoint"},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, layout = simulation.problem.system, simulation.problem.points
+    n = layout.n_vertices
+    below = (layout.original < low)[:, None]
+    spin = np.cross(np.where(below, [0.0, 0.0, 8.0], [0.0, 0.0, -8.0]), system.x[:n] - 0.5 * side)
+    system.v[:n] = np.where(below, [0.4, 0.0, 2.0], [0.0, 0.0, -2.0]) + spin
+    layout.update_ghosts(system.v)
+    simulation.ledger.measure()
+
+    def angular() -> Array:
+        each = np.cross(system.x[:n], system.mass[:n, None] * system.v[:n])
+        return np.array(comm.allreduce(np.stack([each.sum(axis=0), np.abs(each).sum(axis=0)])))
+
+    (before, size), rubbed = angular(), 0.0
+    while not simulation.finished:
+        simulation.step()
+        np.testing.assert_allclose(angular()[0], before, rtol=0, atol=1e-11 * size.sum())
+        rubbed = simulation.ledger.columns()["friction_work"]
+    assert rubbed > 0.05 * simulation.budget.total
+    simulation.destroy()
+
+
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
     """Two sheets lie crosswise on a slope and stick, so heavy that their edges touch; on one rank edges are

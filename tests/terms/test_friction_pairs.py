@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.terms import friction_pairs
-from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ def x() -> Array:
 
 @pytest.fixture
 def state(x: Array) -> tuple[Array, ...]:
-    """Pairs of which about half slide."""
+    """Pairs of which about half slide, some of them between sheets."""
     random = np.random.default_rng(1)
     stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
     beta = random.normal(size=(N, 4))
@@ -30,7 +30,13 @@ def state(x: Array) -> tuple[Array, ...]:
     start = np.einsum("ei,eik->ek", beta, x[stencil]) + 0.1 * random.normal(size=(N, 3))
     slip = 0.05 * random.normal(size=(N, 3))
     slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-    return stencil, beta, normal, start, slip, np.full(N, 3.0), np.full(N, 0.4)
+    turn = 0.3 * random.normal(size=(N, 4, 3))
+    turn -= np.einsum("eik,ek->ei", turn, normal)[:, :, None] * normal[:, None, :]
+    turn[:, 0] = -turn[:, 1:].sum(axis=1)
+    turn[::2] = 0.0
+    heights = np.einsum("eik,ek->ei", x[stencil], normal)
+    start += np.einsum("ei,eik->ek", heights, turn)
+    return stencil, beta, normal, turn, start, slip, np.full(N, 3.0), np.full(N, 0.4)
 
 
 def energies(x: Array, state: tuple[Array, ...]) -> Array:
@@ -80,11 +86,13 @@ def test_no_energy_is_above_that_of_regularised_springs(x: Array, state: tuple[A
 
 
 def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, state: tuple[Array, ...]) -> None:
-    stencil, beta, normal, _, _, _, limit = state
-    forces = gradient(x, state)[stencil] / beta[:, :, None]
+    stencil, beta, normal, turn, _, _, _, limit = state
+    gradients = gradient(x, state)[stencil]
+    along = np.einsum("eik,ek->ei", gradients, normal)
+    forces = (gradients - along[:, :, None] * normal[:, None, :]) / beta[:, :, None]
     np.testing.assert_allclose(forces, np.broadcast_to(forces[:, :1], forces.shape), atol=1e-12)
+    np.testing.assert_allclose(along, np.einsum("eik,ek->ei", turn, forces[:, 0]), atol=1e-12)
     size = np.linalg.norm(forces[:, 0], axis=1)
-    assert np.abs(np.sum(forces[:, 0] * normal, axis=1)).max() < 1e-12
     assert size.max() <= limit[0] * (1.0 + 1e-12)
     assert 5 < (size > 0.999 * limit[0]).sum() < N - 5
 
@@ -98,8 +106,9 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, state: tuple[Array, .
     np.testing.assert_allclose(size[slides], limit[slides] / stiffness[slides], rtol=1e-12)
     # what was put in is stored or heat
     np.testing.assert_allclose(0.5 * stiffness * size**2 + heat, before, rtol=1e-12)
-    start = np.einsum("ei,eik->ek", state[1], x[state[0]])
-    after = (*state[:3], start, *state[4:])
+    heights = np.einsum("eik,ek->ei", x[state[0]], state[2])
+    start = np.einsum("ei,eik->ek", state[1], x[state[0]]) + np.einsum("ei,eik->ek", heights, state[3])
+    after = (*state[:4], start, *state[5:])
     np.testing.assert_allclose(gradient(x, after), force, atol=1e-12)
 
 
@@ -121,3 +130,95 @@ def test_rounding_does_not_tell_which_of_two_sliding_pairs_goes_on() -> None:
     what[0, friction_pairs.SLIP] *= 1.01  # one that sticks still
     friction_pairs.find(key, among, what, place)
     assert place[0] == 0
+
+
+def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, ...]:
+    """Points (4 N, 3) and all that the kernels take of pairs of a vertex and a triangle, or of two edges, of
+    which some are nearest at a corner."""
+    points, kind = random.normal(size=(N, 4, 3)), np.where(np.arange(N) < N // 2, VERTEX_TRIANGLE, EDGE_EDGE)
+    part = random.uniform(size=(N, 2)) * np.where(np.arange(N) % 3 == 0, 0.0, 1.0)[:, None]
+    s, t = part[:, 0], part[:, 1]
+    before, crossed = (np.ones(N), s + 0.5 * t - 1.0, -s, -0.5 * t), (1.0 - s, s, t - 1.0, -t)
+    beta = np.where((kind == EDGE_EDGE)[:, None], np.stack(crossed, axis=1), np.stack(before, axis=1))
+    gap = np.einsum("ei,eik->ek", beta, points)
+    normal = gap / np.linalg.norm(gap, axis=1, keepdims=True)
+    turn = np.empty((N, 4, 3))
+    for e in range(N):
+        friction_pairs.frame(points[e], kind[e], normal[e], turn[e])
+    turn *= np.linalg.norm(gap, axis=1)[:, None, None]
+    stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
+    start = gap + np.einsum("eik,ek,eim->em", points, normal, turn)
+    slip = random.normal(size=(N, 3))
+    slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
+    return points.reshape(-1, 3), stencil, beta, normal, turn, start, slip, np.full(N, 3.0), np.full(N, 0.4)
+
+
+def test_two_sheets_that_turn_together_do_not_slip() -> None:
+    """To first order in the angle; and forces have neither a resultant nor a moment."""
+    random = np.random.default_rng(4)
+    x, *state = pairs_between_sheets(random)
+    pull = gradient(x, tuple(state)).reshape(N, 4, 3)
+    np.testing.assert_allclose(pull.sum(axis=1), 0.0, atol=1e-13 * np.abs(pull).max())
+    moments = np.cross(x.reshape(N, 4, 3), pull).sum(axis=1)
+    np.testing.assert_allclose(moments, 0.0, atol=1e-12 * np.abs(pull).max())
+    found = np.zeros((N, 3))
+    friction_pairs.add_moments(x, *state, found)
+    np.testing.assert_allclose(found, 0.0, atol=1e-12 * np.abs(pull).max())
+    farther = x + 0.01 * random.normal(size=x.shape)
+    pull = gradient(farther, tuple(state)).reshape(N, 4, 3)
+    friction_pairs.add_moments(farther, *state, found)
+    np.testing.assert_allclose(found, np.cross(farther.reshape(N, 4, 3), pull).sum(axis=1), atol=1e-10)
+    assert np.abs(found).max() > 1e-4
+    state[-3][:] = 0.0
+    limits = np.full(N, np.inf)
+    h, axis = 1e-6, np.array([0.6, 0.0, 0.8])
+    turned = x + np.cross(h * axis, x) + [0.1, 0.2, 0.3]
+    out = np.empty(N)
+    friction_pairs.energies(turned, *state[:-1], limits, out)
+    assert np.sqrt(out).max() < 1e-11
+    without = [*state[:3], np.zeros_like(state[3]), np.einsum("ei,eik->ek", state[1], x[state[0]])]
+    friction_pairs.energies(turned, *without, *state[5:7], limits, out)
+    assert np.sqrt(out).max() > 1e-7
+
+
+def test_without_a_lever_there_is_none() -> None:
+    """Nearly parallel edges, and a vertex beside a triangle, have a small one, and that on a line none."""
+    turn, up = np.empty((4, 3)), np.array([0.0, 0.0, 1.0])
+    edges = np.array([[-1.0, 0.0, 0.1], [1.0, 0.0, 0.1], [-1.0, -0.01, 0.0], [1.0, 0.01, 0.0]])
+    assert 0.0 < friction_pairs.frame(edges, EDGE_EDGE, up, turn) < 2e-4
+    assert np.isfinite(turn).all()
+    edges[:, 1] = 0.0
+    assert friction_pairs.frame(edges, EDGE_EDGE, up, turn) == 0.0
+    assert not turn.any()
+    triangle = np.array([[0.0, 0.0, 0.1], [0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
+    assert friction_pairs.frame(triangle, VERTEX_TRIANGLE, up, turn) == 0.0
+    triangle[3, 0] = 0.3
+    assert friction_pairs.frame(triangle, VERTEX_TRIANGLE, up, turn) == pytest.approx(0.06)
+
+
+def test_what_turns_with_an_edge_or_a_vertex_is_a_triangle_in_line_with_them() -> None:
+    """Of those that are the one with the lowest numbers, whatever their order; else the one most so."""
+    x = np.array([[0.2, 0.0, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, -1.0]])
+    triangles = [[1, 2, 3], [4, 2, 1], [2, 1, 5]]
+    cases = [
+        ({1: -0.8, 2: -0.2}, [1, 0], (0, 0, 1), 0),
+        ({1: -0.8, 2: -0.2}, [0, 1], (0, 0, 1), 0),
+        ({1: -0.8, 2: -0.2}, [2, 1, 0], (0, 0, 1), 0),
+        ({1: -0.8, 2: -0.2}, [1, 2], (0, 1, 0), 2),
+        ({2: -1.0}, [2, 1], (0, 0, 1), 1),
+        ({1: -0.5, 2: -0.3, 4: -0.2}, [0, 1], (0, 0, 1), 1),
+    ]
+    for share, order, normal, expected in cases:
+        rows = np.array([[0, *triangles[t]] for t in order], dtype=np.int64)
+        for first in range(len(order)):
+            if not set(share) <= set(rows[first]):
+                continue
+            beta = np.array([[1.0, *(share.get(v, 0.0) for v in rows[first, 1:])]])
+            at, flat = np.array([first]), np.zeros(len(order), dtype=np.int64)
+            towards = np.array([normal], dtype=float)
+            pairs = rows.astype(np.int32), rows, rows, flat + VERTEX_TRIANGLE, flat - 1
+            friction_pairs.choose(x, *pairs, beta, towards, at)
+            assert order[at[0]] == expected
+            assert dict(zip(rows[at[0]].tolist(), beta[0].tolist(), strict=True)) == {
+                **dict.fromkeys(rows[at[0]].tolist(), 0.0), 0: 1.0, **share,
+            }  # fmt: skip
