@@ -148,7 +148,9 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     """Give what slides the friction that it lacks, or take back what it had too much, by impulses; what all
     impulses of the step did; collective.
 
-    No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`.
+    No pair is turned round by more friction, nor more than twice as fast by less: both are at most its speed
+    times m of `_inverse_masses`. Friction of a light vertex that others press on an obstacle's edge is
+    balanced by them: all of it back would throw the vertex off.
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
@@ -157,13 +159,13 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     if not any(system.points.largest(float(np.abs(more).max(initial=0.0)))):
         return damped
     impulse = np.zeros_like(x)
-    inverse = _inverse_masses(system, [(points, beta, more > 0.0)])
+    inverse = _inverse_masses(system, [(points, beta, more != 0.0)])
     rows, of_sheet = np.maximum(points, 0), np.where(points >= 0, beta, 0.0)
     speed = np.einsum("ei,eik,ek->e", of_sheet, system.v[rows], along)
     speed -= np.einsum("ek,ek->e", moved, along) / dt
     most = np.where((of_sheet != 0.0)[:, :, None], inverse[rows], 0.0).max(axis=(1, 2), initial=0.0)
-    stops = np.divide(speed, dt * most, out=np.zeros_like(speed), where=most > 0.0)
-    force = -np.minimum(more, np.maximum(stops, 0.0))[:, None] * along
+    stops = np.divide(np.maximum(speed, 0.0), dt * most, out=np.zeros_like(speed), where=most > 0.0)
+    force = -np.clip(more, -stops, stops)[:, None] * along
     np.add.at(impulse, rows, dt * of_sheet[:, :, None] * force[:, None, :])
     work, on = float(np.vdot(force, moved)), obstacle >= 0
     pushed = _on_obstacles(system, points[on], beta[on], obstacle[on], force[on])
