@@ -43,7 +43,15 @@ def disc_of(angle: Array) -> tuple[Array, Ints]:
 
 
 def draped(
-    bench: Bench, start: Array, faces: Ints, rest: Array, material: dict[str, Any], seed: int
+    bench: Bench,
+    start: Array,
+    faces: Ints,
+    rest: Array,
+    material: dict[str, Any],
+    seed: int,
+    *,
+    gap: float = DRAPE_GAP,
+    speed: float = SPEED,
 ) -> Array:
     """Positions (V, 3) [m] of a cloth that rests on the disc; collective.
 
@@ -58,15 +66,19 @@ def draped(
         As in a scene.
     seed : int
         Of the noise of the start.
+    gap : float
+        Of the contact [m]; below the shortest edge.
+    speed : float
+        Of the fastest vertex [m/s], at which the cloth counts as at rest.
     """
     disc = {"mesh": bench.mesh(*disc_of(np.radians(np.linspace(0.0, 360.0, 49))))}
     content = {
-        "mesh": bench.mesh(start + [0.0, 0.0, 0.95 * DRAPE_GAP], faces, rest=rest),
+        "mesh": bench.mesh(start + [0.0, 0.0, 0.95 * gap], faces, rest=rest),
         "material": material,
         "time": {"end": STEP * STEPS, "step": STEP},
         "gravity": [0.0, 0.0, -G],
         "initial": {"noise": NOISE, "seed": seed},
-        "contact": {"gap": DRAPE_GAP, "friction": 0.3, "self": False},
+        "contact": {"gap": gap, "friction": 0.3, "self": False},
         "obstacles": {"disc": disc},
         # stiff sheets are slow to fold, but shorter steps cost more
         "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
@@ -75,7 +87,7 @@ def draped(
         while not trial.simulation.finished:
             trial.step()
             # by time, not by steps: those of stiff sheets are cut into many
-            if trial.simulation.time > 0.5 * STEP * STEPS and np.abs(trial.v).max() < SPEED:
+            if trial.simulation.time > 0.5 * STEP * STEPS and np.abs(trial.v).max() < speed:
                 break
         return trial.x
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -124,3 +125,22 @@ def quarter_disc(n: int, radius: float) -> tuple[Array, Ints]:
     """
     flat, faces = rectangle(n, n, 1.0, 1.0)
     return radius * rounded(flat), faces
+
+
+def rings(n: int) -> tuple[Array, Ints]:
+    """The disc of radius 1 about the origin: a centre and n rings of 6, 12, … 6 n vertices at equal angles.
+
+    All triangles are nearly equilateral.
+    """
+    vertices, faces = [np.zeros((1, 3))], []
+    first = [0, *(1 + 3 * k * (k + 1) for k in range(n))]  # vertex of each ring
+    for k in range(1, n + 1):
+        angle = np.arange(6 * k) * (math.pi / (3 * k))
+        vertices.append(np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) * (k / n))
+        sector, at = (i.ravel() for i in np.meshgrid(np.arange(6), np.arange(k), indexing="ij"))
+        outer, last, inside = sector * k + at, at == k - 1, max(6 * (k - 1), 1)
+        inner = sector * (k - 1) + at
+        a, b = first[k] + outer, first[k] + (outer + 1) % (6 * k)
+        c, d = first[k - 1] + inner % inside, first[k - 1] + (inner + 1) % inside
+        faces += [np.column_stack([a, b, c]), np.column_stack([c, b, d])[~last]]
+    return np.concatenate(vertices), np.concatenate(faces)

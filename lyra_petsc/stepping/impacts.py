@@ -148,9 +148,11 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     """Give what slides the friction that it lacks, or take back what it had too much, by impulses; what all
     impulses of the step did; collective.
 
-    No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`. Friction
-    has no moment where the step begins; what it and these impulses have of it elsewhere is taken back under
-    the midpoint rule, so that angular momentum stays as it is.
+    No pair is turned round by more friction, nor more than twice as fast by less: both are at most its speed
+    times m of `_inverse_masses`. Friction of a light vertex that others press on an obstacle's edge is
+    balanced by them: all of it back would throw the vertex off. Friction has no moment where the step begins;
+    what it and these impulses have of it elsewhere is taken back under the midpoint rule, so that angular
+    momentum stays as it is.
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
@@ -163,11 +165,11 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
         return damped
     impulse = np.zeros_like(x)
     size = np.linalg.norm(ways, axis=2)
-    inverse = _inverse_masses(system, [(points, size, more > 0.0)])
+    inverse = _inverse_masses(system, [(points, size, more != 0.0)])
     speed = np.einsum("eik,eik->e", system.v[points], ways) - np.einsum("ek,ek->e", moved, along) / dt
     most = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
-    stops = np.divide(speed, dt * most, out=np.zeros_like(speed), where=most > 0.0)
-    push = -np.minimum(more, np.maximum(stops, 0.0))
+    stops = np.divide(np.maximum(speed, 0.0), dt * most, out=np.zeros_like(speed), where=most > 0.0)
+    push = -np.clip(more, -stops, stops)
     force, impulses = push[:, None] * along, (dt * push)[:, None, None] * ways
     np.add.at(impulse, points, impulses)
     if system.integrator.by_stage:
