@@ -361,6 +361,8 @@ class StageEquations:
         if self.active.limiting and self.integrator.moves:
             from lyra_petsc.stepping import impacts  # of no use elsewhere
 
+            if self.stage.after < self.dt:  # what is met behind the stage has its energy from here on
+                self._follow(self._xs, self.x - self._xs, (1.0,))
             if not self.discretisation.near:
                 self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
                 return

@@ -85,3 +85,25 @@ def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
         x = shape(simulation)
     if (alone := end_on_one_rank(comm, scene, shared_tmp / "run", 20)) is not None:
         np.testing.assert_allclose(x, alone, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
+def test_what_is_met_behind_the_stage_has_its_energy_there(integrator: str) -> None:
+    """An automatic step from outside of the gap far into it is found out, not the one after it."""
+    content = {
+        "mesh": grid(0.3, 0.3, 8, 8, "alternating") | {"transform": {"translate": [-0.15, -0.15, 0.02]}},
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"gap": 0.003, "friction": 0.4},
+        "obstacles": {"floor": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}}},
+        "time": {"end": 0.6, "step": "auto", "tolerance": 1e-3, "integrator": integrator},
+    }
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(content))
+    while not simulation.finished:
+        simulation.step()
+    x, steps = simulation.problem.system.x.copy(), simulation.step_number
+    simulation.destroy()
+    assert steps < 150
+    assert (x[:, 2] > 0.0).all()
+    assert (x[:, 2] < 0.003).all()
