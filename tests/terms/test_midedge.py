@@ -742,6 +742,18 @@ def test_obtuse_corners_of_supports_are_noted(
     assert all(re.search(corner, note) for note in found)
 
 
+def test_reentrant_corners_of_supports_are_noted(tmp_path: Path) -> None:
+    flat, faces = rectangle(8, 8, 1.0, 1.0)
+    shape = faces[(flat[faces].mean(axis=1)[:, :2] < 0.5).any(axis=1)]
+    used, shape = np.unique(shape, return_inverse=True)
+    x, y = flat[used, 0], flat[used, 1]
+    mesh = obj_file(tmp_path / "ell.obj", np.column_stack([x, y, 0.0 * x]), shape.reshape(-1, 3))
+    within = (x > 0.0) & (y > 0.0) & (x < 1.0) & (y < 1.0) & ((x < 0.5) | (y < 0.5))
+    rim = [{"nodes": np.flatnonzero(~within).tolist(), "axes": ["z"]}]
+    (found,) = noted({"mesh": mesh, "material": THIN, "handles": rim}, "unbounded moments")
+    assert re.search("the corner of 270° .* to 0.0006 m", found)
+
+
 def test_a_polygon_for_a_disc_has_no_corners(tmp_path: Path) -> None:
     turns = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
     ring = np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
