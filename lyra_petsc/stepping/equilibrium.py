@@ -151,8 +151,17 @@ class Equilibrium:
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
         self._scale = self._norm(force)
-        if self._scale > floor:
+        if self._scale > floor and not self._unstable():
             system.applied.unbalanced = -force
+
+    def _unstable(self) -> bool:
+        """Whether the start shape would leave the forces that hold it, as a compressed one does; collective.
+
+        Where they were lessened step by step it would fold far away; let go at once it finds the next shape.
+        """
+        examination = Examination(self._system, self._spacing, self._size)
+        examination.destroy()
+        return examination.stability.stable is False
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""

@@ -29,9 +29,9 @@ LOCAL = 1.8
 NOTABLE = 0.03
 """Error of a vertex's displacement from which on it is noted."""
 
-UNRESOLVED = 0.065
-"""(h/L)^p from which on it is said that edges h at a corner are long for a sheet of size L: about 1 % of the
-deflection of skew plates of 30 and 60 degrees."""
+UNRESOLVED, REENTRANT = 0.065, 0.008
+"""(h/L)^p from which on it is said that edges h at a corner are long for a sheet of size L, below and beyond
+180 degrees: about 1 % of the deflection of skew plates of 30 and 60 degrees, and of an L."""
 
 
 def coarse(
@@ -157,7 +157,8 @@ def corners(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
     simple &= np.bincount(ends[~boundary & ~supported].ravel(), minlength=n) > 0  # no sheet held in its plane
     found = np.flatnonzero(simple & (opening > OBTUSE) & (turn > np.maximum(CORNER, 2.0 * nearby)))
     length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[found]
-    fine = np.sqrt(area.sum()) * UNRESOLVED ** (0.5 / np.abs(1.0 - np.pi / opening[found]))
+    part = np.where(opening[found] < np.pi, UNRESOLVED, REENTRANT)
+    fine = np.sqrt(area.sum()) * part ** (0.5 / np.abs(1.0 - np.pi / opening[found]))
     long = length > 1.5 * fine
     found, length, fine = (values[long] for values in (found, length, fine))
     if not len(found):

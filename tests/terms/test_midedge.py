@@ -518,6 +518,53 @@ def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
     assert energies[2] < 1e-3 * 0.5 * 0.25 * 0.25
 
 
+@pytest.mark.parametrize(("twist", "rolled"), [(0.8, True), (0.15, False)])
+def test_a_tape_spring_is_bistable(twist: float, rolled: bool, tmp_path: Path) -> None:
+    """Bent by κ across at rest it may also be rolled up by d12 κ / d11 along, if it resists twist enough.
+
+    At the start its chords are as much shorter as to fold it, were they let go little by little. S. D. Guest,
+    S. Pellegrino, Proceedings of the Royal Society A 462 (2006) 839-854.
+    """
+    bent, coupling, stiffness = 50.0, 0.7, 0.02
+    flat, faces = rectangle(16, 8, 0.12, 0.06, alternating=True)
+    radius = 1.0 / (coupling * bent)
+    turn = (flat[:, 0] - 0.06) / radius
+    start = np.column_stack([radius * np.sin(turn), flat[:, 1], radius * np.cos(turn)])
+    rows = [f"v {x} {y} {z}" for x, y, z in start.tolist()] + [f"vt {x} {y}" for x, y, *_ in flat.tolist()]
+    rows += ["f " + " ".join(f"{k}/{k}" for k in face) for face in (faces + 1).tolist()]
+    (tmp_path / "tape.obj").write_text("\n".join(rows) + "\n")
+    plate = {"d11": 1.0, "d22": 1.0, "d12": coupling, "d33": twist}
+    stretch = 12.0 / 4e-4**2
+    middle = 4 * 17 + 8
+    content = {
+        "mesh": {"file": str(tmp_path / "tape.obj")},
+        "material": {
+            "density": 0.5,
+            "membrane": {key.replace("d", "c"): stretch * stiffness * value for key, value in plate.items()},
+            "bending": {key: stiffness * value for key, value in plate.items()},
+            "rest_curvature": [0.0, -bent, 0.0],
+        },
+        "gravity": [0.0, 0.0, 0.0],
+        "handles": [
+            {"nodes": [middle]},
+            {"nodes": [middle + 1], "axes": ["y", "z"]},
+            {"nodes": [middle + 17], "axes": ["z"]},
+        ],
+        "time": {"analysis": "static", "step": 0.25},
+    }
+    run = Run(MPI.COMM_SELF, scene_of(content))
+    newton = 0
+    while not run.finished:
+        newton += run.step().newton_iterations
+    term = midedge_of(run)
+    found = term.curvatures(run.problem.system.x, term.frames)[:, :2].mean(axis=0)
+    expected = [-coupling * bent, 0.0] if rolled else [0.0, -bent]
+    np.testing.assert_allclose(found, expected, atol=6.0 if rolled else 0.1)  # free edges bend on
+    assert run.stability["stable"]
+    assert newton <= (30 if rolled else 400)
+    run.destroy()
+
+
 def fan(path: Path, *degrees: float, flat: bool = False) -> dict[str, Any]:
     """Triangles in such directions about the edge of vertices 0 and 1; ``flat``: at rest side by side."""
     angles = np.radians(degrees)
@@ -693,6 +740,18 @@ def test_obtuse_corners_of_supports_are_noted(
     found = noted(content | {"handles": [{"nodes": rim} | hold]}, "unbounded moments")
     assert len(found) == (1 if corner else 0)
     assert all(re.search(corner, note) for note in found)
+
+
+def test_reentrant_corners_of_supports_are_noted(tmp_path: Path) -> None:
+    flat, faces = rectangle(8, 8, 1.0, 1.0)
+    shape = faces[(flat[faces].mean(axis=1)[:, :2] < 0.5).any(axis=1)]
+    used, shape = np.unique(shape, return_inverse=True)
+    x, y = flat[used, 0], flat[used, 1]
+    mesh = obj_file(tmp_path / "ell.obj", np.column_stack([x, y, 0.0 * x]), shape.reshape(-1, 3))
+    within = (x > 0.0) & (y > 0.0) & (x < 1.0) & (y < 1.0) & ((x < 0.5) | (y < 0.5))
+    rim = [{"nodes": np.flatnonzero(~within).tolist(), "axes": ["z"]}]
+    (found,) = noted({"mesh": mesh, "material": THIN, "handles": rim}, "unbounded moments")
+    assert re.search("the corner of 270° .* to 0.0006 m", found)
 
 
 def test_a_polygon_for_a_disc_has_no_corners(tmp_path: Path) -> None:
