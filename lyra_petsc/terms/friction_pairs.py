@@ -44,8 +44,8 @@ UPRIGHT = 0.7
 FLAT = 1e-12
 """Product of the squared levers over the square of their sum below which there is none in some direction."""
 
-LAST = np.int64(np.iinfo(np.int64).max)
-"""No vertex has a higher number."""
+OBLIQUE = (0.54, 0.62, 0.57)
+"""A direction across which no mesh lies: numbers of vertices are others on other ranks."""
 
 EQUAL = 1e-6
 """Relative difference of squared lengths up to which which is longer is a matter of rounding."""
@@ -254,7 +254,7 @@ def slide(x, stencil, beta, normal, turn, start, slip, stiffness, limit, heat, s
 def choose(x, stencil, points, number, kind, obstacle, beta, normal, at):  # type: ignore[no-untyped-def]
     """Of pairs ``at`` (E,) between a vertex and an edge or vertex of a sheet take the one with the triangle
     around that whose plane turns with them, and its β (E, 4): one with a normal near theirs, and of these the
-    one with the lowest numbers, on any ranks.
+    one farthest along `OBLIQUE`, which is the same on any ranks.
     """
     ours = np.empty(4)
     for m in range(len(at)):
@@ -264,23 +264,20 @@ def choose(x, stencil, points, number, kind, obstacle, beta, normal, at):  # typ
             nearest += 1 if beta[m, i] != 0.0 else 0
         if kind[e] != VERTEX_TRIANGLE or obstacle[e] >= 0 or nearest == 3:
             continue
-        best, least, one = -1.0, LAST, e
+        best, farthest, one = -1.0, -math.inf, e
         begin = e
         while begin > 0 and _before_sheet(kind, obstacle, points, begin - 1, points[e, 0]):
             begin -= 1
         other = begin
         while other < len(kind) and _before_sheet(kind, obstacle, points, other, points[e, 0]):
-            common, lo, hi = 0, LAST, np.int64(-1)
+            common, far = 0, 0.0
             for i in range(1, 4):
-                here = _beta_of(number, beta, m, e, number[other, i])
-                if here != 0.0:
-                    common += 1
-                else:
-                    lo, hi = min(lo, number[other, i]), max(hi, number[other, i])
+                common += 1 if _beta_of(number, beta, m, e, number[other, i]) != 0.0 else 0
+                far += dot(OBLIQUE, point(x, stencil[other, i]))
             if common == nearest:
-                cosine, rest = _cosine(x, stencil, other, normal, m), (lo << 32) | hi
-                if (cosine > best and best < UPRIGHT) or (cosine >= UPRIGHT and rest < least):
-                    best, least, one = cosine, rest, other
+                cosine = _cosine(x, stencil, other, normal, m)
+                if (cosine > best and best < UPRIGHT) or (cosine >= UPRIGHT and far > farthest):
+                    best, farthest, one = cosine, far, other
             other += 1
         for i in range(4):
             ours[i] = beta[m, 0] if i == 0 else _beta_of(number, beta, m, e, number[one, i])
