@@ -44,8 +44,12 @@ UPRIGHT = 0.7
 FLAT = 1e-12
 """Product of the squared levers over the square of their sum below which there is none in some direction."""
 
-LAST = np.int64(np.iinfo(np.int64).max)
-"""No vertex has a higher number."""
+ON_EDGE = 1e-7
+"""Barycentric coordinate below which a place is on an edge: where meshes lie on each other in line, it is a
+matter of rounding in which triangle."""
+
+OBLIQUE = (0.54, 0.62, 0.57)
+"""A direction across which no mesh lies: numbers of vertices are others on other ranks."""
 
 EQUAL = 1e-6
 """Relative difference of squared lengths up to which which is longer is a matter of rounding."""
@@ -254,34 +258,32 @@ def slide(x, stencil, beta, normal, turn, start, slip, stiffness, limit, heat, s
 def choose(x, stencil, points, number, kind, obstacle, beta, normal, at):  # type: ignore[no-untyped-def]
     """Of pairs ``at`` (E,) between a vertex and an edge or vertex of a sheet take the one with the triangle
     around that whose plane turns with them, and its β (E, 4): one with a normal near theirs, and of these the
-    one with the lowest numbers, on any ranks.
+    one farthest along `OBLIQUE`, which is the same on any ranks.
     """
-    ours = np.empty(4)
+    ours, first, following = np.empty(4), np.full(len(x), -1), np.empty(len(kind), dtype=np.int64)
+    for e in range(len(kind)):  # pairs of a vertex with several patches are not next to each other
+        if kind[e] == VERTEX_TRIANGLE and obstacle[e] < 0:
+            row = Index(points[e, 0])
+            following[e], first[row] = first[row], e
     for m in range(len(at)):
         e = at[m]
-        nearest = 0
-        for i in range(1, 4):
-            nearest += 1 if beta[m, i] != 0.0 else 0
-        if kind[e] != VERTEX_TRIANGLE or obstacle[e] >= 0 or nearest == 3:
+        if kind[e] != VERTEX_TRIANGLE or obstacle[e] >= 0:
             continue
-        best, least, one = -1.0, LAST, e
-        begin = e
-        while begin > 0 and _before_sheet(kind, obstacle, points, begin - 1, points[e, 0]):
-            begin -= 1
-        other = begin
-        while other < len(kind) and _before_sheet(kind, obstacle, points, other, points[e, 0]):
-            common, lo, hi = 0, LAST, np.int64(-1)
+        nearest = _round_off(x, stencil, e, beta, normal, m)
+        if nearest == 3:
+            continue
+        best, farthest, one = -1.0, -math.inf, e
+        other = first[Index(points[e, 0])]
+        while other >= 0:
+            common, far = 0, 0.0
             for i in range(1, 4):
-                here = _beta_of(number, beta, m, e, number[other, i])
-                if here != 0.0:
-                    common += 1
-                else:
-                    lo, hi = min(lo, number[other, i]), max(hi, number[other, i])
+                common += 1 if _beta_of(number, beta, m, e, number[other, i]) != 0.0 else 0
+                far += dot(OBLIQUE, point(x, stencil[other, i]))
             if common == nearest:
-                cosine, rest = _cosine(x, stencil, other, normal, m), (lo << 32) | hi
-                if (cosine > best and best < UPRIGHT) or (cosine >= UPRIGHT and rest < least):
-                    best, least, one = cosine, rest, other
-            other += 1
+                cosine = _cosine(x, stencil, other, normal, m)
+                if (cosine > best and best < UPRIGHT) or (cosine >= UPRIGHT and far > farthest):
+                    best, farthest, one = cosine, far, other
+            other = following[other]
         for i in range(4):
             ours[i] = beta[m, 0] if i == 0 else _beta_of(number, beta, m, e, number[one, i])
         for i in range(4):
@@ -290,9 +292,26 @@ def choose(x, stencil, points, number, kind, obstacle, beta, normal, at):  # typ
 
 
 @leaf()
-def _before_sheet(kind, obstacle, points, e, vertex):  # type: ignore[no-untyped-def]
-    """Whether pair e is one of this vertex and a triangle of a sheet."""
-    return kind[e] == VERTEX_TRIANGLE and obstacle[e] < 0 and points[e, 0] == vertex
+def _round_off(x, stencil, e, beta, normal, m):  # type: ignore[no-untyped-def]
+    """Let what is `ON_EDGE` of the triangle of pair e be nearest to that, by β and the normal in row m; how
+    many vertices it is nearest to then.
+    """
+    largest, nearest, less = 1, 3, 0.0
+    for i in range(2, 4):
+        largest = i if abs(beta[m, i]) > abs(beta[m, largest]) else largest
+    for i in range(1, 4):
+        if abs(beta[m, i]) < ON_EDGE:
+            less, nearest, beta[m, i] = less + beta[m, i], nearest - 1, 0.0
+    if less != 0.0:
+        beta[m, largest] += less
+        gap = 0.0, 0.0, 0.0
+        for i in range(4):
+            b, there = beta[m, i], point(x, stencil[e, i])
+            gap = gap[0] + b * there[0], gap[1] + b * there[1], gap[2] + b * there[2]
+        length = math.sqrt(dot(gap, gap))
+        for k in range(3):
+            normal[m, k] = gap[k] / length
+    return nearest
 
 
 @leaf()

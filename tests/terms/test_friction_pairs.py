@@ -197,7 +197,7 @@ def test_without_a_lever_there_is_none() -> None:
 
 
 def test_what_turns_with_an_edge_or_a_vertex_is_a_triangle_in_line_with_them() -> None:
-    """Of those that are the one with the lowest numbers, whatever their order; else the one most so."""
+    """Of those that are the one farthest along a direction, whatever their order; else the one most so."""
     x = np.array([[0.2, 0.0, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, -1.0]])
     triangles = [[1, 2, 3], [4, 2, 1], [2, 1, 5]]
     cases = [
