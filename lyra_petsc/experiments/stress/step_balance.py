@@ -49,8 +49,9 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
 
-MOST_PANELS, NEAR_PANELS = 16, 256
-"""Of the integral along the hinges' way, and that of contact, which begins with a panel for half the gap."""
+MOST_PANELS, NEAR_PANELS = 16, (64, 1024)
+"""Of the integral along the hinges' way, and fewest and most of that of contact, or one for half the gap.
+With fewer, two values may agree by chance, as pairs with one feature become pairs with another."""
 
 SAMPLES, WIDEST_TURN = 9, 1.0
 """Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
@@ -113,8 +114,9 @@ def force_along(
     follows = comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN
     # a barrier is as wide as its gap; second derivatives leap where nearest points go from edge to triangle
     farthest, skin = largest(comm, dx[:n]), min((term.skin for term in near), default=0.0)
-    panels = max(MOST_PANELS, math.ceil(farthest / skin)) if skin > 0.0 else MOST_PANELS
-    for which, known, first, most in ((bent, follows, 1, MOST_PANELS), (near, True, panels, NEAR_PANELS)):
+    fewest, most_near = NEAR_PANELS
+    panels = max(fewest, math.ceil(farthest / skin)) if skin > 0.0 else fewest
+    for which, known, first, most in ((bent, follows, 1, MOST_PANELS), (near, True, panels, most_near)):
         if which:
             found = refined(which, first, most) if known else None
             if found is None:
