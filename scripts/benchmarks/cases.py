@@ -114,15 +114,16 @@ SHEETS = 5
 def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then the same
     with contact and nothing near (by ``semi-implicit`` steps, too), and one that falls over a ball; sheets
-    that swing, and as many in a stack on a plane, of the cloth as it is and a thousand times stiffer.
+    that swing, and as many in a stack on a plane, vertices on vertices and not, of the cloth as it is and a
+    thousand times stiffer.
     """
 
-    def sheets(number: int, apart: float) -> list[dict[str, Any]]:
+    def sheets(number: int, apart: float, aside: float = 0.0) -> list[dict[str, Any]]:
         grid = {"width": 1.0, "height": 1.0, "nx": cells_of(vertices // number), "pattern": "alternating"}
         grid["ny"] = grid["nx"]
         return [
-            {"grid": grid, "transform": {"translate": [-0.5, -0.5, apart * (layer + 0.95)]}}
-            for layer in range(number)
+            {"grid": grid, "transform": {"translate": [x - 0.5, 0.6 * x - 0.5, apart * (layer + 0.95)]}}
+            for layer, x in enumerate(aside * layer for layer in range(number))
         ]
 
     common = hanging_square(vertices, "beuler")
@@ -131,7 +132,7 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     ball = {"obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.31], "radius": 0.3}}}}
     floor = {"obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}}
     gap = 0.2 / cells_of(vertices // SHEETS)
-    one, several = sheets(1, 0.0), sheets(SHEETS, gap)
+    one, several, beside = sheets(1, 0.0), sheets(SHEETS, gap), {"mesh": sheets(SHEETS, gap, 1.55 * gap)}
     far = {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}}
     alone, near = {"mesh": one}, {"mesh": one, "contact": {"friction": 0.4}}
     once = held | {"time": common["time"] | {"integrator": "semi-implicit"}}
@@ -148,4 +149,5 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
         scenes[f"{SHEETS} swing{words}"] = stiffer | held
         touching = {"contact": {"gap": gap, "friction": 0.4}}
         scenes[f"{SHEETS} in a stack{words}"] = stiffer | free | floor | touching
+        scenes[f"{SHEETS} in a stack, not in line{words}"] = stiffer | free | floor | touching | beside
     return scenes
