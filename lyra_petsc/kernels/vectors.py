@@ -130,20 +130,26 @@ def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi:
     return types.void(blocks, places, out, lo, hi, factors), generate
 
 
-def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
-    """blocks[at // 2] += diagonal I + left rightᵀ, transposed where ``at`` is odd; nothing where negative."""
+def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) -> Any:
+    """blocks[at // 2] += diagonal I + Σ left rightᵀ, transposed where ``at`` is odd; nothing where negative.
+
+    ``pairs`` is a tuple of pairs of three numbers each, left and right.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks at diagonal left right")
-        at, begin = code.integer("at"), code.begin("blocks")
+        code = Code(context, builder, signature, arguments, "blocks at diagonal pairs")
+        at, begin, diagonal = code.integer("at"), code.begin("blocks"), code.given["diagonal"]
         with builder.if_then(code.is_ours(at), likely=True):
-            left, right = code.swapped(at, *(code.filled(code.numbers(name)) for name in ("left", "right")))
-            diagonal, (eight, ninth) = code.given["diagonal"], code.outer(left, right)
-            eight, ninth = code.plus(eight, code.identity(diagonal)), code.plus(ninth, diagonal)
+            products = [code.outer(*code.swapped(at, *pair)) for pair in code.pairs("pairs")]
+            eights, ninths = zip(*products, strict=True)
+            eight, ninth = (
+                reduce(code.plus, eights, code.identity(diagonal)),
+                reduce(code.plus, ninths, diagonal),
+            )
             code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), eight, ninth)
         return context.get_dummy_value()
 
-    return types.void(blocks, at, diagonal, left, right), generate
+    return types.void(blocks, at, diagonal, pairs), generate
 
 
 def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
@@ -260,7 +266,7 @@ def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
 gather: Any = intrinsic(_gather)
 gather_edges: Any = intrinsic(_gather_edges)
 add_corners: Any = intrinsic(_add_corners)
-add_outer: Any = intrinsic(_add_outer)
+add_outers: Any = intrinsic(_add_outers)
 add_six: Any = intrinsic(_add_six)
 add_triangle: Any = intrinsic(_add_triangle)
 fetch: Any = intrinsic(_fetch)

@@ -36,6 +36,8 @@ MISSING = -2
 def block_of(indptr, columns, row, column):  # type: ignore[no-untyped-def]
     """The number of a block, or `MISSING`."""
     lo, hi = indptr[row], indptr[row + 1]
+    if row == column:  # the first one, if there is one
+        hi = min(hi, lo + 1)
     while hi - lo > 1:
         middle = (lo + hi) // 2
         if columns[middle] <= column:

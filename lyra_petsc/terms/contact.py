@@ -147,8 +147,8 @@ class Meeting(NamedTuple):
     @property
     def stiffness(self) -> Array:
         """b″ times the square of the distance's gradient [N/m], (m,)."""
-        square: Array = np.sum(self.felt[:, :3] ** 2, axis=1)
-        return self.felt[:, 4] * square
+        found: Array = np.einsum("mk,mk,m->m", self.felt[:, :3], self.felt[:, :3], self.felt[:, 4])
+        return found
 
 
 _NONE = np.empty(0)

@@ -40,8 +40,8 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
-from lyra_petsc.kernels.vectors import add_outer
-from lyra_petsc.terms.hinge import cross, dot, minus
+from lyra_petsc.kernels.vectors import add_outers
+from lyra_petsc.terms.hinge import combined, cross, dot, minus, scaled
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
 """Kinds of pairs. A plane is a point p1 and a unit normal p2; a vertex inside keeps no more than a radius
@@ -661,7 +661,8 @@ def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met,
     ``met`` as of `add_gradient`; ``offsets`` (E, 10) as of `kernels.scatter`. No rows for obstacles.
     ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
     """
-    room = np.empty((4, 3)), np.empty((2, 4)), np.empty((2, 3)), np.empty((4, 4, 3, 3)), np.zeros(12)
+    p, across, gamma, e = np.empty((4, 3)), np.empty((4, 3)), np.empty((2, 4)), np.zeros((2, 3))
+    room = p, across, gamma, e, np.empty((4, 4, 3, 3)), np.zeros(12)
     blocks = values.reshape(-1, 9)
     for n in range(len(met[0])):
         fetch_ahead(met[0][Index(min(n + AHEAD, len(met[0]) - 1))], offsets, blocks, 10, 0)
@@ -681,7 +682,7 @@ def _add_hessian(  # type: ignore[no-untyped-def]
     factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
     if factor == 0.0 or not abs(g[3]) < np.inf:
         return
-    p, gamma, e, h, slope = room
+    p, across, gamma, e, h, slope = room
     first, edges = (1.0 - blend) * g[3], kind[pair] == EDGE_EDGE
     free = _free(kind[pair], b, gamma) if first != 0.0 else 0
     if free > 0 or edges:
@@ -690,7 +691,7 @@ def _add_hessian(  # type: ignore[no-untyped-def]
         _around_foot(p)
     _directions(gamma, p, free, e)
     if not edges or not _fades(p, parallel):
-        _add_outers(factor, points[pair], g, b, first, free, gamma, e, offsets[pair], blocks)
+        _add_outers(factor, points[pair], g, b, first, free, gamma, e, offsets[pair], across, blocks)
         return
     _hessian(g, b, first, free, gamma, e, h)
     delta = math.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2) - offset[pair]
@@ -726,55 +727,40 @@ def _inverse(free, e):  # type: ignore[no-untyped-def]
 
 
 @leaf()
-def _add_outers(factor, points, felt, beta, first, free, gamma, e, offsets, blocks):  # type: ignore[no-untyped-def]
+def _add_outers(factor, points, felt, beta, first, free, gamma, e, offsets, across, blocks):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add that of a pair which does not fade, as products of two vectors, to blocks (n_blocks, 9).
 
-    Where two coordinates are free the e_k span what is across g: I − Σ A⁻¹_kl e_k e_lᵀ is g gᵀ / |g|².
+    Where two coordinates are free the e_k span what is across g: I − Σ A⁻¹_kl e_k e_lᵀ is g gᵀ / |g|². Let
+    ``across`` (4, 3) be Σ A⁻¹_kl γ_ki e_l then, and β_i e + γ_i g where one is.
     """
     g = felt[0], felt[1], felt[2]
     second = factor * felt[4]
     first = factor * first
     a00, a01, a11 = _inverse(free, e)
-    along = second if free == 2 else second - first / (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-    e0, e1 = (e[0, 0], e[0, 1], e[0, 2]), (e[1, 0], e[1, 1], e[1, 2])
+    along = second if free == 2 else second - first / dot(g, g)
     for i in range(4):
-        b = beta[i]
-        if b == 0.0 or points[i] < 0:  # γ is 0, too, where β is
+        u, v, w = a00 * gamma[0, i] + a01 * gamma[1, i], a01 * gamma[0, i] + a11 * gamma[1, i], 0.0
+        if free == 1:
+            u, v, w = beta[i], 0.0, gamma[0, i]
+        for k in range(3):
+            across[i, k] = u * e[0, k] + v * e[1, k] + w * g[k]
+    for j in range(4):
+        c, q = beta[j], (across[j, 0], across[j, 1], across[j, 2])
+        if c == 0.0 or points[j] < 0:  # γ is 0, too, where β is
             continue
-        for j in range(i, 4):
-            c = beta[j]
-            if c == 0.0 or points[j] < 0:
+        for i in range(j + 1):
+            b, p = beta[i], (across[i, 0], across[i, 1], across[i, 2])
+            if b == 0.0 or points[i] < 0:
                 continue
-            to, both = offsets[(7 - i) * i // 2 + j], b * c
-            if to < 0:
-                continue
+            to, own = offsets[(7 - i) * i // 2 + j], b * c * along
             if free == 2:
-                p, q = gamma[0, i], gamma[1, i]
-                r, s = gamma[0, j], gamma[1, j]
-                mixed = p * (a00 * r + a01 * s) + q * (a01 * r + a11 * s)
-                own = both * along - first * mixed
-                u, v = -first * b * (a00 * r + a01 * s), -first * b * (a01 * r + a11 * s)
-                left = (
-                    own * g[0] + u * e0[0] + v * e1[0],
-                    own * g[1] + u * e0[1] + v * e1[1],
-                    own * g[2] + u * e0[2] + v * e1[2],
-                )
-                add_outer(blocks, to, 0.0, left, g)
-                u, v = -first * c * (a00 * p + a01 * q), -first * c * (a01 * p + a11 * q)
-                right = u * e0[0] + v * e1[0], u * e0[1] + v * e1[1], u * e0[2] + v * e1[2]
-                add_outer(blocks, to, 0.0, g, right)
-                continue
-            own = both * along
-            add_outer(blocks, to, both * first, (own * g[0], own * g[1], own * g[2]), g)
-            if free == 1:
-                p, r, less = gamma[0, i], gamma[0, j], -first * a00
-                left = (
-                    less * (b * e0[0] + p * g[0]),
-                    less * (b * e0[1] + p * g[1]),
-                    less * (b * e0[2] + p * g[2]),
-                )
-                right = c * e0[0] + r * g[0], c * e0[1] + r * g[1], c * e0[2] + r * g[2]
-                add_outer(blocks, to, 0.0, left, right)
+                own -= first * dot(p, q)
+                left = combined(own, g, -first * b, q)
+                add_outers(blocks, to, 0.0, ((left, g), (g, scaled(-first * c, p))))
+            elif free == 1:
+                add_outers(blocks, to, b * c * first, ((scaled(own, g), g), (scaled(-first * a00, p), q)))
+            else:
+                add_outers(blocks, to, b * c * first, ((scaled(own, g), g),))
 
 
 @leaf()

@@ -41,9 +41,6 @@ HEAT = np.arange(3) == WORK
 PAID = 0.25
 """Part of that which is made up for in a step: all at once would make friction tremble."""
 
-SLIP = 5
-"""Place of the elastic parts of the ways among what the kernels take."""
-
 ELASTIC = 0.01
 """Part of the gap that a pair which sticks may go before it slides, at most. Where less holds what slides
 than what sticks, all go as far: if what is pressed least, as a sheet's border, slid before the rest, the
@@ -143,9 +140,9 @@ class CoulombFriction(Elastic):
         super().take(elements)
         what = elements.data["what"].reshape(-1, COLUMNS)
         n = len(what)
-        self._beta, vectors, self._turn = np.empty((n, 4)), np.empty((4, n, 3)), np.empty((n, 4, 3))
-        self._normal, self._still, self._slip, self._foot = vectors
-        taken = self._beta, self._normal, self._turn, self._still, self._slip, self._foot
+        self._beta, self._tangents, self._ways = np.empty((n, 4)), np.empty((n, 2, 3)), np.empty((n, 2, 4, 3))
+        self._still, self._slip, self._foot = np.empty((n, 2)), np.empty((n, 3)), np.empty((n, 3))
+        taken = self._beta, self._tangents, self._ways, self._still, self._slip, self._foot
         friction_pairs.unpack(what, *taken)
         self._obstacle = what[:, 1].astype(np.int64)
         of_vertex = (what[:, 0] != EDGE_EDGE) & (what[:, 2] == 0.0)
@@ -227,20 +224,25 @@ class CoulombFriction(Elastic):
         now = obstacles.at(step.at) if obstacles.moving else places
         return ObstacleMoves(step.end, part, stage, end, now, places)
 
-    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
-        """What the kernels take, with obstacles moved so, and what sticks to them."""
-        start, slip = self._still, self._slip
+    def _along(self, vectors: Array, of: Any = slice(None)) -> Array:
+        """Components (n, 2) of vectors (n, 3) across the normals of some pairs."""
+        found: Array = np.einsum("eck,ek->ec", self._tangents[of], vectors)
+        return found
+
+    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[tuple[NDArray[Any], ...], Array]:
+        """What the kernels take, with obstacles moved so, and what sticks to them; the elastic parts."""
+        still, slip = self._still, self._slip
         for obstacle, (rotation, translation) in enumerate(moved):
             if not translation.any() and (rotation == np.eye(3)).all():
                 continue
-            mine, foot = self._obstacle == obstacle, self._foot
-            if start is self._still:
-                start, slip = start.copy(), slip.copy()
-            side, foot = self._beta[mine].sum(axis=1), foot[mine]
-            start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
-            slip[mine] = slip[mine] @ rotation.T
-        state = self._beta, self._normal, self._turn, start, slip, self._spring, self._limit
-        return self.stencil, *state
+            if still is self._still:
+                still, slip = still.copy(), slip.copy()
+            mine = self._obstacle == obstacle
+            side, foot, before = self._beta[mine].sum(axis=1), self._foot[mine], slip[mine]
+            slip[mine] = before @ rotation.T
+            way = side[:, None] * (foot @ rotation.T + translation - foot)
+            still[mine] += self._along(slip[mine] - before - way, mine)
+        return (self.stencil, self._ways, still, self._spring, self._limit), slip
 
     def _at_stage(self, frozen: ObstacleMoves) -> tuple[NDArray[Any], ...]:
         """The same for positions of the stage, a part a of the way to the end: a D, with D there, has the
@@ -248,12 +250,20 @@ class CoulombFriction(Elastic):
         """
         if self._of is not frozen:
             self._of, part = frozen, frozen.part
-            stencil, beta, normal, turn, start, slip, spring, limit = self._state(frozen.stage)
+            (stencil, ways, still, spring, limit), _ = self._state(frozen.stage)
             if part != 1.0:
-                start = start + (1.0 / part - 1.0) * self._still
-                beta, turn, spring, limit = beta / part, turn / part, part * spring, part * limit
-            self._stage = stencil, beta, normal, turn, start, slip, spring, limit
+                still = still + (1.0 / part - 1.0) * (self._still - self._along(self._slip))
+                ways, spring, limit = ways / part, part * spring, part * limit
+            self._stage = stencil, ways, still, spring, limit
         return self._stage
+
+    def _slid(
+        self, x: Array, state: tuple[NDArray[Any], ...], slip: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The elastic parts of the ways at positions x (n_local, 3), what sliding takes [J], which slide."""
+        slip, heat, slides = slip.copy(), np.empty(len(slip)), np.empty(len(slip), dtype=np.bool_)
+        friction_pairs.slide(x, *state, self._tangents, slip, heat, slides)
+        return slip, heat, slides
 
     def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
         out = np.empty(self.n_owned)
@@ -268,14 +278,12 @@ class CoulombFriction(Elastic):
         # by forces: an obstacle goes many times as far as what sticks, over which energies tell nothing
         work = 0.0
         if self._contact.obstacles.moving and self.n_elements:
-            _, _, _, _, before, *_ = self._at_stage(frozen[0])
-            _, _, _, _, after, *_ = self._at_stage(frozen[1])
+            (_, _, before, *_), (_, _, after, *_) = (self._at_stage(at) for at in frozen)
             for x, at in zip(ends, frozen, strict=True):
-                stencil, beta, normal, _, start, slip, spring, limit = self._at_stage(at)
-                u = np.einsum("ei,eik->ek", beta, x[stencil]) - start
-                u += slip - np.einsum("ek,ek->e", u, normal)[:, None] * normal
+                stencil, ways, still, spring, limit = self._at_stage(at)
+                u = np.einsum("ecik,eik->ec", ways, x[stencil]) + still
                 pull = np.minimum(spring, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))[:, None] * u
-                work -= 0.5 * float(np.vdot(pull[: self.n_owned], (after - before)[: self.n_owned]))
+                work += 0.5 * float(np.vdot(pull[: self.n_owned], (after - before)[: self.n_owned]))
         return work
 
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
@@ -301,10 +309,8 @@ class CoulombFriction(Elastic):
         """How many pairs that this rank counts stick and slide at positions x (n_local, 3), and the sum of
         the normal forces [N] that they are given in the step.
         """
-        mine, state = slice(self.n_owned), list(self._at_stage(frozen))
-        state[SLIP] = state[SLIP].copy()
-        heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
-        friction_pairs.slide(x, *state, heat, slides)
+        mine, state = slice(self.n_owned), self._at_stage(frozen)
+        *_, slides = self._slid(x, state, self._slip)
         sliding = float(np.count_nonzero(slides[mine]))
         return self.n_owned - sliding, sliding, float(self._force[mine].sum())
 
@@ -318,12 +324,9 @@ class CoulombFriction(Elastic):
             self._on_obstacles = np.zeros_like(self._on_obstacles)
             self._renew(x, frozen.places, self._known)
             return
-        heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
-        state = list(self._state(frozen.end))
-        self._on_obstacles = self._forces(x, tuple(state))
-        # forces stay those of the step until there are other pairs
-        state[SLIP] = slip = state[SLIP].copy()
-        friction_pairs.slide(x, *state, heat, slides)
+        state, slip = self._state(frozen.end)
+        self._on_obstacles = self._forces(x, state)
+        slip, heat, slides = self._slid(x, state, slip)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
         old = self._known.what.copy()
@@ -333,12 +336,11 @@ class CoulombFriction(Elastic):
     def rubbing(
         self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
     ) -> Rubbing:
-        contact, state = self._contact, list(self._state(frozen.end))
+        contact = self._contact
         *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
-        vertex, slides = contact.vertex_of(at), np.empty(self.n_elements, dtype=np.bool_)
+        vertex = contact.vertex_of(at)
         on = (vertex >= 0) & (sheets | (contact.obstacle[at] >= 0))
-        state[SLIP] = slip = state[SLIP].copy()
-        friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
+        slip, _, slides = self._slid(x, *self._state(frozen.end))
         led = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
         rub = led[slides[led]]
         # normal forces on vertices: that acted, that pairs were given, and those among them that slide
@@ -358,9 +360,7 @@ class CoulombFriction(Elastic):
         points, beta, obstacle = self.stencil[rub], self._beta[rub], self._obstacle[rub]
         length = np.linalg.norm(slip[rub], axis=1, keepdims=True)
         along = np.divide(slip[rub], length, out=np.zeros((len(rub), 3)), where=length > 0.0)
-        ways = beta[:, :, None] * along[:, None, :]
-        couple = np.einsum("eik,ek->ei", self._turn[rub], along)
-        ways += couple[:, :, None] * self._normal[rub][:, None, :]
+        ways = np.einsum("ec,ecim->eim", self._along(along, rub), self._ways[rub])
         more = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
         moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
         return Rubbing(points, beta, along, ways, more, obstacle, moved)
@@ -378,10 +378,7 @@ class CoulombFriction(Elastic):
 
     def lagging(self, x: Array, frozen: ObstacleMoves) -> dict[str, Array]:
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
-        state, count = list(self._state(frozen.end)), len(names)
-        state[SLIP] = slip = state[SLIP].copy()
-        slides = np.empty(self.n_elements, dtype=np.bool_)
-        friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
+        (slip, _, slides), count = self._slid(x, *self._state(frozen.end)), len(names)
         mine, pull = slice(self.n_owned), self._spring * np.linalg.norm(slip, axis=1)
         *_, force, at = self._contact.touching(x, frozen.places, self._contact.n_owned)
 

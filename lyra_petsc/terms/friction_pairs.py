@@ -9,8 +9,12 @@ c and h_i what the sum and n · x_i were; of an obstacle that moves c is what it
 and d_i = 0. Between sheets the second sum takes away that they turn together: n does so with the triangle
 or with both edges, which tell the vectors d_i across n (`frame`). Nearest points are a distance apart;
 without it any rotation would be a slip, and forces at them would have a moment. With it forces have none
-where the state was accepted. Up to the force μ N the pair sticks like a spring of stiffness k, beyond it
-slides. The potential of this force is convex::
+where the state was accepted. In a step u is known by its components along two unit vectors t_c across n::
+
+    u_c = Σ w_ci · x_i + still_c,  w_ci = β_i t_c + (d_i · t_c) n
+
+Up to the force μ N the pair sticks like a spring of stiffness k, beyond it slides. The potential of this
+force is convex::
 
     D = ½ k |u|²  for k |u| ≤ μ N,  else  μ N |u| − (μ N)² / 2k
 
@@ -27,9 +31,9 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import fetch_ahead
-from lyra_petsc.kernels.vectors import add_outer
+from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.hinge import cross, dot, minus, point
+from lyra_petsc.terms.hinge import combined, cross, dot, minus, point
 
 SLIP, SLID, BETA, NORMAL, START, FOOT, FORCE, GRIP, TURN, COLUMNS = 6, 9, 10, 14, 17, 20, 23, 24, 25, 34
 """Where each begins in a row of what is known of pairs, `friction.Pairs`, and how long it is."""
@@ -98,160 +102,121 @@ def frame(p, kind, n, turn):  # type: ignore[no-untyped-def]
 
 
 @leaf()
-def _height(x, stencil, normal, e, i):  # type: ignore[no-untyped-def]
-    """How far vertex i of pair e is along n beyond its first vertex."""
-    one, other, out = Index(stencil[e, i]), Index(stencil[e, 0]), 0.0
-    for k in range(3):
-        out += normal[e, k] * (x[one, k] - x[other, k])
-    return out
+def _tangents(n):  # type: ignore[no-untyped-def]
+    """Two unit vectors across n and each other.
+
+    Duff, Burgess, Christensen, Hery, Kensler, Liani & Villemin, Building an orthonormal basis, revisited,
+    Journal of Computer Graphics Techniques 6 (2017) 1-8.
+    """
+    sign = math.copysign(1.0, n[2])
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    return (1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), (b, sign + n[1] * n[1] * a, -n[1])
 
 
 @leaf()
-def _turns(turn, e):  # type: ignore[no-untyped-def]
-    """Whether the turning of pair e is none of its way: where it touches no obstacle."""
-    return turn[e, 3, 0] != 0.0 or turn[e, 3, 1] != 0.0 or turn[e, 3, 2] != 0.0
+def _way(x, e, stencil, ways, still):  # type: ignore[no-untyped-def]
+    """The components of u of pair e, and |u|."""
+    one, other = still[e, 0], still[e, 1]
+    for i in range(4):
+        row = Index(stencil[e, i])
+        for k in range(3):
+            one += ways[e, 0, i, k] * x[row, k]
+            other += ways[e, 1, i, k] * x[row, k]
+    return one, other, math.sqrt(one * one + other * other)
 
 
 @leaf()
-def _turn_of(turn, e, i):  # type: ignore[no-untyped-def]
-    """d_i of pair e."""
-    return turn[e, i, 0], turn[e, i, 1], turn[e, i, 2]
+def _pull(x, e, stencil, ways, still, stiffness, limit):  # type: ignore[no-untyped-def]
+    """∂D/∂u [N] of pair e, its components."""
+    one, other, size = _way(x, e, stencil, ways, still)
+    factor = stiffness[e] if stiffness[e] * size <= limit[e] else limit[e] / size
+    return factor * one, factor * other
 
 
 @leaf()
-def way(x, e, stencil, beta, normal, turn, start, slip, u):  # type: ignore[no-untyped-def]
-    """u of pair e into u (3,); |u|."""
-    along = 0.0
-    for k in range(3):
-        at = -start[e, k]
-        for i in range(4):
-            at += beta[e, i] * x[Index(stencil[e, i]), k]
-        u[k] = at
-        along += normal[e, k] * at
-    if _turns(turn, e):
-        for i in range(1, 4):
-            height = _height(x, stencil, normal, e, i)
-            for k in range(3):
-                u[k] += turn[e, i, k] * height
-    square = 0.0
-    for k in range(3):
-        u[k] += slip[e, k] - along * normal[e, k]
-        square += u[k] * u[k]
-    return math.sqrt(square)
+def _of(ways, e, component, i):  # type: ignore[no-untyped-def]
+    """w of a component and vertex i of pair e."""
+    return ways[e, component, i, 0], ways[e, component, i, 1], ways[e, component, i, 2]
 
 
 @kernel()
-def energies(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+def energies(x, stencil, ways, still, stiffness, limit, out):  # type: ignore[no-untyped-def]
     """D [J] of the first len(out) pairs."""
-    u = np.empty(3)
     for e in range(len(out)):
-        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
+        _, _, size = _way(x, e, stencil, ways, still)
         k, most = stiffness[e], limit[e]
-        out[e] = 0.5 * k * m * m if k * m <= most else most * (m - 0.5 * most / k)
+        out[e] = 0.5 * k * size * size if k * size <= most else most * (size - 0.5 * most / k)
 
 
 @kernel()
-def add_gradient(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, stencil, ways, still, stiffness, limit, out):  # type: ignore[no-untyped-def]
     """Add the gradient [N] to rows of out (n_local, 3)."""
-    u = np.empty(3)
     for e in range(len(stencil)):
-        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
-        factor = stiffness[e] if stiffness[e] * m <= limit[e] else limit[e] / m
-        turns = _turns(turn, e)
+        one, other = _pull(x, e, stencil, ways, still, stiffness, limit)
         for i in range(4):
-            row, couple = Index(stencil[e, i]), 0.0
-            if turns:
-                couple = factor * dot(_turn_of(turn, e, i), u)
+            row = Index(stencil[e, i])
             for k in range(3):
-                out[row, k] += factor * beta[e, i] * u[k] + couple * normal[e, k]
+                out[row, k] += one * ways[e, 0, i, k] + other * ways[e, 1, i, k]
 
 
 @kernel()
-def add_moments(x, stencil, beta, normal, turn, start, slip, stiffness, limit, out):  # type: ignore[no-untyped-def]
+def add_moments(x, stencil, ways, still, stiffness, limit, out):  # type: ignore[no-untyped-def]
     """Add the moments [N m] of the gradients of pairs between sheets to out (E, 3)."""
-    u = np.empty(3)
     for e in range(len(stencil)):
-        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
-        factor = stiffness[e] if stiffness[e] * m <= limit[e] else limit[e] / m
-        pull = factor * u[0], factor * u[1], factor * u[2]
-        n, foot = (normal[e, 0], normal[e, 1], normal[e, 2]), point(x, stencil[e, 0])
+        one, other = _pull(x, e, stencil, ways, still, stiffness, limit)
+        foot = point(x, stencil[e, 0])
         for i in range(1, 4):
-            arm, couple = minus(point(x, stencil[e, i]), foot), dot(_turn_of(turn, e, i), pull)
-            b = beta[e, i]
-            force = b * pull[0] + couple * n[0], b * pull[1] + couple * n[1], b * pull[2] + couple * n[2]
-            moment = cross(arm, force)
+            force = combined(one, _of(ways, e, 0, i), other, _of(ways, e, 1, i))
+            moment = cross(minus(point(x, stencil[e, i]), foot), force)
             for k in range(3):
                 out[e, k] += moment[k]
 
 
 @kernel()
-def add_hessians(  # type: ignore[no-untyped-def]
-    x, stencil, beta, normal, turn, start, slip, stiffness, limit, weight, blend, offsets, values
-):  # fmt: skip
+def add_hessians(x, stencil, ways, still, stiffness, limit, weight, blend, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add weight (E,) times the Hessians [N/m], all positive semidefinite, to block rows values (n, 3, 3).
 
     ``offsets`` (E, 10) as of `kernels.scatter`. ``blend`` 0 is exact; 1 takes a spring of the stiffness
     μ N / |u| for what slides, whose energy is nowhere less.
     """
-    u, blocks = np.empty(3), values.reshape(-1, 9)
+    blocks = values.reshape(-1, 9)
     for e in range(len(stencil)):
         fetch_ahead(e, offsets, blocks, 10)
-        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
-        pair = e, m, u, beta, normal, turn, stiffness[e], limit[e], weight[e]
-        _add_hessian(*pair, blend, offsets, blocks)
-
-
-@leaf()
-def _add_hessian(e, m, u, beta, normal, turn, stiffness, limit, weight, blend, offsets, blocks):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Add that of pair e with the way u (3,), of length m, to blocks (n_blocks, 9)."""
-    sticks = stiffness * m <= limit
-    factor = stiffness if sticks else limit / m
-    less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
-    n, along, turns = (normal[e, 0], normal[e, 1], normal[e, 2]), (u[0], u[1], u[2]), _turns(turn, e)
-    for a in range(4):
-        for b in range(a, 4):
-            both, to = weight * beta[e, a] * beta[e, b], offsets[e, (7 - a) * a // 2 + b]
-            if turns:
-                c, d = weight * beta[e, a], weight * beta[e, b]
-                f, g = _turn_of(turn, e, a), _turn_of(turn, e, b)
-                own = factor * (weight * dot(f, g) - both)
-                left = (
-                    factor * c * g[0] + own * n[0],
-                    factor * c * g[1] + own * n[1],
-                    factor * c * g[2] + own * n[2],
-                )
-                add_outer(blocks, to, factor * both, left, n)
-                add_outer(blocks, to, 0.0, n, (factor * d * f[0], factor * d * f[1], factor * d * f[2]))
-                if less != 0.0:
-                    p, q = weight * dot(f, along), dot(g, along)
-                    c, d = -less * c, beta[e, b]
-                    p *= -less
-                    left = c * u[0] + p * n[0], c * u[1] + p * n[1], c * u[2] + p * n[2]
-                    right = d * u[0] + q * n[0], d * u[1] + q * n[1], d * u[2] + q * n[2]
-                    add_outer(blocks, to, 0.0, left, right)
+        one, other, size = _way(x, e, stencil, ways, still)
+        sticks = stiffness[e] * size <= limit[e]
+        factor = weight[e] * (stiffness[e] if sticks else limit[e] / size)
+        less = 0.0 if sticks else (1.0 - blend) * factor / (size * size)
+        across, mixed, along = factor - less * one * one, -less * one * other, factor - less * other * other
+        for b in range(4):
+            v, w = _of(ways, e, 0, b), _of(ways, e, 1, b)
+            if dot(v, v) == 0.0 and dot(w, w) == 0.0:  # a point of an obstacle
                 continue
-            if both == 0.0:
-                continue
-            own, by = both * factor, -both * less
-            add_outer(blocks, to, own, (-own * n[0], -own * n[1], -own * n[2]), n)
-            if by != 0.0:
-                add_outer(blocks, to, 0.0, (by * u[0], by * u[1], by * u[2]), along)
+            right, other_right = combined(across, v, mixed, w), combined(mixed, v, along, w)
+            for a in range(b + 1):
+                pairs = (_of(ways, e, 0, a), right), (_of(ways, e, 1, a), other_right)
+                add_outers(blocks, offsets[e, (7 - a) * a // 2 + b], 0.0, pairs)
 
 
 @kernel()
-def slide(x, stencil, beta, normal, turn, start, slip, stiffness, limit, heat, slides):  # type: ignore[no-untyped-def]
-    """Let ``slip`` be the elastic part of u; the work [J] that sliding takes and whether pairs do, (E,)."""
-    u = np.empty(3)
+def slide(x, stencil, ways, still, stiffness, limit, tangents, slip, heat, slides):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Let ``slip`` (E, 3), what has gone into ``still``, be the elastic part of u; the work [J] that sliding
+    takes and whether pairs do, (E,).
+    """
     for e in range(len(stencil)):
-        m = way(x, e, stencil, beta, normal, turn, start, slip, u)
-        elastic = limit[e] / stiffness[e]
-        heat[e], slides[e] = 0.0, m > elastic
-        if m > elastic:
-            heat[e] = limit[e] * (m - elastic)
+        one, other, size = _way(x, e, stencil, ways, still)
+        u, elastic = (one, other), limit[e] / stiffness[e]
+        heat[e], slides[e] = 0.0, size > elastic
+        for c in range(2):
+            before = 0.0
             for k in range(3):
-                u[k] *= elastic / m
-        for k in range(3):
-            slip[e, k] = u[k]
+                before += tangents[e, c, k] * slip[e, k]
+            for k in range(3):
+                slip[e, k] += (u[c] - before) * tangents[e, c, k]
+        if size > elastic:
+            heat[e] = limit[e] * (size - elastic)
+            for k in range(3):
+                slip[e, k] *= elastic / size
 
 
 @kernel()
@@ -399,18 +364,30 @@ def describe(x, stencil, points, keys, touching, same, old, what):  # type: igno
 
 
 @kernel()
-def unpack(what, beta, normal, turn, start, slip, foot):  # type: ignore[no-untyped-def]
-    """Columns of what (E, 34) into arrays of their own, (E, 4) and (E, 3)."""
+def unpack(what, beta, tangents, ways, still, slip, foot):  # type: ignore[no-untyped-def]
+    """What the kernels take of rows of what (E, 34): β (E, 4), t (E, 2, 3), w (E, 2, 4, 3), still (E, 2), ξ
+    and where an obstacle is touched (E, 3).
+    """
     for e in range(len(what)):
+        n = what[e, NORMAL], what[e, NORMAL + 1], what[e, NORMAL + 2]
+        across = _tangents(n)
         for i in range(4):
             beta[e, i] = what[e, BETA + i]
         for k in range(3):
-            normal[e, k], start[e, k] = what[e, NORMAL + k], what[e, START + k]
             slip[e, k], foot[e, k] = what[e, SLIP + k], what[e, FOOT + k]
-            turn[e, 0, k] = 0.0
-            for i in range(1, 4):
-                turn[e, i, k] = what[e, TURN + 3 * i - 3 + k]
-                turn[e, 0, k] -= turn[e, i, k]
+        for c in range(2):
+            t, couples, still[e, c] = across[c], 0.0, 0.0
+            for k in range(3):
+                tangents[e, c, k] = t[k]
+                still[e, c] += t[k] * (slip[e, k] - what[e, START + k])
+            for i in range(3, -1, -1):
+                couple = -couples  # of all d_i together there is none
+                if i > 0:
+                    at = TURN + 3 * i - 3
+                    couple = t[0] * what[e, at] + t[1] * what[e, at + 1] + t[2] * what[e, at + 2]
+                couples += couple
+                for k in range(3):
+                    ways[e, c, i, k] = beta[e, i] * t[k] + couple * n[k]
 
 
 @leaf()

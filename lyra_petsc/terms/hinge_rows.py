@@ -17,7 +17,7 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
-from lyra_petsc.kernels.vectors import add_outer, add_six, fetch
+from lyra_petsc.kernels.vectors import add_outers, add_six, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.hinge_forces import limits_of
@@ -95,7 +95,7 @@ def add_across(  # type: ignore[no-untyped-def]
         areas = shape[one, 6] * shape[two, 6]
         left = scaled(stiffness * square * square / areas, (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]
-        add_outer(values, across[h], 0.0, left, right)
+        add_outers(values, across[h], 0.0, ((left, right),))
 
 
 @kernel(inline="always")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.vectors import add_outer
+from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.term import Offsets
 
@@ -118,4 +118,4 @@ def _add_stiffness(at, points, beta, normal, stiffness, offsets, values):  # typ
             for b in range(a, 4):
                 own, to = stiffness[m] * beta[m, a] * beta[m, b], offsets[at[m], (7 - a) * a // 2 + b]
                 if own != 0.0 and points[m, a] >= 0 and points[m, b] >= 0 and to >= 0:
-                    add_outer(blocks, to, 0.0, (own * n[0], own * n[1], own * n[2]), n)
+                    add_outers(blocks, to, 0.0, (((own * n[0], own * n[1], own * n[2]), n),))

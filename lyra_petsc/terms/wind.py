@@ -19,7 +19,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
-from lyra_petsc.kernels.vectors import add_outer
+from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
@@ -95,7 +95,7 @@ def add_hessian(v, s, area, n, wind, density, drag, offsets, values):  # type: i
         right = n[e, 0], n[e, 1], n[e, 2]
         left = along * right[0], along * right[1], along * right[2]
         for pair in range(6):
-            add_outer(values, offsets[e, pair], across, left, right)
+            add_outers(values, offsets[e, pair], across, ((left, right),))
 
 
 class Wind(Viscous):

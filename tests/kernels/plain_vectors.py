@@ -74,16 +74,17 @@ def scatter_edges(blocks, places, out, lo, hi, factors):  # type: ignore[no-unty
 
 
 @plain
-def add_outer(blocks, at, diagonal, left, right):  # type: ignore[no-untyped-def]
+def add_outers(blocks, at, diagonal, pairs):  # type: ignore[no-untyped-def]
     flat = blocks.reshape(-1, 9)
     if at >= 0:
         k = at >> 1
         for i in range(3):
-            for j in range(3):
-                if at & 1:
-                    flat[k, 3 * i + j] += right[i] * left[j]
-                else:
-                    flat[k, 3 * i + j] += left[i] * right[j]
+            for left, right in pairs:
+                for j in range(3):
+                    if at & 1:
+                        flat[k, 3 * i + j] += right[i] * left[j]
+                    else:
+                        flat[k, 3 * i + j] += left[i] * right[j]
             flat[k, 4 * i] += diagonal
 
 

@@ -18,7 +18,7 @@ N = 40
 @cache
 def calls(module: Any) -> Any:
     """A compiled function that calls every operation of the module, each on an array of its own."""
-    gather, scatter, add_outer = module.gather, module.scatter, module.add_outer
+    gather, scatter, add_outers = module.gather, module.scatter, module.add_outers
     add_six, add_triangle = module.add_six, module.add_triangle
     put_plain, put_transposed, fetch = module.put_plain, module.put_transposed, module.fetch
 
@@ -38,7 +38,7 @@ def calls(module: Any) -> Any:
         for e in range(offsets.shape[0]):
             r = rows[e]
             n, a, b = (r[0], r[1], r[2]), (r[3], r[4], r[5]), (r[6], r[7], r[8])
-            add_outer(outer, offsets[e, 0], r[9], n, a)
+            add_outers(outer, offsets[e, 0], r[9], ((n, a), (b, n)))
             pair, mixed = (a, b), (((r[9], a), (r[10], n)), ((r[11], b),))
             add_six(six, offsets, e, n, (pair, mixed, pair, mixed, pair, mixed))
             own, between = (r[1], r[2], r[2], r[3], r[4]), (r[5], r[6], r[7], r[8], r[9])

@@ -9,14 +9,14 @@ import pytest
 from numba import njit
 
 from lyra_petsc.kernels.scatter import AHEAD, add_elements, fetch_ahead
-from lyra_petsc.kernels.vectors import add_corners, add_outer, add_six, add_triangle
+from lyra_petsc.kernels.vectors import add_corners, add_outers, add_six, add_triangle
 
 RNG = np.random.default_rng(7)
 
 
 @njit
-def add_one(values: Any, at: Any, diagonal: Any, left: Any, right: Any) -> None:
-    add_outer(values, at, diagonal, left, right)
+def add_one(values: Any, at: Any, diagonal: Any, pairs: Any) -> None:
+    add_outers(values, at, diagonal, pairs)
 
 
 @njit
@@ -40,12 +40,13 @@ def vectors(count: int) -> tuple[tuple[float, float, float], ...]:
 
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
 @pytest.mark.parametrize("odd", [0, 1])
-def test_an_outer_product_is_added_to_one_block(kind: type, odd: int) -> None:
+@pytest.mark.parametrize("count", [1, 2])
+def test_outer_products_are_added_to_one_block(kind: type, odd: int, count: int) -> None:
     before = RNG.normal(size=(3, 3, 3))
-    left, right = vectors(2)
-    block = 0.7 * np.eye(3) + np.outer(left, right)
+    pairs = tuple(vectors(2) for _ in range(count))
+    block = 0.7 * np.eye(3) + sum(np.outer(left, right) for left, right in pairs)
     values = before.copy()
-    add_one(values, kind(2 * 1 + odd), 0.7, left, right)
+    add_one(values, kind(2 * 1 + odd), 0.7, pairs)
     expected = before.copy()
     expected[1] += block.T if odd else block
     np.testing.assert_allclose(values, expected, atol=1e-14)
@@ -55,7 +56,7 @@ def test_an_outer_product_is_added_to_one_block(kind: type, odd: int) -> None:
 
 def test_what_others_have_is_left_to_them() -> None:
     values = np.ones((2, 3, 3))
-    add_one(values, np.int32(-1), 5.0, *vectors(2))
+    add_one(values, np.int32(-1), 5.0, (vectors(2),))
     np.testing.assert_array_equal(values, 1.0)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.friction_pairs import BETA, COLUMNS, NORMAL, SLIP, START, TURN
 
 Array = NDArray[np.float64]
 
@@ -19,9 +22,37 @@ def x() -> Array:
     return np.random.default_rng(0).normal(size=(4 * N, 3))
 
 
+class Pairs(NamedTuple):
+    """As a table of friction has them: stencil, β, n, d, Σ β_i c_i with Σ d_i h_i, and ξ."""
+
+    stencil: NDArray[np.int32]
+    beta: Array
+    normal: Array
+    turn: Array
+    start: Array
+    slip: Array
+
+    @property
+    def unpacked(self) -> tuple[Array, ...]:
+        """Tangents, w, still and ξ, as `unpack` gives them."""
+        what = np.zeros((N, COLUMNS))
+        for at, each in ((BETA, self.beta), (NORMAL, self.normal), (START, self.start), (SLIP, self.slip)):
+            what[:, at : at + each.shape[1]] = each
+        what[:, TURN : TURN + 9] = self.turn[:, 1:].reshape(N, 9)
+        beta, tangents, ways, still = (np.empty((N, *rest)) for rest in ((4,), (2, 3), (2, 4, 3), (2,)))
+        slip = np.empty((N, 3))
+        friction_pairs.unpack(what, beta, tangents, ways, still, slip, np.empty((N, 3)))
+        return tangents, ways, still, slip
+
+    def state(self, limit: float = 0.4) -> tuple[Array, ...]:
+        """What the kernels take."""
+        _, ways, still, _ = self.unpacked
+        return self.stencil, ways, still, np.full(N, 3.0), np.full(N, limit)
+
+
 @pytest.fixture
-def state(x: Array) -> tuple[Array, ...]:
-    """Pairs of which about half slide, some of them between sheets."""
+def pairs(x: Array) -> Pairs:
+    """Of them about half slide, some are between sheets."""
     random = np.random.default_rng(1)
     stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
     beta = random.normal(size=(N, 4))
@@ -36,7 +67,12 @@ def state(x: Array) -> tuple[Array, ...]:
     turn[::2] = 0.0
     heights = np.einsum("eik,ek->ei", x[stencil], normal)
     start += np.einsum("ei,eik->ek", heights, turn)
-    return stencil, beta, normal, turn, start, slip, np.full(N, 3.0), np.full(N, 0.4)
+    return Pairs(stencil, beta, normal, turn, start, slip)
+
+
+@pytest.fixture
+def state(pairs: Pairs) -> tuple[Array, ...]:
+    return pairs.state()
 
 
 def energies(x: Array, state: tuple[Array, ...]) -> Array:
@@ -85,9 +121,16 @@ def test_no_energy_is_above_that_of_regularised_springs(x: Array, state: tuple[A
         assert (energies(x + way.reshape(-1, 3), state) <= bound + 1e-12 * np.abs(bound)).all()
 
 
-def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, state: tuple[Array, ...]) -> None:
-    stencil, beta, normal, turn, _, _, _, limit = state
-    gradients = gradient(x, state)[stencil]
+def test_tangents_lie_across_the_normals(pairs: Pairs) -> None:
+    for normal in (pairs.normal, -pairs.normal, np.tile([0.0, 0.0, -1.0], (N, 1))):
+        frames = np.concatenate([normal[:, None], pairs._replace(normal=normal).unpacked[0]], axis=1)
+        products = np.einsum("eik,ejk->eij", frames, frames)
+        np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-14)
+
+
+def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, pairs: Pairs) -> None:
+    stencil, beta, normal, turn, _, _ = pairs
+    gradients, limit = gradient(x, pairs.state())[stencil], pairs.state()[-1]
     along = np.einsum("eik,ek->ei", gradients, normal)
     forces = (gradients - along[:, :, None] * normal[:, None, :]) / beta[:, :, None]
     np.testing.assert_allclose(forces, np.broadcast_to(forces[:, :1], forces.shape), atol=1e-12)
@@ -97,18 +140,21 @@ def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, state: tuple[Array, .
     assert 5 < (size > 0.999 * limit[0]).sum() < N - 5
 
 
-def test_sliding_leaves_what_the_limit_stretches(x: Array, state: tuple[Array, ...]) -> None:
+def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None:
+    state, (tangents, *_, slip) = pairs.state(), pairs.unpacked
     before, force = energies(x, state), gradient(x, state)
     heat, slides = np.empty(N), np.empty(N, dtype=np.bool_)
-    friction_pairs.slide(x, *state, heat, slides)
-    *_, slip, stiffness, limit = state
+    friction_pairs.slide(x, *state, tangents, slip, heat, slides)
+    *_, stiffness, limit = state
     size = np.linalg.norm(slip, axis=1)
+    assert np.abs(np.einsum("ek,ek->e", slip, pairs.normal)).max() < 1e-15
     np.testing.assert_allclose(size[slides], limit[slides] / stiffness[slides], rtol=1e-12)
     # what was put in is stored or heat
     np.testing.assert_allclose(0.5 * stiffness * size**2 + heat, before, rtol=1e-12)
-    heights = np.einsum("eik,ek->ei", x[state[0]], state[2])
-    start = np.einsum("ei,eik->ek", state[1], x[state[0]]) + np.einsum("ei,eik->ek", heights, state[3])
-    after = (*state[:4], start, *state[5:])
+    heights = np.einsum("eik,ek->ei", x[pairs.stencil], pairs.normal)
+    start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])
+    start += np.einsum("ei,eik->ek", heights, pairs.turn)
+    after = pairs._replace(start=start, slip=slip).state()
     np.testing.assert_allclose(gradient(x, after), force, atol=1e-12)
 
 
@@ -118,23 +164,22 @@ def test_rounding_does_not_tell_which_of_two_sliding_pairs_goes_on() -> None:
     keys = np.zeros((3, 10), dtype=np.int64)
     keys[:, :4], keys[:, 4], keys[:, 5] = [*triangles, *edge], VERTEX_TRIANGLE, -1
     among, key = keys[:2], keys[2:]
-    what = np.zeros((2, friction_pairs.COLUMNS))
-    what[:, friction_pairs.SLIP], what[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
+    what = np.zeros((2, COLUMNS))
+    what[:, SLIP], what[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
     for order in ([0, 1], [1, 0]):
         for longer in (0, 1):
             old = what.copy()
-            old[longer, friction_pairs.SLIP] *= 1.0 + 1e-12
+            old[longer, SLIP] *= 1.0 + 1e-12
             place = np.empty(1, dtype=np.int64)
             friction_pairs.find(key, among[order], old[order], place)
             assert order[place[0]] == 1
-    what[0, friction_pairs.SLIP] *= 1.01  # one that sticks still
+    what[0, SLIP] *= 1.01  # one that sticks still
     friction_pairs.find(key, among, what, place)
     assert place[0] == 0
 
 
-def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, ...]:
-    """Points (4 N, 3) and all that the kernels take of pairs of a vertex and a triangle, or of two edges, of
-    which some are nearest at a corner."""
+def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, Pairs]:
+    """Points (4 N, 3) and pairs of a vertex and a triangle, or of two edges, some nearest at a corner."""
     points, kind = random.normal(size=(N, 4, 3)), np.where(np.arange(N) < N // 2, VERTEX_TRIANGLE, EDGE_EDGE)
     part = random.uniform(size=(N, 2)) * np.where(np.arange(N) % 3 == 0, 0.0, 1.0)[:, None]
     s, t = part[:, 0], part[:, 1]
@@ -150,14 +195,15 @@ def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, ...]:
     start = gap + np.einsum("eik,ek,eim->em", points, normal, turn)
     slip = random.normal(size=(N, 3))
     slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-    return points.reshape(-1, 3), stencil, beta, normal, turn, start, slip, np.full(N, 3.0), np.full(N, 0.4)
+    return points.reshape(-1, 3), Pairs(stencil, beta, normal, turn, start, slip)
 
 
 def test_two_sheets_that_turn_together_do_not_slip() -> None:
     """To first order in the angle; and forces have neither a resultant nor a moment."""
     random = np.random.default_rng(4)
-    x, *state = pairs_between_sheets(random)
-    pull = gradient(x, tuple(state)).reshape(N, 4, 3)
+    x, pairs = pairs_between_sheets(random)
+    state = pairs.state()
+    pull = gradient(x, state).reshape(N, 4, 3)
     np.testing.assert_allclose(pull.sum(axis=1), 0.0, atol=1e-13 * np.abs(pull).max())
     moments = np.cross(x.reshape(N, 4, 3), pull).sum(axis=1)
     np.testing.assert_allclose(moments, 0.0, atol=1e-12 * np.abs(pull).max())
@@ -165,20 +211,17 @@ def test_two_sheets_that_turn_together_do_not_slip() -> None:
     friction_pairs.add_moments(x, *state, found)
     np.testing.assert_allclose(found, 0.0, atol=1e-12 * np.abs(pull).max())
     farther = x + 0.01 * random.normal(size=x.shape)
-    pull = gradient(farther, tuple(state)).reshape(N, 4, 3)
+    pull = gradient(farther, state).reshape(N, 4, 3)
     friction_pairs.add_moments(farther, *state, found)
     np.testing.assert_allclose(found, np.cross(farther.reshape(N, 4, 3), pull).sum(axis=1), atol=1e-10)
     assert np.abs(found).max() > 1e-4
-    state[-3][:] = 0.0
-    limits = np.full(N, np.inf)
+    rest = pairs._replace(slip=np.zeros((N, 3)))
     h, axis = 1e-6, np.array([0.6, 0.0, 0.8])
     turned = x + np.cross(h * axis, x) + [0.1, 0.2, 0.3]
-    out = np.empty(N)
-    friction_pairs.energies(turned, *state[:-1], limits, out)
-    assert np.sqrt(out).max() < 1e-11
-    without = [*state[:3], np.zeros_like(state[3]), np.einsum("ei,eik->ek", state[1], x[state[0]])]
-    friction_pairs.energies(turned, *without, *state[5:7], limits, out)
-    assert np.sqrt(out).max() > 1e-7
+    assert np.sqrt(energies(turned, rest.state(np.inf))).max() < 1e-11
+    start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])
+    without = rest._replace(turn=np.zeros((N, 4, 3)), start=start)
+    assert np.sqrt(energies(turned, without.state(np.inf))).max() > 1e-7
 
 
 def test_without_a_lever_there_is_none() -> None:
