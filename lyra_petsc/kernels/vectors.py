@@ -8,6 +8,7 @@ docs/performance.md says what the difference is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
@@ -26,6 +27,16 @@ def _check(*arrays: Any) -> None:
     kinds = {array.dtype for array in arrays}
     if len(kinds) > 1 or any(array.layout != "C" or array.ndim != 2 for array in arrays):
         raise TypingError("contiguous arrays of two dimensions and one type are expected")
+
+
+def _without_result(names: str, given: tuple[Any, ...], write: Callable[[Code], None]) -> Any:
+    """What numba takes of an operation with these arguments, which ``write`` writes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        write(Code(context, builder, signature, arguments, names))
+        return context.get_dummy_value()
+
+    return types.void(*given), generate
 
 
 def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
@@ -60,8 +71,7 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     """out[columns[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; out (n, 4), its last column is padding."""
     _check(blocks, out)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks columns out lo hi factors")
+    def write(code: Code) -> None:
         block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("out")
         row = code.filled(code.numbers("factors"))
         with code.loop() as (k, _):
@@ -72,9 +82,8 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
             total = code.plus(code.plus(first, second), code.pick(last, c, 0, 1, 6, 6))
             target = code.at(vectors, code.number(numbers, k), WIDTH)
             code.store(code.plus(code.load(target), total), target)
-        return context.get_dummy_value()
 
-    return types.void(blocks, columns, out, lo, hi, factors), generate
+    return _without_result("blocks columns out lo hi factors", (blocks, columns, out, lo, hi, factors), write)
 
 
 def _gather_edges(typing: Any, blocks: Any, places: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
@@ -113,21 +122,19 @@ def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi:
     """out[places[k]] += blocks[k]ᵀ factors for lo ≤ k < hi, as ``gather_edges`` has them."""
     _check(blocks, out)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks places out lo hi factors")
+    def write(code: Code) -> None:
         block_rows, numbers, vectors = code.begin("blocks"), code.begin("places"), code.begin("out")
         factors = [code.repeat(number) for number in code.numbers("factors")]
         with code.loop() as (k, _):
             block, four = code.at(block_rows, k, 12), code.at(numbers, k, WIDTH)
-            rows = [code.load(builder.gep(block, [INDEX(WIDTH * i)])) for i in range(3)]
+            rows = [code.load(code.builder.gep(block, [INDEX(WIDTH * i)])) for i in range(3)]
             total = code.summed(*zip(rows, factors, strict=True))
             for i in range(WIDTH):  # one after the other: an edge may be there twice, with a coupling of 0
                 target = code.at(vectors, code.number(four, INDEX(i)), 1)
-                more = builder.extract_element(total, LANE(i))
-                builder.store(code.plus(builder.load(target), more), target)
-        return context.get_dummy_value()
+                more = code.builder.extract_element(total, LANE(i))
+                code.builder.store(code.plus(code.builder.load(target), more), target)
 
-    return types.void(blocks, places, out, lo, hi, factors), generate
+    return _without_result("blocks places out lo hi factors", (blocks, places, out, lo, hi, factors), write)
 
 
 def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) -> Any:
@@ -136,20 +143,16 @@ def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) ->
     ``pairs`` is a tuple of pairs of three numbers each, left and right.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks at diagonal pairs")
+    def write(code: Code) -> None:
         at, begin, diagonal = code.integer("at"), code.begin("blocks"), code.given["diagonal"]
-        with builder.if_then(code.is_ours(at), likely=True):
+        with code.builder.if_then(code.is_ours(at), likely=True):
             products = [code.outer(*code.swapped(at, *pair)) for pair in code.pairs("pairs")]
             eights, ninths = zip(*products, strict=True)
-            eight, ninth = (
-                reduce(code.plus, eights, code.identity(diagonal)),
-                reduce(code.plus, ninths, diagonal),
-            )
-            code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), eight, ninth)
-        return context.get_dummy_value()
+            eight, ninth = reduce(code.plus, eights), reduce(code.plus, ninths, diagonal)
+            eight = code.plus(eight, code.identity(diagonal))
+            code.add_block(code.at(begin, code.builder.ashr(at, INDEX(1)), 9), eight, ninth)
 
-    return types.void(blocks, at, diagonal, pairs), generate
+    return _without_result("blocks at diagonal pairs", (blocks, at, diagonal, pairs), write)
 
 
 def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
@@ -159,8 +162,7 @@ def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -
     three numbers. Offsets (E, 6) are a pattern's.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks offsets e n six")
+    def write(code: Code) -> None:
         n = code.filled(code.numbers("n"))
         n_left, n_right, offsets, blocks = code.spread(n), code.tiled(n), code.six_offsets(), []
         for offset, (right, left) in zip(offsets, code.pairs("six"), strict=True):
@@ -169,9 +171,8 @@ def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -
             eight = code.summed((n_left, code.tiled(right)), (code.spread(left), n_right))
             blocks.append((eight, ninth))
         code.add_six(offsets, blocks)
-        return context.get_dummy_value()
 
-    return types.void(blocks, offsets, e, n, six), generate
+    return _without_result("blocks offsets e n six", (blocks, offsets, e, n, six), write)
 
 
 def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three: Any) -> Any:
@@ -181,20 +182,18 @@ def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three:
     uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + g I. Offsets (E, 6) are those of a pattern.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks offsets e f three")
+    def write(code: Code) -> None:
         u, v = code.vectors("f")
         (uu, uu9), (uv, uv9), (vv, vv9) = code.outer(u, u), code.outer(u, v), code.outer(v, v)
         vu, made = code.transposed(uv), []
         for a, b, c, d, g in code.tuples("three"):
-            ninth = code.plus(code.summed((a, uu9), (builder.fadd(b, c), uv9), (d, vv9)), g)
+            ninth = code.plus(code.summed((a, uu9), (code.builder.fadd(b, c), uv9), (d, vv9)), g)
             a, b, c, d = (code.repeat(factor, 8) for factor in (a, b, c, d))
             eight = code.summed((a, uu), (b, uv), (c, vu), (d, vv))
             made.append((code.plus(eight, code.identity(g)), ninth))
         _add_balanced(code, code.six_offsets(), made)
-        return context.get_dummy_value()
 
-    return types.void(blocks, offsets, e, f, three), generate
+    return _without_result("blocks offsets e f three", (blocks, offsets, e, f, three), write)
 
 
 def _add_balanced(code: Code, offsets: list[Any], three: list[Any]) -> None:
@@ -214,52 +213,37 @@ def _add_corners(typing: Any, blocks: Any, offsets: Any, e: Any, three: Any) -> 
     Given are those of (1, 1), (1, 2), (2, 2), nine numbers each. Offsets (E, 6) are those of a pattern.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks offsets e three")
+    def write(code: Code) -> None:
         made = [(code.filled(nine[:8], code.eight), nine[8]) for nine in code.tuples("three")]
         _add_balanced(code, code.six_offsets(), made)
-        return context.get_dummy_value()
 
-    return types.void(blocks, offsets, e, three), generate
+    return _without_result("blocks offsets e three", (blocks, offsets, e, three), write)
 
 
-def _put(transposed: bool, typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
-    """out[at] = blocks[k], or this transposed."""
+def _put(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at // 2] = blocks[k], transposed where ``at`` is odd; both (n, 9)."""
     _check(blocks, out)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks k out at")
+    def write(code: Code) -> None:
+        builder, at = code.builder, code.integer("at")
         source = code.at(code.begin("blocks"), code.integer("k"), 9)
-        target = code.at(code.begin("out"), code.integer("at"), 9)
+        target = code.at(code.begin("out"), builder.ashr(at, INDEX(1)), 9)
         eight, last = code.load(source, code.eight), INDEX(8)
-        code.store(code.transposed(eight) if transposed else eight, target)
+        code.store(code.swapped(at, eight, code.transposed(eight))[0], target)
         builder.store(builder.load(builder.gep(source, [last])), builder.gep(target, [last]))
-        return context.get_dummy_value()
 
-    return types.void(blocks, k, out, at), generate
-
-
-def _put_plain(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
-    """out[at] = blocks[k]; both (n, 9)."""
-    return _put(False, typing, blocks, k, out, at)
-
-
-def _put_transposed(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
-    """out[at] = blocks[k] transposed; both (n, 9)."""
-    return _put(True, typing, blocks, k, out, at)
+    return _without_result("blocks k out at", (blocks, k, out, at), write)
 
 
 def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
     """Let block k come into the caches; there need be no such block."""
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks k")
+    def write(code: Code) -> None:
         block = code.at(code.begin("blocks"), code.integer("k"), 9)
         for last in (0, 8):  # it may lie on two cache lines
-            code.fetch(builder.gep(block, [INDEX(last)]))
-        return context.get_dummy_value()
+            code.fetch(code.builder.gep(block, [INDEX(last)]))
 
-    return types.void(blocks, k), generate
+    return _without_result("blocks k", (blocks, k), write)
 
 
 # their callers leave out ``typing``
@@ -270,7 +254,6 @@ add_outers: Any = intrinsic(_add_outers)
 add_six: Any = intrinsic(_add_six)
 add_triangle: Any = intrinsic(_add_triangle)
 fetch: Any = intrinsic(_fetch)
-put_plain: Any = intrinsic(_put_plain)
-put_transposed: Any = intrinsic(_put_transposed)
+put: Any = intrinsic(_put)
 scatter: Any = intrinsic(_scatter)
 scatter_edges: Any = intrinsic(_scatter_edges)

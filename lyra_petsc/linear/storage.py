@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.kernels.vectors import put_plain, put_transposed
+from lyra_petsc.kernels.vectors import put
 from lyra_petsc.linear.pattern import BlockPattern, begins, index_type
 from lyra_petsc.mesh.points import Points
 
@@ -40,14 +40,14 @@ def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: i
     blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
     for row in range(n):
         for t in range(begin[row], begin[row + 1]):
-            put_transposed(blocks, below[t], inner, p)
+            put(blocks, below[t], inner, 2 * p + 1)
             p += 1
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                put_plain(blocks, k, inner, p)
+                put(blocks, k, inner, 2 * p)
                 p += 1
             else:
-                put_plain(blocks, k, outer, q)
+                put(blocks, k, outer, 2 * q)
                 q += 1
 
 

@@ -140,16 +140,10 @@ def add_triangle(blocks, offsets, e, f, three):  # type: ignore[no-untyped-def]
 
 
 @plain
-def put_plain(blocks, k, out, at):  # type: ignore[no-untyped-def]
-    for i in range(9):
-        out[at, i] = blocks[k, i]
-
-
-@plain
-def put_transposed(blocks, k, out, at):  # type: ignore[no-untyped-def]
+def put(blocks, k, out, at):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
-            out[at, 3 * i + j] = blocks[k, 3 * j + i]
+            out[at >> 1, 3 * i + j] = blocks[k, 3 * j + i if at & 1 else 3 * i + j]
 
 
 @plain

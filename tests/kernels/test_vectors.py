@@ -20,18 +20,18 @@ def calls(module: Any) -> Any:
     """A compiled function that calls every operation of the module, each on an array of its own."""
     gather, scatter, add_outers = module.gather, module.scatter, module.add_outers
     add_six, add_triangle = module.add_six, module.add_triangle
-    put_plain, put_transposed, fetch = module.put_plain, module.put_transposed, module.fetch
+    put, fetch = module.put, module.fetch
 
     @njit
-    def products(blocks, columns, x, gathered, scattered, put):  # type: ignore[no-untyped-def]
+    def products(blocks, columns, x, gathered, scattered, stored):  # type: ignore[no-untyped-def]
         for row in range(gathered.shape[0]):
             lo, hi = 3 * row, 3 * row + 3
             a, b, c = gather(blocks, columns, x, lo, hi, 8)
             gathered[row, 0], gathered[row, 1], gathered[row, 2] = a, b, c
             scatter(blocks, columns, scattered, lo, hi, (x[row, 0], x[row, 1], x[row, 2]))
             fetch(blocks, row + 8)
-            put_plain(blocks, row, put, 2 * row)
-            put_transposed(blocks, row, put, 2 * row + 1)
+            put(blocks, row, stored, 4 * row)
+            put(blocks, row, stored, 4 * row + 3)
 
     @njit
     def sums(offsets, rows, outer, six, triangle):  # type: ignore[no-untyped-def]
