@@ -238,7 +238,9 @@ class CoulombFriction(Elastic):
                 start, slip = start.copy(), slip.copy()
             side, foot = self._beta[mine].sum(axis=1), foot[mine]
             start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
-            slip[mine] = slip[mine] @ rotation.T
+            # across the normal, as else forces would have no potential
+            turned, n = slip[mine] @ rotation.T, self._normal[mine]
+            slip[mine] = turned - np.einsum("ek,ek->e", turned, n)[:, None] * n
         state = self._beta, self._normal, self._turn, start, slip, self._spring, self._limit
         return self.stencil, *state
 
