@@ -10,8 +10,8 @@ W is by the trapezoidal rule: half the sum of the forces at both ends of the ste
 geometry there, times the way. (The integrator's own forces, at its stage, balance a blow-up as well.) A
 target that moves works by the mean over both ends of what its motion does to the energy, which for springs is
 the same rule. D of integrators whose stage's velocity is not Δx/Δt is that of uniform motion, the least that
-leads from end to end: at the start from rest, the stage's is several times what any motion makes. G is judged
-against the scale ::
+leads from end to end, by the geometry in its middle: at the start from rest, the stage's is several times
+what any motion makes. G is judged against the scale ::
 
     S = largest so far of T + U + |V − V₀| + Σ|W| + ΣD
 
@@ -162,7 +162,7 @@ class EnergyGuard:
                 layout.update_ghosts(values)
         x1, v1, at = system.x, system.v, system.prescribed.at
         moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
-        works, heat_beside = self._with_least_heat(x1 - x0, works)
+        works, heat_beside = self._with_least_heat(x0, x1, works)
         change = kinetic_energy(system.mass, gained)
         # what the ledger's kinetic energies hold beyond the free coordinates
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
@@ -197,13 +197,16 @@ class EnergyGuard:
             noise=noise,
         )
 
-    def _with_least_heat(self, moved: Array, works: Works) -> tuple[Works, float]:
-        """The works with the damping forces of uniform motion along ``moved`` (n_local, 3), and what this
+    def _with_least_heat(self, x0: Array, x1: Array, works: Works) -> tuple[Works, float]:
+        """The works with the damping forces of uniform motion from x0 to x1 (n_local, 3), and what this
         rank must add to their heat [J] for it to be that of this motion.
         """
         system = self._system
         if not system.damping.acts or system.integrator.order == 1 or system.integrator.by_stage:
             return works, 0.0
+        # about the middle, chords of what turns stretch nothing
+        system.damping.freeze(0.5 * (x0 + x1), system.damping.frozen)
+        moved = x1 - x0
         force = system.damping.product(moved / system.dt)
         heat = float(np.vdot(force, moved[: len(force)]))
         return replace(works, damping=force.take(system.prescribed.at)), heat - works.damped

@@ -536,6 +536,7 @@ class SteppedScene:
         )
         near = worst_pair(system)
         between_sheets = near is not None and not near.obstacle
+        room = [more_room(near, scene)] if near is not None and near.blocks else []
         now = Circumstances(
             dt=end - self.time,
             nominal=self.control.step,
@@ -557,8 +558,8 @@ class SteppedScene:
             diagnosis=diagnosis,
             advice=[
                 *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
-                *([more_room(near, scene)] if near is not None and near.blocks else []),
-                *advice(diagnosis, stuck, scene, now),
+                # forces grow without bounds where parts would pass, whatever the numbers of the scene
+                *(room or advice(diagnosis, stuck, scene, now)),
             ],
             sources=outline.sources,
             stuck=stuck,

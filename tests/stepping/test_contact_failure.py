@@ -50,6 +50,7 @@ def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
     assert f"{failure.near.words} {failure.near.gap:.3g} m apart" in text
     assert f"and the obstacle '{failure.near.obstacle}', around (" in text
     assert "try more room for the sheet: obstacles.plate.motion must leave it some" in text
+    assert len(failure.advice) == 1  # no number is absurd where there is no room
     assert failure.content()["near"]["obstacle"] == failure.near.obstacle
     assert simulation.ledger.columns()["smallest_gap"] > 0.0
     simulation.destroy()

@@ -131,6 +131,25 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     assert ways[1] > 0.05
 
 
+def test_friction_on_what_tilts_has_a_potential(comm: MPI.Comm) -> None:
+    """Else no line search finds a way: what turns with a plane beside its normal is no way along it."""
+    tilted = {"axis": [1.0, 0.0, 0.0], "degrees": 30.0}
+    content = {
+        "mesh": grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [-0.2, -0.2, 0.95 * GAP]}},
+        "material": CLOTH | {"bending": 1e-4},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": 0.4, "self": False},
+        "obstacles": {"floor": {"plane": FLAT, "motion": [{"time": 0.0}, {"time": 0.3, "rotate": tilted}]}},
+        "time": {"end": 0.3, "step": 0.01},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    while not simulation.finished:
+        simulation.step()
+    rejected = simulation.totals["rejected"]
+    simulation.destroy()
+    assert rejected == 0
+
+
 def test_what_sticks_turns_with_a_plane(comm: MPI.Comm) -> None:
     """The elastic part of its way, which holds it against its inertia, turns, too; else it would creep."""
     side, far, quarter = 0.06, 0.4, {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}
