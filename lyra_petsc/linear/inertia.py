@@ -102,7 +102,7 @@ class Inertia:
         x, b = self._matrix.mat.createVecs()
         b.setArray(right.ravel())
         self._ksp.solve(b, x)
-        found = x.getArray(readonly=True).reshape(right.shape).copy()
+        found: Array = x.getArray(readonly=True).reshape(right.shape).copy()
         x.destroy()
         b.destroy()
         return found
@@ -117,22 +117,17 @@ class Inertia:
             shift *= MORE
         if pivots is None:
             return None
-        assert self._ksp is not None
-        x, y = self._matrix.mat.createVecs()
-        x.setArray(start.ravel())
-        x.normalize()
-        lowest = np.inf
+        mode, lowest = start / np.sqrt(self._dot(start, start)), np.inf
         for _ in range(SOLVES):
-            self._ksp.solve(x, y)
-            before, lowest = lowest, 1.0 / y.dot(x) - shift
-            y.normalize()
-            x, y = y, x
+            found = self.solve(mode)
+            before, lowest = lowest, 1.0 / self._dot(found, mode) - shift
+            mode = found / np.sqrt(self._dot(found, found))
             if lowest < 0.0 and abs(lowest - before) <= SAME * abs(lowest):
                 break
-        mode = x.getArray(readonly=True).reshape(start.shape).copy()
-        x.destroy()
-        y.destroy()
-        return float(lowest), mode
+        return lowest, mode
+
+    def _dot(self, one: Array, other: Array) -> float:
+        return float(self._layout.summed(float(np.vdot(one, other)))[0])
 
     def _free_solver(self) -> None:
         if self._ksp is not None:

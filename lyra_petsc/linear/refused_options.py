@@ -18,14 +18,17 @@ from lyra_petsc.linear.petsc_options import is_set
 SNES_TYPES = ("newtonls", "ksponly")
 """Newton's method with a line search, and one linear solve."""
 
-JACOBIANS = ("snes_mf", "snes_mf_operator", "snes_fd", "snes_fd_color")
-"""Options that replace the assembled Jacobian."""
-
+JACOBIANS = "snes_mf", "snes_mf_operator", "snes_fd", "snes_fd_color"
 WITHOUT_GRID = (
     *("snes_grid_sequence", "snes_convergence_estimate", "snes_monitor_fields", "snes_fd_function"),
     *("ts_convergence_estimate", "ksp_view_diagonal_scale"),
 )
-"""Options by which PETSc reads what belongs to grids of its own (DM), and crashes."""
+LEFT_OUT = {
+    **dict.fromkeys(WITHOUT_GRID, "PETSc crashes by it where it has no grid of its own"),
+    **dict.fromkeys(JACOBIANS, "regularisation needs the entries of the exact Jacobian"),
+}
+"""Flags that may not be on, and why: those by which PETSc reads what belongs to grids of its own (DM), and
+those that replace the assembled Jacobian."""
 
 NEEDS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
 """Preconditioners that without an option take for ever (sweeps that are not symmetric), or crash (an operator
@@ -75,16 +78,9 @@ def check_options() -> None:
             "is by solver.force_tolerance and solver.step_tolerance; leave it out",
             key="-snes_convergence_test",
         )
-    for name in WITHOUT_GRID:
+    for name, why in LEFT_OUT.items():
         if _is_on(name):
-            raise InputError(
-                "PETSc crashes by it where it has no grid of its own; leave it out", key=f"-{name}"
-            )
-    for name in JACOBIANS:
-        if _is_on(name):
-            raise InputError(
-                "regularisation needs the entries of the exact Jacobian; leave it out", key=f"-{name}"
-            )
+            raise InputError(f"{why}; leave it out", key=f"-{name}")
     kind = options.getString("snes_type", "")
     if is_set("snes_type") and kind not in SNES_TYPES:
         allowed = " and ".join(SNES_TYPES)

@@ -33,6 +33,7 @@ from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, changes, dump_scene
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping import term_memory
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 MOST_CHANGES = 12
@@ -354,15 +355,16 @@ class Recorder:
         rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.reference.late)):
             rows[f"start_{number}"] = system.reference.late[start]
-        arrays = {name: layout.split(values)[0] for name, values in rows.items()} | simulation.term_states()
+        arrays = {name: layout.split(values)[0] for name, values in rows.items()}
+        arrays |= term_memory.of_vertices(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= simulation.edge_states()
+        edges |= term_memory.of_edges(system)
         scalars = simulation.memory() | {
             "last_state": last_state,
             "scheme": simulation.scene.time.scheme,
         }
         began = clock.monotonic()
-        elements = simulation.element_states()
+        elements = term_memory.of_elements(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
         self._last_checkpoint = clock.monotonic()
         self._steps_since = 0

@@ -23,16 +23,16 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.extrapolation import Extrapolation
+from lyra_petsc.stepping.friction_balance import LAG, FrictionBalance
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.relaxation import Relaxation
 from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
-from lyra_petsc.terms.term import Load
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.following_loads import FollowingLoads
+    from lyra_petsc.stepping.whole_stiffness import WholeStiffness
 
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""
@@ -68,10 +68,6 @@ LONGEST = 1e7
 ANY = float(np.finfo(np.float64).max)
 """Beyond all Δτ."""
 
-MOST_ITERATIONS, GIVEN_UP = 20, 1e6
-"""Of Newton's method with all of the stiffness, and the growth of the force in one, by stretching, at which
-it is given up."""
-
 HARD = 40
 """Newton iterations of a load step after which all of the stiffness is tried first in the next one."""
 
@@ -82,13 +78,8 @@ NO_POTENTIAL = (
 NUDGE = 1e-6
 """Of an edge, by which handles are moved to see what force that takes."""
 
-LAG, MOST_ROUNDS = 1e-3, 10
-"""Part of the friction that may be other than normal forces in the equilibrium allow; how often it is taken
-anew for that, at most."""
-
-SLIDES, SLIDING, MOST_SLID = 0.95, 5, 3
-"""Part of the friction allowed from which on all slides; in how many proximal steps that lead farther off it
-does in vain; and after how many load steps without an equilibrium where it does a smaller one is no help."""
+SLIDING = 5
+"""Proximal steps that lead farther off after which a load step in which all slides is given up."""
 
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
@@ -137,9 +128,13 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
         self._whole = False  # whether all of the stiffness is tried first
-        self._in_vain = self._slid = 0
-        self._slid_in = 0.0  # the last increment of the load factor in which all slid
-        self._lag = 0.0  # of the last equilibrium
+        self._in_vain = 0
+        self._friction = FrictionBalance(system)
+        self._pressures: WholeStiffness | None = None
+        if system.active.following:
+            from lyra_petsc.stepping.whole_stiffness import WholeStiffness  # of use for nothing else
+
+            self._pressures = WholeStiffness(system, stepper.tangent, self._examine, self._balanced)
         # the last equilibrium, how it changes with the load factor [m], and what loads change by [N]
         self._found, self._pull = 0.0, np.zeros((system.points.n_owned, 3))
         self._rate: Array | None = None
@@ -159,9 +154,11 @@ class Equilibrium:
 
         Where they were lessened step by step it would fold far away; let go at once it finds the next shape.
         """
-        examination = Examination(self._system, self._spacing, self._size)
-        examination.destroy()
-        return examination.stability.stable is False
+        with self._examine() as examination:
+            return examination.stability.stable is False
+
+    def _examine(self) -> Examination:
+        return Examination(self._system, self._spacing, self._size)
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""
@@ -181,95 +178,30 @@ class Equilibrium:
         )
 
     def _by_whole_stiffness(self, before: float, factor: float) -> Attempt | None:
-        """Seek it by Newton's method with all of the stiffness of pressures, where they have no potential.
-
-        Beside free edges there may be an equilibrium where the symmetric part of the stiffness, and with it
-        the potential that solves minimise, is indefinite. Otherwise none that is unstable is taken. On
-        failure the state is the one before; collective.
-        """
-        system, n = self._system, self._system.points.n_owned
-        if not system.active.following or system.active.viscous or system.discretisation.guards:
+        """Seek it by Newton's method with all of the stiffness of pressures; collective."""
+        if self._pressures is None:
             return None
-        x = system.x[:n].copy()
+        system = self._system
         system.applied.factor = factor
-        guess = self._extrapolation.to(factor, before, x)
-        last, frozen, anchored, balanced, scale = np.inf, None, 0.0, False, self._scale
-        for iteration in range(MOST_ITERATIONS):
-            force = self._out_of_balance(before, factor, first=False)
-            self._scale = scale  # forces on the way may be large
-            if frozen is None:
-                frozen, anchored = system.active.frozen, system.moving_energy_before
-                system.prescribed.targets(before, factor, factor, guess)
-                system.state.set(guess, np.zeros_like(x))
-                system.active.carry_frames(system.x)
-                continue
-            if iteration > 1 and self._balanced(force, last):
-                balanced = True
-                break
-            off = system.out_of_balance()[0]
-            way = self._whole_way(off, factor) if np.isfinite(force) else None
-            if way is None or force > GIVEN_UP * last:
-                break
-            last = force
-            system.state.set(system.x[:n] + way, np.zeros_like(x))
-            system.active.carry_frames(system.x)
-        if not balanced or not self._stands(factor):
-            system.state.set(x, np.zeros_like(x))
-            system.active.carry_frames(system.x, frozen)
-            return None
-        system.stay()
-        system.moving_energy_before = anchored
-        self._in_vain, self._found, self._rate = 0, factor, None
-        return Attempt(True, iteration - 1, 0, force)
-
-    def _stands(self, factor: float) -> bool:
-        """Whether the equilibrium is stable, or has no potential that would tell; collective."""
-        examination = Examination(self._system, self._spacing, self._size)
-        try:
-            found = examination.stability
-            return found.stable is not False or self._skew_holds(found, examination.mode(), factor)
-        finally:
-            examination.destroy()
-
-    def _skew_holds(self, found: Stability, mode: Array | None, factor: float) -> bool:
-        """Whether the skew part of the pressures' stiffness holds what the symmetric part S lets go by
-        ``mode`` u.
-
-        With one negative eigenvalue of S the determinant of all of the stiffness K has the sign of uᵀK⁻¹u, as
-        the rest of S, and so of K, is positive definite; collective.
-        """
-        if mode is None or found.negative != 1 or self._system.active.viscous:
-            return False
-        way = self._whole_way(mode, factor)
-        return way is not None and self._system.points.summed(float(np.vdot(mode, way)))[0] > 0.0
-
-    def _whole_way(self, force: Array, factor: float) -> Array | None:
-        """The displacement (n_owned, 3) [m] to which a force (n_owned, 3) [N] leads with all of the
-        stiffness, if pressures have a part in it; collective.
-        """
-        from lyra_petsc.stepping.following_loads import newton_way
-
-        known, comm = self._linearised(factor, factor), self._system.points.comm
-        if known is None:
-            return None
-        examination = Examination(self._system, self._spacing, self._size)
-        try:
-            return newton_way(force, examination.solve, lambda way: self._skew_force(known, way), comm)
-        finally:
-            examination.destroy()
+        guess = self._extrapolation.to(factor, before, system.x[: system.points.n_owned])
+        found = self._pressures.seek(before, factor, guess)
+        if found is not None:
+            self._in_vain, self._found, self._rate = 0, factor, None
+        return found
 
     def _by_proximal_steps(self, before: float, factor: float) -> Attempt:
         """Seek it as the module's head says."""
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
         system.applied.factor = factor
-        newton = linear = solves = rounds = anew = 0
+        newton = linear = solves = anew = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
         touched = system.active.touched()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
+        self._friction.begin()
         attempt = Attempt(False, 0, 0, 0.0)
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
@@ -278,10 +210,8 @@ class Equilibrium:
                 anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
             balanced = arrived and self._balanced(force, last)
-            self._lag = self._friction()[0] if balanced else 0.0
-            if balanced and (rounds == MOST_ROUNDS or self._lag <= LAG):
-                if factor - before >= self._slid_in:
-                    self._slid, self._slid_in = 0, 0.0
+            if balanced and self._friction.settled():
+                self._friction.found(factor - before)
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
                 linear += self._learn_rate(x, before, factor)
@@ -289,7 +219,7 @@ class Equilibrium:
             lessened = anew + _last_lessened([each.residual for each in history[anew:]])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
             farther = force > WORSE * history[lessened].residual
-            if not words and arrived and farther and solves - lessened >= SLIDING and self._friction()[1]:
+            if not words and arrived and farther and solves - lessened >= SLIDING and self._friction.slides():
                 words = "no equilibrium: proximal steps lead farther off"
             if words:
                 break
@@ -299,7 +229,7 @@ class Equilibrium:
             if attempt.converged:
                 system.active.on_the_way(system.x)
             if balanced:  # but for friction
-                rounds, anew = rounds + 1, len(history)
+                anew = len(history)
                 longest, leaps = self._integrator.pseudo, not system.active.viscous
                 last = self._out_of_balance(before, factor, first=True)
                 self._integrator.pseudo = longest
@@ -330,9 +260,9 @@ class Equilibrium:
                 ceiling = self._integrator.pseudo if touches else ceiling
                 self._integrator.pseudo *= SHRINK
                 leaps = False
-        slides = self._friction()[1] if words and arrived else ""
+        slides = self._friction.lost(factor - before) if words and arrived else ""
         if slides:
-            self._slid, self._slid_in, words = self._slid + 1, factor - before, f"{words}; {slides}"
+            words = f"{words}; {slides}"
         self._sufficed = 0.0
         self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
@@ -378,7 +308,10 @@ class Equilibrium:
             pull = pull + (system.out_of_balance()[0] - here) / (part * step)
             system.x[:] = x
             system.forget_forces()
-        self._rate, spent = self._tangent(pull, self._linearised(before, factor))
+        if self._pressures is None:
+            self._rate, spent = self._stepper.tangent(pull)
+        else:
+            self._rate, spent = self._pressures.tangent(pull, self._pressures.linearised(before, factor))
         if self._rate is not None:
             self._rate += moved / step
         return spent
@@ -389,55 +322,22 @@ class Equilibrium:
         Returns linear iterations.
         """
         system, now = self._system, self._system.applied.now.copy()
-        known = system.applied.following = self._linearised(before, factor)
+        if self._pressures is None:
+            system.applied.given = relaxation.following(now)
+            return 0
+        loads = system.applied.following = self._pressures.linearised(before, factor)
         way, spent = None, 0
-        if known is not None and not system.active.viscous:  # of wind no stiffness is known
-            if not first:
-                way, spent = self._tangent(system.out_of_balance()[0], known)
-            elif self._integrator.others and self._rate is not None:
-                way = (factor - before) * self._rate
-        if known is None or way is None:
+        if system.active.viscous:  # of wind no stiffness is known
+            pass
+        elif not first:
+            way, spent = self._pressures.tangent(system.out_of_balance()[0], loads)
+        elif self._integrator.others and self._rate is not None:
+            way = (factor - before) * self._rate
+        if way is None:
             system.applied.given = relaxation.following(now)
         else:
-            system.applied.given = now + self._skew_force(known, way)
+            system.applied.given = now + self._pressures.skew_force(loads, way)
         return spent
-
-    def _linearised(self, before: float, factor: float) -> FollowingLoads | None:
-        """Pressures, linear in the displacement from the present shape, if there are any."""
-        pressures = self._system.active.following
-        if not pressures:
-            return None
-        from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
-
-        def force_of(load: Load, x: Array, out: Array) -> None:
-            load.add_force(x, before, factor, out)
-
-        return FollowingLoads(pressures, self._system.x, force_of, factor)
-
-    def _skew_force(self, known: FollowingLoads, way: Array) -> Array:
-        """Force (n_owned, 3) [N] on free unknowns by the skew stiffness of pressures on a way; collective."""
-        system = self._system
-        local = np.zeros_like(system.x)
-        local[: len(way)] = way
-        system.points.update_ghosts(local)
-        return np.where(system.prescribed.free, known.skew_force(local, len(way)), 0.0)
-
-    def _tangent(self, force: Array, known: FollowingLoads | None) -> tuple[Array | None, int]:
-        """As `Stepper.tangent`, with all of the stiffness of pressures; collective."""
-        if known is None:
-            return self._stepper.tangent(force)
-        from lyra_petsc.stepping.following_loads import newton_way
-
-        linear = 0
-
-        def solve(force: Array) -> Array | None:
-            nonlocal linear
-            way, spent = self._stepper.tangent(force)
-            linear += spent
-            return way
-
-        way = newton_way(force, solve, lambda way: self._skew_force(known, way), self._system.points.comm)
-        return way, linear
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""
@@ -457,15 +357,15 @@ class Equilibrium:
         newton = linear = followed = 0
         words = ""
         while True:
-            examination = Examination(system, self._spacing, self._size)
-            try:
+            lag = self._friction.lag
+            with self._examine() as examination:
                 found = examination.stability
                 if found.stable is not False:
                     break
                 mode, way = examination.mode(), None
                 if mode is None:
                     words = "its lowest mode was not found"
-                elif self._skew_holds(found, mode, factor):
+                elif self._pressures is not None and self._pressures.holds(found, mode, factor):
                     found = Stability(reason=NO_POTENTIAL)
                 elif examination.wrinkles(mode):
                     words = (
@@ -478,8 +378,6 @@ class Equilibrium:
                     words = "nothing along its lowest mode has less energy"
                 if way is None:
                     break
-            finally:
-                examination.destroy()
             x = system.x[:n].copy()
             self._sufficed = 0.0
             system.state.set(x + way, np.zeros_like(x))
@@ -495,9 +393,9 @@ class Equilibrium:
             followed += 1
         system.moving_energy_before = anchored
         note = _note(found, followed, words)
-        if self._lag > LAG:
+        if lag > LAG:
             note += "; " if note else ""
-            note += f"friction is known to {100.0 * self._lag:.1g} % of what normal forces allow"
+            note += f"friction is known to {100.0 * lag:.1g} % of what normal forces allow"
         return EquilibriumReport(found, newton, linear, note)
 
     def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -505,7 +403,7 @@ class Equilibrium:
         self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned])
         arrays, past = self._extrapolation.memory()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
-        numbers |= {"slid": self._slid, "slid_in": self._slid_in}
+        numbers |= self._friction.memory()
         if self._rate is not None:
             arrays["rate"] = self._rate
         return arrays, numbers | {"extrapolation": past}
@@ -514,8 +412,7 @@ class Equilibrium:
         """Go on with a memory; an older one is empty."""
         self._scale = float(memory.get("scale", self._scale))
         self._in_vain = int(memory.get("in_vain", self._in_vain))
-        self._slid = int(memory.get("slid", self._slid))
-        self._slid_in = float(memory.get("slid_in", self._slid_in))
+        self._friction.restore(memory)
         self._sufficed = float(memory.get("sufficed", self._sufficed))
         self._found = factor
         self._rate = np.array(arrays["rate"]) if "rate" in arrays else None
@@ -525,7 +422,7 @@ class Equilibrium:
     @property
     def in_vain(self) -> bool:
         """Whether so much led nowhere since the last equilibrium that a smaller increment is no help."""
-        return self._in_vain >= MOST_IN_VAIN or self._slid >= MOST_SLID
+        return self._in_vain >= MOST_IN_VAIN or self._friction.in_vain
 
     def _hopeless(self, solves: int, lessened: int, before: Array, *, arrived: bool) -> str:
         """Why no more proximal steps are taken, or nothing; ``before`` is where they began; collective."""
@@ -592,23 +489,6 @@ class Equilibrium:
         if force <= self._tolerances.force_tolerance * self._scale:
             return True
         return LESS * last <= force <= self._floor
-
-    def _friction(self) -> tuple[float, str]:
-        """Friction that normal forces now do not allow, over what they allow, and in words what slides;
-        collective.
-        """
-        sums = self._system.active.lagging(self._system.x)
-        if not sums:
-            return 0.0, ""
-        each = self._system.points.summed(*np.concatenate(list(sums.values()))).reshape(-1, 3)
-        slides = [
-            f"it slides on {name}" if name else "sheets slide on each other"
-            for name, (_, friction, allowed) in zip(sums, each, strict=True)
-            if friction > SLIDES * allowed > 0.0
-        ]
-        wrong, friction, allowed = each.sum(axis=0)
-        words = f"{' and '.join(slides)}, with {friction:.3g} N of friction" if slides else ""
-        return float(wrong / max(allowed, np.finfo(float).tiny)), words
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))

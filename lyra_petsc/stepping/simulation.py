@@ -21,6 +21,7 @@ from lyra_petsc.linear.refused_options import check_options, check_size
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping import term_memory
 from lyra_petsc.stepping.compression_watch import Compression
 from lyra_petsc.stepping.energy_balance import Budget, Ledger
 from lyra_petsc.stepping.energy_guard import EnergyGuard
@@ -37,7 +38,6 @@ from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import MEETS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
-from lyra_petsc.terms.term import Elastic
 
 SMALLEST_FRACTION = 2.0**-12
 """Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""
@@ -193,9 +193,10 @@ class SteppedScene:
         for term in system.active.elastic:
             if term.registration.element_vertices:  # friction, which knows of no way before the start
                 term.begin(system.x)
-        self._seek: Equilibrium | Stepper = self.stepper
-        if scene.time.analysis == "static":
-            self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
+        self._equilibrium: Equilibrium | None = None
+        if scene.time.static:
+            sizes = outline.spacing, outline.size, floor
+            self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
         self._usual = system.integrator
         self.ledger = Ledger(system)
         self.guard = EnergyGuard(system) if system.integrator.moves else None
@@ -274,7 +275,7 @@ class SteppedScene:
             past_slope = self.local_error.memory() if self.local_error is not None else None
             with self.phases("solve"):
                 self.stepper.follow_integrator()
-                attempt = self._seek.attempt(self.time, end)
+                attempt = (self._equilibrium or self.stepper).attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
@@ -306,9 +307,9 @@ class SteppedScene:
             self._usual.disturbed()
             if self.local_error is not None:
                 self.local_error.disturbed()
-        if isinstance(self._seek, Equilibrium) and self.control.is_end(end):
+        if self._equilibrium is not None and self.control.is_end(end):
             with self.phases("solve"):
-                settled = self._seek.settle(self.time, end)
+                settled = self._equilibrium.settle(self.time, end)
             newton += settled.newton_iterations
             linear += settled.linear_iterations
             self.stability = settled.stability.content
@@ -320,18 +321,17 @@ class SteppedScene:
         with self.phases("balance"):
             if self.guard is None:
                 self.ledger.record(x_before[:n])
-            when, told = f"step {self.step_number} ({self._now()})", "compression" in self._told
-            note = self.compression.look(when, told=told)
+            when = f"step {self.step_number} ({self._now()})"
+            note = self.compression.look(when, told="compression" in self._told)
         if note:
-            self._told.add("compression")
-            self.notes.append(note)
+            self._tell_once("compression", note)
         if attempt.at_roundoff and "roundoff" not in self._told:
             self._tell_of_roundoff(attempt.residual)
-        if self.stepper.stopped_by and "option" not in self._told:
-            self._told.add("option")
-            self.notes.append(
-                f"step {self.step_number} ({self._now()}): {self.stepper.stopped_by} stopped Newton's "
-                f"method at a residual of {attempt.residual:.2g} N, short of solver.force_tolerance"
+        if self.stepper.stopped_by:
+            self._tell_once(
+                "option",
+                f"{when}: {self.stepper.stopped_by} stopped Newton's method at a residual of "
+                f"{attempt.residual:.2g} N, short of solver.force_tolerance",
             )
         for term in system.active.elastic:
             entry = term.registration
@@ -346,15 +346,21 @@ class SteppedScene:
         stretch = self.compression.smallest, self.compression.largest
         return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.left)
 
+    def _tell_once(self, of: str, note: str) -> None:
+        """Note something unless the run has been told of it, which checkpoints keep."""
+        if of not in self._told:
+            self._told.add(of)
+            self.notes.append(note)
+
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
         loads = float(np.sum(self.problem.system.applied.now**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
-            self._told.add("roundoff")
-            self.notes.append(
+            self._tell_once(
+                "roundoff",
                 f"step {self.step_number} ({self._now()}) ended at round-off: double precision leaves a "
-                f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads"
+                f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads",
             )
 
     def _now(self) -> str:
@@ -375,12 +381,12 @@ class SteppedScene:
         if stands:
             self.local_error.accepted(v_before, dt)
             self.estimated_error += error
-            if error > share and "error" not in self._told:
-                self._told.add("error")
+            if error > share:
                 where = "of those that follow impacts " if least > control.smallest else ""
-                self.notes.append(
+                self._tell_once(
+                    "error",
                     f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
-                    f"the smallest Δt = {dt:.3g} s {where}(-ts_adapt_dt_min)"
+                    f"the smallest Δt = {dt:.3g} s {where}(-ts_adapt_dt_min)",
                 )
         return stands
 
@@ -459,13 +465,11 @@ class SteppedScene:
 
     def _tell_of_impact(self, why: str, by: str) -> None:
         """Say once by which integrator such steps are repeated."""
-        told = "impact" if by == "backward Euler" else f"impact {by}"
-        if told not in self._told:
-            self._told.add(told)
-            self.notes.append(
-                f"step {self.step_number + 1} ({self._now()}): {self._usual.name} {why} where "
-                f"something touches; such steps are repeated by {by}"
-            )
+        self._tell_once(
+            "impact" if by == "backward Euler" else f"impact {by}",
+            f"step {self.step_number + 1} ({self._now()}): {self._usual.name} {why} where something touches; "
+            f"such steps are repeated by {by}",
+        )
 
     def _lessen(self, dt: float, halvings: int) -> None:
         """Halve a step that made energy, or give up; the state is that before it."""
@@ -495,8 +499,8 @@ class SteppedScene:
                     f"going on with '{following}'"
                 )
                 return
-        in_vain = (isinstance(self._seek, Equilibrium) and self._seek.in_vain) or self.stepper.stopped_by
-        if in_vain or not self.control.failed():
+        in_vain = self._equilibrium is not None and self._equilibrium.in_vain
+        if in_vain or self.stepper.stopped_by or not self.control.failed():
             self.failure = self._explain(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
         why = attempt.words or "no solution was found"
@@ -569,6 +573,7 @@ class SteppedScene:
 
     def memory(self) -> dict[str, Any]:
         """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""
+        equilibrium = self._equilibrium
         return {
             "time": self.time,
             "step": self.step_number,
@@ -583,11 +588,7 @@ class SteppedScene:
             "estimated_error": self.estimated_error,
             "integrator": self._numbers(),
             **self.stepper.memory(self.time)[1],
-            **(
-                {"equilibrium": self._seek.memory(self.time)[1]}
-                if isinstance(self._seek, Equilibrium)
-                else {}
-            ),
+            **({} if equilibrium is None else {"equilibrium": equilibrium.memory(self.time)[1]}),
             "energy": None if self.guard is None else self.guard.memory(),
             "late_starts": sorted(self.problem.system.reference.late),
         }
@@ -600,67 +601,11 @@ class SteppedScene:
         """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
         arrays = dict(self.problem.system.integrator.memory()[0])
         arrays |= self.ledger.memory()[0] | self.stepper.memory(self.time)[0]
-        if isinstance(self._seek, Equilibrium):
-            arrays |= self._seek.memory(self.time)[0]
+        if self._equilibrium is not None:
+            arrays |= self._equilibrium.memory(self.time)[0]
         if self.local_error is not None:
             arrays |= self.local_error.memory()[0]
         return arrays
-
-    def term_states(self) -> dict[str, Array]:
-        """Vertex arrays (n_vertices, 3) that terms with a state keep in a checkpoint, by ``term.name``."""
-        return {
-            f"{term.name}.{name}": values
-            for term in self.problem.system.active.elastic
-            for name, values in term.state().items()
-        }
-
-    def edge_states(self) -> dict[str, Array]:
-        """The same of edges with an unknown, (n_edges,)."""
-        layout, found = self.problem.points, {}
-        for term in self.problem.system.active.elastic:
-            for name, values in term.edge_state().items():
-                rows = np.zeros(3 * layout.n_local)
-                rows[term.edge_places] = values
-                found[f"{term.name}.{name}"] = rows[layout.edge_places]
-        return found
-
-    def element_states(self) -> dict[str, Array]:
-        """What terms keep in a checkpoint of elements: (E, n + m) each, of which the first n are numbers of
-        vertices in the mesh.
-        """
-        layout, found = self.problem.points, {}
-        for term in self.problem.system.active.elastic:
-            if term.registration.element_vertices:
-                if term.registration.neighbours:
-                    vertices, values = term.element_state()
-                else:
-                    vertices = layout.global_number[term.stencil[: term.n_owned]]
-                    values = term.element_values()[: term.n_owned]
-                numbers = layout.in_mesh()[layout.local(vertices.ravel())].reshape(vertices.shape)
-                found[term.name] = np.concatenate([numbers, values], axis=1)
-        return found
-
-    def _restore_elements(self, term: Elastic, vertices: Ints, values: Array) -> None:
-        """Let a term go on with elements given by global numbers (E, n), on any rank; collective."""
-        layout, comm = self.problem.points, self.comm
-        owner = np.searchsorted(layout.bounds, vertices, side="right") - 1
-        sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
-        came = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
-        vertices, values = (np.concatenate(part) for part in zip(*came, strict=True))
-        if not term.registration.neighbours:
-            _restore_values(term, layout.global_number[term.stencil], vertices, values)
-            return
-        term.restore_elements(vertices, values, range(layout.start, layout.start + layout.n_owned))
-
-    def _restore_edges(self, term: Elastic, edges: Mapping[str, Array]) -> None:
-        """Let a term go on with what a checkpoint holds of edges, those of ghosts too; collective."""
-        layout, state = self.problem.points, {}
-        for name in term.registration.edge_state:
-            rows = np.zeros((layout.n_local, 3))
-            rows.ravel()[layout.edge_places] = edges[f"{term.name}.{name}"]
-            layout.update_ghosts(rows)
-            state[name] = rows.ravel()[term.edge_places]
-        term.restore_edges(state, self.problem.system.x)
 
     def resume(
         self,
@@ -672,11 +617,7 @@ class SteppedScene:
         """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
         system = self.problem.system
         system.state.update_ghosts()
-        for term in system.active.elastic:
-            if term.registration.edge_state:
-                self._restore_edges(term, edges)
-            if term.name in elements and not term.registration.neighbours:
-                self._restore_elements(term, *elements[term.name])
+        term_memory.restore_fixed(system, edges, elements)
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
         # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)
@@ -684,8 +625,8 @@ class SteppedScene:
         refuse_contact(system, self.scene, f"at {self._now()}")
         self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)
-        if isinstance(self._seek, Equilibrium):
-            self._seek.restore(arrays, memory.get("equilibrium", {}), self.time)
+        if self._equilibrium is not None:
+            self._equilibrium.restore(arrays, memory.get("equilibrium", {}), self.time)
         self.estimated_error = float(memory["estimated_error"])
         system.integrator.restore(arrays, memory["integrator"])
         if self.guard is not None and memory.get("energy"):  # older ones have none
@@ -693,14 +634,7 @@ class SteppedScene:
             self.guard.restore(memory["energy"], same=same)
         if self.local_error is not None:
             self.local_error.restore(arrays, memory["integrator"])
-        for term in system.active.elastic:
-            names = term.registration.state
-            if names:
-                known = {name: arrays.get(f"{term.name}.{name}") for name in names}
-                term.restore({name: array for name, array in known.items() if array is not None})
-            if term.name in elements and term.registration.neighbours:
-                self._restore_elements(term, *elements[term.name])
-                term.take_pairs(system.x, system.active.frozen[term])
+        term_memory.restore_changing(system, arrays, elements)
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
         self.stability = self.stability and memory.get("stability", self.stability)
@@ -720,13 +654,3 @@ class SteppedScene:
     def _take_back_options(self) -> None:
         for name in self._filled:
             PETSc.Options().delValue(name)
-
-
-def _restore_values(term: Elastic, own: Ints, vertices: Ints, values: Array) -> None:
-    """Let a term whose elements have these vertices (E, n) go on with values (k, m) of others (k, n), among
-    which they are; those that are not keep what they have.
-    """
-    found, now = {tuple(key): row for row, key in enumerate(vertices.tolist())}, term.element_values().copy()
-    rows = np.array([found.get(tuple(key), -1) for key in own.tolist()], dtype=np.int64)
-    now[rows >= 0] = values[rows[rows >= 0]]
-    term.restore_values(now)

@@ -8,7 +8,7 @@ pivots are those of its Schur complement, on the vertices.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from mpi4py import MPI
@@ -95,7 +95,7 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
 
 
 class Examination:
-    """Of the equilibrium that the equations are at; collective.
+    """Of the equilibrium that the equations are at, whose factors it holds until it ends; collective.
 
     Attributes
     ----------
@@ -207,7 +207,10 @@ class Examination:
         load.add_force(system.x, system.t0, system.t1, here)
         return (0.5 * total - here)[:n]
 
-    def destroy(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
         """Free the factors; collective."""
         if self._inertia is not None:
             self._inertia.destroy()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
@@ -32,6 +34,25 @@ NOTABLE = 0.03
 UNRESOLVED, REENTRANT = 0.065, 0.008
 """(h/L)^p from which on it is said that edges h at a corner are long for a sheet of size L, below and beyond
 180 degrees: about 1 % of the deflection of skew plates of 30 and 60 degrees, and of an L."""
+
+
+class Sides(NamedTuple):
+    """Of triangles, opposite their corners.
+
+    Attributes
+    ----------
+    ends : (F, 3, 2) int64
+        Vertices.
+    alone : (F, 3) bool
+        Whether no other of the triangles has the edge.
+    supported, clamped : (F, 3) bool
+        Whether handles hold it against deflection, and whether they keep its slope.
+    """
+
+    ends: Ints
+    alone: Mask
+    supported: Mask
+    clamped: Mask
 
 
 def coarse(
@@ -76,18 +97,17 @@ def _irregular(rest: RestShape, chosen: Ints, number: Ints, size: Array, sharpne
     grids, the forces cancel.
     """
     mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
-    n, sides = mesh.n_vertices, triangles[:, [[1, 2], [2, 0], [0, 1]]]
+    n, sides = mesh.n_vertices, _sides(rest, triangles, number)
 
     def mean(values: Array) -> Array:
         """Mean (V,) of the values (F, 3) of sides at their ends."""
-        count = np.maximum(np.bincount(sides.ravel(), minlength=n), 1)
-        return np.bincount(sides.ravel(), np.repeat(values.ravel(), 2), n) / count
+        count = np.maximum(np.bincount(sides.ends.ravel(), minlength=n), 1)
+        return np.bincount(sides.ends.ravel(), np.repeat(values.ravel(), 2), n) / count
 
     opening = np.maximum(_openings(triangles, size, n), 1e-9)
     meet = 2.0 * np.pi / opening * np.bincount(triangles.ravel(), minlength=n)  # images by symmetry, too
-    alone = mean(meet[sides].sum(axis=2)) - meet < 7.0
-    free = (np.bincount(number.ravel())[number] == 1) & ~_held(rest, triangles)[1]
-    alone[sides[free]] = False
+    alone = mean(meet[sides.ends].sum(axis=2)) - meet < 7.0
+    alone[sides.ends[sides.alone & ~sides.clamped]] = False
     found = np.flatnonzero(alone & (meet > 2.5) & (meet < 4.5))
     half = np.pi / meet[found]
     load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * meet[found]
@@ -112,17 +132,16 @@ def narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array
 
     Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity, 3rd ed. 1970, § 109.
     """
-    mesh, materials = rest.mesh, rest.scene.material
     thickness = np.array(
         [
             np.sqrt(12.0 * shell.plate[0] / shell.c11)
             if material.young is not None or is_isotropic(material.cloth)
             else 0.0
-            for shell, material in zip(rest.shells, materials, strict=True)
+            for shell, material in zip(rest.shells, rest.scene.material, strict=True)
         ]
     )[rest.shell_of[chosen]]
-    supported, clamped = _held(rest, mesh.triangles[chosen])
-    free = (np.bincount(number.ravel())[number] == 1) & ~supported & ~clamped
+    _, alone, supported, clamped = _sides(rest, rest.mesh.triangles[chosen], number)
+    free = alone & ~supported & ~clamped
     lost = 0.315 * float(thickness @ np.sum(size * free, axis=1)) / float(area[thickness > 0.0].sum() or 1.0)
     if lost < NARROW:
         return []
@@ -142,11 +161,8 @@ def corners(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
 
     Source: M. L. Williams, Proceedings of the First US National Congress of Applied Mechanics (1951) 325-329.
     """
-    mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
-    n = mesh.n_vertices
-    boundary = np.bincount(number.ravel())[number] == 1
-    supported, clamped = _held(rest, triangles)
-    ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
+    triangles, n = rest.mesh.triangles[chosen], rest.mesh.n_vertices
+    ends, boundary, supported, clamped = _sides(rest, triangles, number)
     opening = _openings(triangles, size, n)
 
     turn, nearby = np.abs(np.pi - opening), np.zeros(n)
@@ -180,15 +196,13 @@ def _openings(triangles: Ints, size: Array, n: int) -> Array:
     return np.asarray(np.bincount(triangles.ravel(), angle.ravel(), n), dtype=np.float64)
 
 
-def _held(rest: RestShape, triangles: Ints) -> tuple[Mask, Mask]:
-    """Which edges opposite the corners of ``triangles`` (n, 3) are held against deflection, and which also
-    keep their slope.
-    """
+def _sides(rest: RestShape, triangles: Ints, number: Ints) -> Sides:
+    """Of ``triangles`` (F, 3), whose edges opposite corners have the numbers (F, 3)."""
     mesh, scene = rest.mesh, rest.scene
     axes, ends = np.zeros((mesh.n_vertices, 3), dtype=bool), triangles[:, [[1, 2], [2, 0], [0, 1]]]
     slope = np.zeros(triangles.shape, dtype=bool)
-    for number, handle in enumerate(scene.handles):
-        held = select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)
+    for place, handle in enumerate(scene.handles):
+        held = select_vertices(mesh, handle, key=f"handles[{place}]", file=scene.source)
         if is_exact(handle):
             axes[held[:, None], list(handle.axis_numbers)] = True
         if handle.holds_slope:
@@ -196,4 +210,5 @@ def _held(rest: RestShape, triangles: Ints) -> tuple[Mask, Mask]:
     x = mesh.positions[triangles]
     normal = unit(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]))
     across = np.sum(axes[ends] * normal[:, None, None, :] ** 2, axis=3)
-    return (across > 0.9).all(axis=2), slope
+    alone = np.bincount(number.ravel())[number] == 1
+    return Sides(ends, alone, (across > 0.9).all(axis=2), slope)

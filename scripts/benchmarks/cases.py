@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lyra_petsc.experiments.meshes import rectangle_script
 
 CLOTH = "gray-interlock"
@@ -119,11 +121,12 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     """
 
     def sheets(number: int, apart: float, aside: float = 0.0) -> list[dict[str, Any]]:
-        grid = {"width": 1.0, "height": 1.0, "nx": cells_of(vertices // number), "pattern": "alternating"}
-        grid["ny"] = grid["nx"]
+        cells = cells_of(vertices // number)
+        grid = {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells, "pattern": "alternating"}
+        first, farther = np.array([-0.5, -0.5, 0.95 * apart]), np.array([aside, 0.6 * aside, apart])
         return [
-            {"grid": grid, "transform": {"translate": [x - 0.5, 0.6 * x - 0.5, apart * (layer + 0.95)]}}
-            for layer, x in enumerate(aside * layer for layer in range(number))
+            {"grid": grid, "transform": {"translate": (first + layer * farther).tolist()}}
+            for layer in range(number)
         ]
 
     common = hanging_square(vertices, "beuler")

@@ -137,30 +137,29 @@ def test_the_hessian_is_the_slope_of_all_forces(name: str) -> None:
     system.x[:, 0] *= 0.95
     system.begin_step(0.3, 0.7)
     free = np.flatnonzero(system.prescribed.free)
-    examination = Examination(system, 0.25, 1.4)
-    inertia = examination._inertia
-    assert inertia is not None
-    indices, columns, entries = inertia._matrix.mat.getValuesCSR()
-    dense = np.zeros((system.x.size, system.x.size))
-    dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
-    dense = dense[np.ix_(free, free)]
-    slopes = np.empty_like(dense)
-    here = system.x.copy()
-    for column, place in enumerate(free):
-        force = []
-        for sign in (1.0, -1.0):
-            system.x.ravel()[:] = here.ravel()
-            system.x.ravel()[place] += sign * 1e-6
-            system.begin_step(0.3, 0.7)
-            force.append(system.out_of_balance()[0].ravel()[free])
-        slopes[:, column] = (force[1] - force[0]) / 2e-6
-    symmetric = 0.5 * (slopes + slopes.T)
-    np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
-    values = np.linalg.eigvalsh(symmetric)
-    assert examination.stability.negative == np.sum(values < 0.0)
-    assert examination.stability.negative > 0
-    mode = examination.mode()
-    assert mode is not None
-    assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] == pytest.approx(values[0], rel=0.02)
-    examination.destroy()
+    with Examination(system, 0.25, 1.4) as examination:
+        inertia = examination._inertia
+        assert inertia is not None
+        indices, columns, entries = inertia._matrix.mat.getValuesCSR()
+        dense = np.zeros((system.x.size, system.x.size))
+        dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
+        dense = dense[np.ix_(free, free)]
+        slopes = np.empty_like(dense)
+        here = system.x.copy()
+        for column, place in enumerate(free):
+            force = []
+            for sign in (1.0, -1.0):
+                system.x.ravel()[:] = here.ravel()
+                system.x.ravel()[place] += sign * 1e-6
+                system.begin_step(0.3, 0.7)
+                force.append(system.out_of_balance()[0].ravel()[free])
+            slopes[:, column] = (force[1] - force[0]) / 2e-6
+        symmetric = 0.5 * (slopes + slopes.T)
+        np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
+        values = np.linalg.eigvalsh(symmetric)
+        assert examination.stability.negative == np.sum(values < 0.0)
+        assert examination.stability.negative > 0
+        mode = examination.mode()
+        assert mode is not None
+        assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] == pytest.approx(values[0], rel=0.02)
     simulation.destroy()

@@ -164,6 +164,17 @@ class Measured:
         return abs(self.value - self.exact) / scale
 
 
+def missed(quantity: str, found: Array, exact: Array, unit: str = "1") -> Measured:
+    """By how much a vector is missed, whatever the direction, over the size of the exact one."""
+    size = float(np.linalg.norm(exact))
+    return Measured(quantity, size + float(np.linalg.norm(found - exact)), size, unit)
+
+
+def worst(found: Iterable[Sequence[Measured]]) -> list[Measured]:
+    """Of each quantity, of which each entry has one, the one that errs most."""
+    return [max(each, key=lambda one: one.error) for each in zip(*found, strict=True)]
+
+
 Measure = Callable[[Bench, float], Iterable[Measured]]
 
 
@@ -219,6 +230,7 @@ def data(name: str) -> dict[str, Any]:
 
 
 STATIC: dict[str, Any] = {"analysis": "static"}
+FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
 ASSEMBLED = {"end": 1.0, "step": 1.0}
 """Time of a scene that is set up and not stepped."""
 

@@ -28,7 +28,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     family,
     scale,
 )
-from lyra_petsc.experiments.verification.answers import grid
+from lyra_petsc.experiments.verification.answers import FLOOR, grid
 from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.mesh.start_crossings import overlaps_of
 from lyra_petsc.parallel import on_root
@@ -110,14 +110,13 @@ def _pressed(setting: Setting, bench: Bench) -> Content:
     for layer in range(LAYERS):
         place = [-0.05 + 0.002 * (layer % 3), 0.003 * (layer % 2), 0.005 + 0.006 * layer]
         meshes.append(grid(0.1, 0.1, 3, 3) | {"name": f"layer{layer}", "transform": {"translate": place}})
-    floor = {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}
     group = f"layer{LAYERS - 1}"
     # in each step that much more
     loads = [
         {"group": group, "traction": [0.0, 0.0, -more], "from": STEP * k}
         for k, more in enumerate(np.diff(np.geomspace(1e-4, 1.0, RAMP + 1)) * PRESSURE)
     ]
-    return _scene(setting, meshes, {"gap": 0.004}, floor, loads=loads)
+    return _scene(setting, meshes, {"gap": 0.004}, {"floor": FLOOR}, loads=loads)
 
 
 def _knot(setting: Setting, bench: Bench) -> Content:
@@ -167,8 +166,7 @@ def _stack(setting: Setting, bench: Bench) -> Content:
         grid(1.0, 1.0, MANY_CELLS, MANY_CELLS, "alternating") | {"transform": {"translate": place}}
         for place in places
     ]
-    floor = {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}
-    return _scene(setting, meshes, {"gap": gap, "friction": 0.3}, floor)
+    return _scene(setting, meshes, {"gap": gap, "friction": 0.3}, {"floor": FLOOR})
 
 
 def _contacts(trial: Trial) -> tuple[int, float]:

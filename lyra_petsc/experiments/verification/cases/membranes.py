@@ -26,6 +26,7 @@ from lyra_petsc.experiments.verification.answers import (
     grid,
     isotropic,
     scene,
+    worst,
 )
 from lyra_petsc.experiments.verification.flat_plates import lowest_modes
 from lyra_petsc.experiments.verification.rods import stretches
@@ -79,8 +80,7 @@ def patch_states(bench: Bench, n: float) -> Sequence[Measured]:
             for gradient in GRADIENTS:
                 trial.set_state(x=vertices[:, :2] @ gradient.T @ TILT[:2])
                 found.append(_of_state(trial, gradient, MATERIALS[material]))
-    # of each quantity the state that is farthest off
-    return [max(quantity, key=lambda one: one.error) for quantity in zip(*found, strict=True)]
+    return worst(found)
 
 
 def answer(gradient: Array, c: dict[str, float]) -> tuple[Array, float]:

@@ -19,7 +19,9 @@ from lyra_petsc.experiments.verification.answers import (
     case,
     data,
     grid,
+    missed,
     scene,
+    worst,
 )
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.rods import cantilever, pressed_tip
@@ -58,17 +60,15 @@ def _tips(
     bench: Bench, n: float, kind: str, loads: list[dict[str, Any]], rows: Sequence[Sequence[float]]
 ) -> tuple[list[Measured], Array]:
     """The load of a table at which the tip's way errs most, and the tip (−U, W) at full load."""
-    length, worst, tip = LENGTHS[kind], (0.0, 0.0), np.zeros(2)
+    length, tip, found = LENGTHS[kind], np.zeros(2), []
     table = {round(row[0], 6): np.array(row[1:]) for row in rows}
     for factor, trial in increments(bench, sze_strip(kind, n, loads), INCREMENT):
         end = trial.x[np.isclose(trial.start[:, 0], length)].mean(axis=0)
         tip = np.array([length - end[0], end[2]])
         exact = table.get(round(factor, 6))
         if exact is not None:
-            way = float(np.linalg.norm(exact))
-            worst = max(worst, (float(np.linalg.norm(tip - exact)) / way, way))
-    error, way = worst
-    return [Measured("way of the tip, worst load of the table", way * (1.0 + error), way)], tip
+            found.append([missed("way of the tip, worst load of the table", tip, exact)])
+    return worst(found), tip
 
 
 @case(
@@ -86,8 +86,7 @@ def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
     length, membrane = LENGTHS["shear"], 1.2e6 * 0.1
     exact = cantilever(0.0, 4.0 * length**2 / STIFFNESS, STIFFNESS / (membrane * length**2))
     way = np.array([1.0 - exact.reach, exact.drop]) * length
-    size, error = float(np.linalg.norm(way)), float(np.linalg.norm(tip - way))
-    return [*found, Measured("way of the tip at full load", size + error, size, "m")]
+    return [*found, missed("way of the tip at full load", tip, way, "m")]
 
 
 @case(
@@ -127,9 +126,8 @@ def pressed_strip(bench: Bench, n: float) -> Sequence[Measured]:
         if load is not None:
             end = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
             x, z = pressed_tip(load)
-            way = math.hypot(1.0 - x, z)
-            error = math.hypot(end[0] - x, end[2] - z)
-            found.append(Measured(f"way of the tip, q L³/B = {load:g}", way + error, way, "m"))
+            way = np.array([1.0 - end[0], end[2]])
+            found.append(missed(f"way of the tip, q L³/B = {load:g}", way, np.array([1.0 - x, z]), "m"))
     return found
 
 
@@ -230,18 +228,18 @@ def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
     content = TABLES["slit_annulus"]
     table = {round(row[0], 6): row[1:] for row in content["rows"]}
     plate, ends = slit_annulus_scene(bench, round(n))
-    worst: list[Measured] = []
-    height = np.zeros(2)
+    found, height = [], np.zeros(2)
     for factor, trial in increments(bench, plate, INCREMENT):
         height = trial.x[list(ends), 2]
         exact = table.get(round(factor, 6))
         if exact is not None:
-            here = [
-                Measured(f"height of {end}, worst load of the table", float(z), of, "m")
-                for end, z, of in zip("AB", height, exact, strict=True)
-            ]
-            worst = [max(pair, key=lambda each: each.error) for pair in zip(here, worst or here, strict=True)]
-    return worst + [
+            found.append(
+                [
+                    Measured(f"height of {end}, worst load of the table", float(z), of, "m")
+                    for end, z, of in zip("AB", height, exact, strict=True)
+                ]
+            )
+    return worst(found) + [
         Measured(f"height of {end} at full load", float(z), of, "m")
         for end, z, of in zip("AB", height, content["kirchhoff_love"], strict=True)
     ]
@@ -461,16 +459,17 @@ def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
     table = {round(row[0], 6): row[1:] for row in TABLES["open_cylinder"]["rows"]}
     for pattern in PATTERNS:
         content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
-        worst: list[Measured] = []
+        found = []
         for factor, trial in increments(bench, content, INCREMENT):
             way = trial.x - vertices
-            found = way[0, 2], -way[around, 0], -way[-1, 0]
-            here = [
-                Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
-                for point, value, of in zip("ABC", found, table[round(factor, 6)], strict=True)
-            ]
-            worst = [max(pair, key=lambda each: each.error) for pair in zip(here, worst or here, strict=True)]
-        yield from worst
+            ways = way[0, 2], -way[around, 0], -way[-1, 0]
+            found.append(
+                [
+                    Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
+                    for point, value, of in zip("ABC", ways, table[round(factor, 6)], strict=True)
+                ]
+            )
+        yield from worst(found)
 
 
 DEFLECTION = 30.0
