@@ -42,6 +42,7 @@ from lyra_petsc.terms.midedge_shape import (
     Frames,
     against,
     carried,
+    carry,
     directions,
     directors,
     largest_angle,
@@ -238,8 +239,11 @@ class MidEdge(Elastic):
         return np.asarray(self.of_edges.length * np.nan_to_num(angle))
 
     def _carried(self, frames: Frames, x: Array) -> Frames:
-        tangent = self._tangents(x)
-        return Frames(tangent, carried(frames, tangent))
+        # in one piece: once they are others, an array larger than either finds room where they were
+        tangent, across = np.empty((2, len(self.of_edges.ends), 3))
+        directions(x, self.of_edges.ends, tangent)
+        carry(*frames, tangent, across)
+        return Frames(tangent, across)
 
     def _tangents(self, x: Array) -> Array:
         tangent = np.empty((len(self.of_edges.ends), 3))

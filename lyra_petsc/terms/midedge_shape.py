@@ -106,7 +106,8 @@ def largest_angle(unknowns, places, length):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
+def carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
+    """As ``carried``, into out (n, 3)."""
     for k in range(len(out)):
         t = present[k, 0], present[k, 1], present[k, 2]
         t0 = tangent[k, 0], tangent[k, 1], tangent[k, 2]
@@ -120,7 +121,7 @@ def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
 def carried(frames: Frames, tangent: Array) -> Array:
     """a (n, 3): a₀ as the smallest rotation carries it to edges of direction ``tangent`` (n, 3)."""
     out = np.empty_like(tangent)
-    _carry(*frames, tangent, out)
+    carry(*frames, tangent, out)
     return out
 
 
