@@ -164,11 +164,12 @@ def midedge_blocks(
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
         (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
-        shape, length = term.bent(x, frames)[0], term.of_edges.length
+        sheet, tilt = term, term._tilt
     else:
         _, stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
-        edges, shape = term._edges, term._sheet.bent(x, frames)[0]
-        length = term._sheet.of_edges.length
+        edges, sheet = term._edges, term._sheet
+        tilt = sheet._tilt[term._rows] if len(sheet._tilt) else sheet._tilt
+    directors, length = sheet._directors(x, frames), sheet.of_edges.length
     rest = rest if len(rest) else np.zeros((term.n_elements, 3))
     for e, points in enumerate(term.stencil):
         corners, k = x[points], np.empty((3, 3))
@@ -177,12 +178,13 @@ def midedge_blocks(
         area = np.cross(sides[1], sides[2])  # 2A n
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
-        director, spin = shape[edges[e]].reshape(3, 2, 3).transpose(1, 0, 2)
-        if len(term._tilt):
-            cosine, sine = term._tilt[e].T[:, :, None]
+        director = directors[edges[e]]
+        if len(tilt):
+            cosine, sine = tilt[e].T[:, :, None]
             director = cosine * director - sine * np.cross(sides / along[:, None], director)
         tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
         beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
+        spin = -np.cross(before, tangent) / (along[:, None] * beside)
         about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)
         t = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
         t1, t2, s, s1, s2 = np.array([derivatives(each) for each in t]).T

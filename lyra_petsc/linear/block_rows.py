@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.block_product import product_of
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import Elastic
@@ -54,6 +54,18 @@ def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyp
                 for j in range(3):
                     if mask[c, i] or mask[row, j]:
                         values[k, i, j] = size if row == c and i == j else 0.0
+
+
+@cached(fastmath=True)
+def square_without(vector, left_out):  # type: ignore[no-untyped-def]
+    """Sum of the squares of ``vector`` (n,) without those of its entries ``left_out`` (m,), which ascend."""
+    total, begin = 0.0, 0
+    for nth in range(len(left_out) + 1):
+        end = left_out[nth] if nth < len(left_out) else len(vector)
+        for i in range(Index(begin), Index(end)):
+            total += vector[i] * vector[i]
+        begin = end + 1
+    return total
 
 
 class Beside(NamedTuple):

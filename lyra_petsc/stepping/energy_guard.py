@@ -161,9 +161,9 @@ class EnergyGuard:
             for values in (x0, v0):
                 layout.update_ghosts(values)
         x1, v1, at = system.x, system.v, system.prescribed.at
-        moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
+        change = kinetic_energy(system.mass, v1[:n] - v0[:n])
+        moved = x1[:n] - x0[:n]
         works, heat_beside = self._with_least_heat(x0, x1, works)
-        change = kinetic_energy(system.mass, gained)
         # what the ledger's kinetic energies hold beyond the free coordinates
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
         work = self._outer_work(x0, v0, x1, v1, moved)

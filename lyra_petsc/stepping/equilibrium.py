@@ -400,7 +400,7 @@ class Equilibrium:
 
     def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers to go on with from the equilibrium at ``factor``; collective."""
-        self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned])
+        self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned].copy())
         arrays, past = self._extrapolation.memory()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
         numbers |= self._friction.memory()
@@ -416,7 +416,7 @@ class Equilibrium:
         self._sufficed = float(memory.get("sufficed", self._sufficed))
         self._found = factor
         self._rate = np.array(arrays["rate"]) if "rate" in arrays else None
-        x = self._system.x[: self._system.points.n_owned]
+        x = self._system.x[: self._system.points.n_owned].copy()
         self._extrapolation.restore(arrays, memory.get("extrapolation", {}), factor, x)
 
     @property

@@ -36,7 +36,7 @@ class Extrapolation:
         self._degree = 0
 
     def to(self, t1: float, t0: float, v: Array) -> Array:
-        """Velocities (n, 3) [m/s] to expect at t1 [s], of ``v`` at t0."""
+        """Velocities (n, 3) [m/s] to expect at t1 [s], of ``v`` at t0, which are kept and must stay."""
         self.learn(t0, v)
         return self._expected(t1, min(self._degree, len(self._times) - 1))
 
@@ -56,14 +56,12 @@ class Extrapolation:
         """Take the velocities at t0 [s], unless they are known; collective."""
         if self._times and t0 <= self._times[-1]:
             return
-        degrees = range(len(self._times))
-        if degrees:
-            wrong = [(v - self._expected(t0, degree)).ravel() for degree in degrees]
-            errors = np.array([np.dot(error, error) for error in wrong])
+        if self._times:
+            errors = np.array([self._error(t0, v, degree) for degree in range(len(self._times))])
             self._comm.Allreduce(MPI.IN_PLACE, errors)
             self._degree = int(errors.argmin())
         self._times = [*self._times[-MOST:], t0]
-        self._values = [*self._values[-MOST:], v.copy()]
+        self._values = [*self._values[-MOST:], v]
 
     def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Arrays (n, 3) and numbers to go on with after a restart; the newest velocities are the state's."""
@@ -79,8 +77,13 @@ class Extrapolation:
         if not names:
             return
         self._times = [*(float(numbers[name]) for name in names), t0]
-        self._values = [*(np.array(arrays[name]) for name in names), v.copy()]
+        self._values = [*(np.array(arrays[name]) for name in names), v]
         self._degree = int(numbers["degree"])
+
+    def _error(self, t0: float, v: Array, degree: int) -> float:
+        """Square of the difference, on this rank, of v from what was to be expected at t0 [s]."""
+        wrong = (v - self._expected(t0, degree)).ravel()
+        return float(np.dot(wrong, wrong))
 
     def _expected(self, t1: float, degree: int) -> Array:
         times, values = self._times[-degree - 1 :], self._values[-degree - 1 :]

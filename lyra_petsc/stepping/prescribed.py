@@ -23,7 +23,8 @@ class Prescribed:
     at : (m,) int
         Which of all owned unknowns, row by row, are prescribed.
     not_counted : (k,) int
-        Those whose forces a residual is not measured by: the same, but not while vertices are held.
+        Those, ascending, whose forces a residual is not measured by: the same, but not while vertices are
+        held.
     goal : (m,)
         Positions [m] of the prescribed unknowns at the end of the step.
     velocity : (m,)

@@ -26,6 +26,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.linear.block_rows import square_without
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms
@@ -351,7 +352,7 @@ class StageEquations:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
         n, given, free = self.points.n_owned, self.integrator.given, self.prescribed.free
         self.evaluate_at(v)  # what the step's forces are taken at afterwards
-        before, rate_before = self.x[:n].copy(), self.v[:n].copy()
+        before, rate_before = self.x[:n], self.v[:n]
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
         self.integrator.accepted(before, rate_before, free, self.dt)
         self.prescribed.put(moved, self.prescribed.goal)
@@ -759,9 +760,7 @@ class StageEquations:
 
     def _counted(self, name: str, part: Array) -> tuple[str, Array]:
         """A part of F, whose square goes into `largest_force`."""
-        counted = part.copy()
-        np.put(counted, self.prescribed.not_counted, 0.0)
-        self._squares.append(float(np.vdot(counted, counted)))
+        self._squares.append(square_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:

@@ -297,12 +297,7 @@ class Stepper:
         ended = outcome.norm, outcome.left, outcome.at_roundoff
         if velocity is not None:
             if not self._iterates and equations.active.edged:
-                staying = equations.velocity_of_staying()
-                way = velocity - staying
-                if equations.follow_triangles(staying, way):
-                    velocity = staying + way
-                equations.evaluate_at(velocity)
-                equations.turn_frames()
+                velocity = self._with_triangles(velocity)
             equations.accept(velocity)
             if before is not None:
                 assert rate_before is not None
@@ -335,6 +330,17 @@ class Stepper:
             self.linear.reuse.renew()
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
+
+    def _with_triangles(self, velocity: Array) -> Array:
+        """Velocities (n_owned, 3) with directors that go far turned with their triangles; collective."""
+        equations = self._equations
+        staying = equations.velocity_of_staying()
+        way = velocity - staying
+        if equations.follow_triangles(staying, way):
+            velocity = staying + way
+        equations.evaluate_at(velocity)
+        equations.turn_frames()
+        return velocity
 
     def settle_edges(self, floor: float) -> bool:
         """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""

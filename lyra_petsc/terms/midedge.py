@@ -42,6 +42,7 @@ from lyra_petsc.terms.midedge_shape import (
     Frames,
     against,
     carried,
+    carry,
     directions,
     directors,
     largest_angle,
@@ -120,8 +121,8 @@ class MidEdge(Elastic):
         rest = data["rest"] if data["rest"].any() else FLAT
         self._tilt = tilt_of(data)
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
-        self._shapes: Remembered[tuple[Array, ...]] | None = None
-        self._shapes_of: Frames | None = None
+        self._bent: Remembered[Array] | None = None
+        self._bent_of: Frames | None = None
         self._at_end: Frames | None = None  # which have followed already
         self._membrane: Membrane | None = None  # of the same triangles
 
@@ -207,13 +208,14 @@ class MidEdge(Elastic):
         y.ravel()[places] = x.ravel()[places]  # unknowns as they were
         before, after = self._directors(x, frozen)[number], self._directors(y, frozen)[number]
         corners, moved = x[self.stencil[chosen]], way[self.stencil[chosen]]
-        angle, normal, square, e = _angles(corners, before[:, :, :3])
-        turned, _, left, _ = _angles(y[self.stencil[chosen]], after[:, :, :3])
+        angle, normal, square, e = _angles(corners, before)
+        turned, _, left, _ = _angles(y[self.stencil[chosen]], after)
         height = np.sum(moved * normal[:, None, :], axis=2)
         size = np.sqrt(square)[:, None] * np.linalg.norm(e, axis=2)
         with np.errstate(divide="ignore", invalid="ignore"):
             expected = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
-            expected += np.sum(before[:, :, 3:6] * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
+            spins = _spins(sign[:, :, None] * frozen.tangent[number], e)
+            expected += np.sum(spins * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
             turn = np.remainder(turned - angle + np.pi, 2.0 * np.pi) - np.pi
         weight = np.minimum(np.minimum(square, left) / self._constants[2][chosen], 1.0)[:, None]
         weight = np.where(np.isfinite(turn) & np.isfinite(expected), weight, 0.0)
@@ -237,8 +239,11 @@ class MidEdge(Elastic):
         return np.asarray(self.of_edges.length * np.nan_to_num(angle))
 
     def _carried(self, frames: Frames, x: Array) -> Frames:
-        tangent = self._tangents(x)
-        return Frames(tangent, carried(frames, tangent))
+        # in one piece: once they are others, an array larger than either finds room where they were
+        tangent, across = np.empty((2, len(self.of_edges.ends), 3))
+        directions(x, self.of_edges.ends, tangent)
+        carry(*frames, tangent, across)
+        return Frames(tangent, across)
 
     def _tangents(self, x: Array) -> Array:
         tangent = np.empty((len(self.of_edges.ends), 3))
@@ -277,30 +282,28 @@ class MidEdge(Elastic):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def bent(self, x: Array, frames: Frames) -> tuple[Array, Array]:
-        """Directors and what goes with them (n, 6), as by ``midedge_shape.directors``, and their tangents
-        (E, 4), as by ``midedge_shape.tangents``.
-        """
-        if self._shapes is None or self._shapes_of is not frames:
-            self._shapes_of = frames
-            self._shapes = Remembered(lambda at: self._computed(at, frames))
-        shape, tangent = self._shapes(x)
-        return shape, tangent
+    def bent(self, x: Array, frames: Frames) -> Array:
+        """Tangents of directors (E, 4), as by ``midedge_shape.tangents``."""
+        if self._bent is None or self._bent_of is not frames:
+            self._bent_of = frames
+            self._bent = Remembered(lambda at: self._computed(at, frames))
+        return self._bent(x)
 
     def forget(self) -> None:
-        self._shapes = self._shapes_of = None
+        self._bent = self._bent_of = None
 
-    def _computed(self, x: Array, frames: Frames) -> tuple[Array, Array]:
-        shape, tangent = self._directors(x, frames), np.empty((self.n_elements, 4))
-        tangents(x, self.stencil, self.of_edges.of_triangles, shape, self._tilt, tangent)
-        return shape, tangent
+    def _computed(self, x: Array, frames: Frames) -> Array:
+        tangent = np.empty((self.n_elements, 4))
+        director = self._directors(x, frames)
+        tangents(x, self.stencil, self.of_edges.of_triangles, director, self._tilt, tangent)
+        return tangent
 
     def _directors(self, x: Array, frames: Frames) -> Array:
         angle = x.ravel()[self.of_edges.places]
         angle /= self.of_edges.length
         # all at once: NumPy's are several at a time where the processor can
         cosine, sine = np.cos(angle), np.sin(angle, out=angle)
-        out = np.empty((len(angle), 6))
+        out = np.empty((len(angle), 3))
         directors(x, self.of_edges.ends, *frames, cosine, sine, out)
         return out
 
@@ -310,14 +313,13 @@ class MidEdge(Elastic):
     def all_energies(self, x: Array, frozen: Frames, n: int) -> Array:
         """Energy [J] of the first n triangles of this rank, (n,)."""
         out = np.empty(n)
-        midedge_energy.energies(self.bent(x, frozen)[1], *self._constants, out)
+        midedge_energy.energies(self.bent(x, frozen), *self._constants, out)
         return out
 
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
-        sign, bent = self.elements.data["sign"], self.bent(x, frozen)
-        numbers = self.stencil, self.of_edges.of_triangles, self.edges
-        constants = *self._constants, self.of_edges.length
-        midedge_energy.add_gradient(x, *numbers, sign, *bent, *constants, out)
+        numbers = self.stencil, self.of_edges.of_triangles, self.edges, self.elements.data["sign"]
+        bent = frozen.tangent, self.bent(x, frozen), *self._constants
+        midedge_energy.add_gradient(x, *numbers, *bent, self.of_edges.length, out)
 
     def add_hessian(
         self,
@@ -329,11 +331,10 @@ class MidEdge(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        sign, bent = self.elements.data["sign"], self.bent(x, frozen)
-        constants = *self._constants, self.of_edges.length
+        numbers = self.of_edges.of_triangles, self.elements.data["sign"]
+        bent = frozen.tangent, self.bent(x, frozen), *self._constants, self.of_edges.length
         at = offsets[f"{self.name} vertices"], offsets[self.name]
-        numbers = self.of_edges.of_triangles, sign, *bent
-        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
+        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *bent, weight, *at, values)
 
     def largest_turn(self, way: Array) -> float:
         return float(largest_angle(way.ravel(), self.of_edges.places, self.of_edges.length))
@@ -347,7 +348,7 @@ class MidEdge(Elastic):
 
         The angle of a crease at rest is no curvature.
         """
-        found, tilt = self.bent(x, frozen)[1][:, :3].copy(), self._tilt
+        found, tilt = self.bent(x, frozen)[:, :3].copy(), self._tilt
         if len(tilt):
             smooth = tilt[..., 0] > np.cos(CREASED)
             found[smooth] += tilt[..., 1][smooth] / tilt[..., 0][smooth]
@@ -392,6 +393,15 @@ def _angles(corners: Array, director: Array) -> tuple[Array, Array, Array, Array
     normal = unit(normal)
     side = np.sum(director * np.cross(unit(edges), normal[:, None, :]), axis=2)
     return np.arctan2(side, np.sum(director * normal[:, None, :], axis=2)), normal, square, edges
+
+
+def _spins(frame: Array, edges: Array) -> Array:
+    """γ [1/m] of edges (n, 3, 3) [m], as ``midedge_shape.spin``."""
+    square = np.sum(edges * edges, axis=2, keepdims=True)
+    found: Array = np.cross(edges, frame) / (
+        square + np.sqrt(square) * np.sum(frame * edges, axis=2, keepdims=True)
+    )
+    return found
 
 
 def tilt_of(data: Mapping[str, Array]) -> Array:

@@ -20,10 +20,10 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
 
-``tangent`` (E, 4) is as of ``midedge_shape.tangents``, ``shape`` as of ``directors``. Where ``rest``, T̄, is
-empty all of it is 0. With friction, ``friction`` (E, 2) has for each triangle a factor
-c and an energy [J]: by the latter the energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact
-Hessian; without, it is empty.
+``tangent`` (E, 4) is as of ``midedge_shape.tangents``, ``frame`` (n_edges, 3) are the directions of edges'
+frames, of which γ is computed where it is wanted. Where ``rest``, T̄, is empty all of it is 0. With friction,
+``friction`` (E, 2) has for each triangle a factor c and an energy [J]: by the latter the energy is more, and
+by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact Hessian; without, it is empty.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from lyra_petsc.terms.midedge_shape import (
     plain_derivatives,
     put,
     row,
+    spin,
 )
 
 AHEAD = 4
@@ -135,9 +136,10 @@ def _weighted(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _load(  # type: ignore[no-untyped-def]
-    edges, sign, shape, tangent, stiffness, rest, friction, length, first, batch
+    edges, sign, frame, tangent, stiffness, rest, friction, length, first, batch
 ):
-    """Into rows 9 to 36 of a batch γ_i, T, K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c.
+    """Into rows 9 to 36 of a batch the frames' directions, as e_i runs, T, K, T̄ and S̄, ∂φ/∂(unknown) times
+    s, and friction's c.
 
     T̄, S̄ and c that there are none of are left as they are.
     """
@@ -145,9 +147,9 @@ def _load(  # type: ignore[no-untyped-def]
     # several short loops take less time than one that reads everything
     for number in range(BATCH):
         e, i = min(first + number, last), Index(number)
-        put(batch, 9, i, row(shape, edges[e, 0], 3))
-        put(batch, 12, i, row(shape, edges[e, 1], 3))
-        put(batch, 15, i, row(shape, edges[e, 2], 3))
+        put(batch, 9, i, scaled(float(sign[e, 0]), row(frame, edges[e, 0], 0)))
+        put(batch, 12, i, scaled(float(sign[e, 1]), row(frame, edges[e, 1], 0)))
+        put(batch, 15, i, scaled(float(sign[e, 2]), row(frame, edges[e, 2], 0)))
     for number in range(BATCH):
         e, i = min(first + number, last), Index(number)
         put(batch, 18, i, row(tangent, e, 0))
@@ -174,7 +176,8 @@ def _loaded(batch, i):  # type: ignore[no-untyped-def]
     """
     e0, e1, e2 = got(batch, 0, i), got(batch, 3, i), got(batch, 6, i)
     normal = cross(e1, e2)
-    spins, tangent = (got(batch, 9, i), got(batch, 12, i), got(batch, 15, i)), got(batch, 18, i)
+    spins = spin(got(batch, 9, i), e0), spin(got(batch, 12, i), e1), spin(got(batch, 15, i), e2)
+    tangent = got(batch, 18, i)
     slopes = plain_derivatives(tangent[0]), plain_derivatives(tangent[1]), plain_derivatives(tangent[2])
     (k0, k1, k2), (k3, k4, k5) = got(batch, 21, i), got(batch, 24, i)
     (u0, u1, u2), (u3, u4, u5) = got(batch, 27, i), got(batch, 30, i)
@@ -223,7 +226,7 @@ def _compute_forces(batch):  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_gradient(  # type: ignore[no-untyped-def]
-    x, stencil, edges, places, sign, shape, tangent, stiffness, rest, limit, friction, length, out
+    x, stencil, edges, places, sign, frame, tangent, stiffness, rest, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
     flat, batch = out.reshape(-1), np.zeros(46 * BATCH)
@@ -231,7 +234,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
         i = Index(e % BATCH)
         if i == 0:
             load_edges(x, stencil, e, batch)
-            _load(edges, sign, shape, tangent, stiffness, rest, friction, length, e, batch)
+            _load(edges, sign, frame, tangent, stiffness, rest, friction, length, e, batch)
             _compute_forces(batch)
         t0, t1, t2, square = tangent[e, 0], tangent[e, 1], tangent[e, 2], tangent[e, 3]
         if max(abs(t0), abs(t1), abs(t2)) < 1.0 and square >= limit[e]:
@@ -502,7 +505,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
     blend,
     edges,
     sign,
-    shape,
+    frame,
     tangent,
     stiffness,
     rest,
@@ -525,7 +528,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
         i = Index(e % BATCH)
         if i == 0:
             load_edges(x, stencil, e, batch)
-            _load(edges, sign, shape, tangent, stiffness, rest, friction, length, e, batch)
+            _load(edges, sign, frame, tangent, stiffness, rest, friction, length, e, batch)
             _compute(exact, batch)
         t0, t1, t2, square = tangent[e, 0], tangent[e, 1], tangent[e, 2], tangent[e, 3]
         if max(abs(t0), abs(t1), abs(t2)) < 1.0 and square >= limit[e]:

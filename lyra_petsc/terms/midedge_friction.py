@@ -24,7 +24,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import bending, midedge, midedge_energy
 from lyra_petsc.terms.bending import edge_in_material
 from lyra_petsc.terms.midedge import NO_FRICTION, MidEdge
-from lyra_petsc.terms.midedge_shape import Frames, tangents
+from lyra_petsc.terms.midedge_shape import Frames
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
@@ -69,7 +69,6 @@ class MidEdgeFriction(Elastic):
         super().__init__(elements)
         data = elements.data
         self.bent: Array = data["rest"].copy()
-        self._tilt = midedge.tilt_of(data)
         self._slides: Remembered[tuple[Array, ...]] | None = None
         self._frames: Frames | None = None
 
@@ -77,6 +76,9 @@ class MidEdgeFriction(Elastic):
         self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
         assert self.edges is not None
         self._edges = np.searchsorted(sheet.of_edges.places, self.edges).astype(np.int32)
+        theirs = sheet.elements.data["triangle"]
+        order = np.argsort(theirs)
+        self._rows = order[np.searchsorted(theirs, self.elements.data["triangle"], sorter=order)]
 
     @property
     def _sheet(self) -> MidEdge:
@@ -95,8 +97,8 @@ class MidEdgeFriction(Elastic):
         return Sliding(*self._slides(x))
 
     def _computed(self, x: Array, frames: Frames) -> Sliding:
-        half, data, tangent = np.empty(self.n_elements), self.elements.data, np.empty((self.n_elements, 4))
-        tangents(x, self.stencil, self._edges, self._sheet.bent(x, frames)[0], self._tilt, tangent)
+        half, data = np.empty(self.n_elements), self.elements.data
+        tangent = self._sheet.bent(x, frames)[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
         midedge_energy.energies(tangent, *constants, half)
         reach, size = data["reach"], np.sqrt(2.0 * np.maximum(half, 0.0))
@@ -117,10 +119,9 @@ class MidEdgeFriction(Elastic):
         return out
 
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
-        sign, shape = self.elements.data["sign"], self._sheet.bent(x, frozen)[0]
-        numbers, length = (self.stencil, self._edges, self.edges), self._sheet.of_edges.length
-        constants = *self._constants(self._sliding(x, frozen)), length
-        midedge_energy.add_gradient(x, *numbers, sign, shape, *constants, out)
+        numbers = self.stencil, self._edges, self.edges, self.elements.data["sign"]
+        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
+        midedge_energy.add_gradient(x, *numbers, frozen.tangent, *constants, out)
 
     def add_hessian(
         self,
@@ -132,9 +133,8 @@ class MidEdgeFriction(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        sign, shape = self.elements.data["sign"], self._sheet.bent(x, frozen)[0]
         constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
-        numbers = self._edges, sign, shape
+        numbers = self._edges, self.elements.data["sign"], frozen.tangent
         at = offsets[f"{self.name} vertices"], offsets[self.name]
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
@@ -193,7 +193,7 @@ def elements(rest: RestShape) -> Elements:
     form = (area * mean / GIVE)[:, None, None] * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
     data["reach"] = np.sqrt(area * mean * GIVE)
-    for name in ("tangent", "director", "material", "length", "triangle", "damping"):
+    for name in ("tangent", "director", "material", "length", "tilt", "damping"):
         del data[name]
     assert found.edges is not None
     kept = {name: values[rubs] for name, values in data.items()}

@@ -106,7 +106,8 @@ def largest_angle(unknowns, places, length):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
+def carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
+    """As ``carried``, into out (n, 3)."""
     for k in range(len(out)):
         t = present[k, 0], present[k, 1], present[k, 2]
         t0 = tangent[k, 0], tangent[k, 1], tangent[k, 2]
@@ -120,7 +121,7 @@ def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
 def carried(frames: Frames, tangent: Array) -> Array:
     """a (n, 3): a₀ as the smallest rotation carries it to edges of direction ``tangent`` (n, 3)."""
     out = np.empty_like(tangent)
-    _carry(*frames, tangent, out)
+    carry(*frames, tangent, out)
     return out
 
 
@@ -138,27 +139,29 @@ def _turned(t0, a0, t):  # type: ignore[no-untyped-def]
 
 @kernel()
 def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-untyped-def]
-    """Of edges (n, 2): director d and γ [1/m], into out (n, 6).
-
-    γ changes with the edge by −γ ρᵀ, ρ = 2 t / |e| + γ × t, and an antisymmetric part. d is 0 where an edge
-    is too far from its frame.
-    """
+    """Directors d of edges (n, 2) into out (n, 3); 0 where an edge is too far from its frame."""
     for k in range(ends.shape[0]):
         e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
-        length = math.sqrt(dot(e, e))
-        t = scaled(1.0 / length, e)
+        t = scaled(1.0 / math.sqrt(dot(e, e)), e)
         t0 = tangent[k, 0], tangent[k, 1], tangent[k, 2]
         a0 = across[k, 0], across[k, 1], across[k, 2]
-        c, b = dot(t0, t), cross(t0, t)
-        if not c > FARTHEST:
+        if not dot(t0, t) > FARTHEST:
             out[k, :] = 0.0
             continue
         a = _turned(t0, a0, t)
         w = cross(t, a)
-        inverse = 1.0 / (length * (1.0 + c))
         for i in range(3):
             out[k, i] = cosine[k] * a[i] + sine[k] * w[i]
-            out[k, 3 + i] = -inverse * b[i]
+
+
+@kernel(inline="always")
+def spin(t0, e):  # type: ignore[no-untyped-def]
+    """γ [1/m] of an edge e [m] whose frame is of direction t₀.
+
+    It changes with the edge by −γ ρᵀ, ρ = 2 t / |e| + γ × t, and an antisymmetric part.
+    """
+    square = dot(e, e)
+    return scaled(-1.0 / (square + math.sqrt(square) * dot(t0, e)), cross(t0, e))
 
 
 @kernel(inline="always")
@@ -273,9 +276,9 @@ def load_edges(x, stencil, first, batch):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
+def _turned_back(director, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
     """The director of edge i of triangle e, turned about the edge by −ᾱ."""
-    d = row(shape, edges[e, i], 0)
+    d = row(director, edges[e, i], 0)
     if tilt.shape[0] == 0:
         return d
     side, c, s = cross(edge, d), tilt[e, i, 0], -tilt[e, i, 1] / math.sqrt(dot(edge, edge))
@@ -283,14 +286,14 @@ def _turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def
 
 
 @kernel()
-def _load_directors(edges, shape, tilt, first, batch):  # type: ignore[no-untyped-def]
+def _load_directors(edges, director, tilt, first, batch):  # type: ignore[no-untyped-def]
     """Into rows 9 to 17 of a batch the directors of the edges in rows 0 to 8."""
     last = edges.shape[0] - 1
     for number in range(BATCH):
         e, i = min(first + number, last), Index(number)
-        put(batch, 9, i, _turned_back(shape, edges, tilt, e, 0, got(batch, 0, i)))
-        put(batch, 12, i, _turned_back(shape, edges, tilt, e, 1, got(batch, 3, i)))
-        put(batch, 15, i, _turned_back(shape, edges, tilt, e, 2, got(batch, 6, i)))
+        put(batch, 9, i, _turned_back(director, edges, tilt, e, 0, got(batch, 0, i)))
+        put(batch, 12, i, _turned_back(director, edges, tilt, e, 1, got(batch, 3, i)))
+        put(batch, 15, i, _turned_back(director, edges, tilt, e, 2, got(batch, 6, i)))
 
 
 @kernel(inline="always")
@@ -315,8 +318,9 @@ def _compute_tangents(batch):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def tangents(x, stencil, edges, shape, tilt, out):  # type: ignore[no-untyped-def]
-    """T of triangles (E, 3) and |N|² into out (E, 4), of α_i − ᾱ_i by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
+def tangents(x, stencil, edges, director, tilt, out):  # type: ignore[no-untyped-def]
+    """T of triangles (E, 3) and |N|² into out (E, 4), of the angles α_i of directors (n_edges, 3) less ᾱ_i,
+    by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
 
     It may be empty, as those of sheets that are flat at rest.
     """
@@ -325,7 +329,7 @@ def tangents(x, stencil, edges, shape, tilt, out):  # type: ignore[no-untyped-de
         i = Index(e % BATCH)
         if i == 0:
             load_edges(x, stencil, e, batch)
-            _load_directors(edges, shape, tilt, e, batch)
+            _load_directors(edges, director, tilt, e, batch)
             _compute_tangents(batch)
         t0, t1, t2 = got(batch, 18, i)
         if not max(t0, t1, t2) < 2.0:

@@ -7,6 +7,7 @@ import pytest
 from numba.core.errors import TypingError
 
 from lyra_petsc.linear.block_product import half_stored
+from lyra_petsc.linear.block_rows import square_without
 
 N, GHOSTS = 23, 4
 
@@ -53,3 +54,11 @@ def test_other_arrays_are_refused() -> None:
         half_stored(*given, blocks, x.astype(np.float32), sums, out)
     with pytest.raises(TypingError, match="contiguous arrays"):
         half_stored(*given, np.ones((3, 9))[::2], x, sums, out)
+
+
+@pytest.mark.parametrize("left_out", [[], [0], [4], [0, 1, 3], [0, 1, 2, 3, 4]])
+def test_squares_without_entries_that_may_be_anything(left_out: list[int]) -> None:
+    vector = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    expected = float(np.sum(np.delete(vector, left_out) ** 2))
+    vector[left_out] = 1e200
+    assert square_without(vector, np.array(left_out, dtype=np.int64)) == expected

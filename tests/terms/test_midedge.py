@@ -175,7 +175,8 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         x[:n] += random.normal(0.0, 0.05, (n, 3))
         x[term.stencil[7, 2]] = x[term.stencil[7, :2]].mean(axis=0) + 1e-4
         x.ravel()[term.of_edges.places] = directors_along_normals(term, x)
-        shape, tangent = term.bent(x, term.frames)
+        frames, director = term.frames, term._directors(x, term.frames)
+        tangent = term.bent(x, frames)
         length, weight = term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
         assert 0.1 < np.mean(np.abs(tangent[:, :3]) > 1.0) < 0.9
@@ -189,14 +190,14 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
                 bent = np.empty((len(triangles), 4))
-                tangents(x, triangles, edges, shape, midedge.UPRIGHT, bent)
+                tangents(x, triangles, edges, director, midedge.UPRIGHT, bent)
                 constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
                 midedge_energy.energies(bent, *constants, energies[part])
-                given = edges, at, sign, shape, bent, *constants, length
+                given = edges, at, sign, frames.tangent, bent, *constants, length
                 midedge_energy.add_gradient(x, triangles, *given, pull)
                 corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
-                numbers = *constants, length, weight[part], corners, mixed, values
-                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, shape, bent, *numbers)
+                numbers = frames.tangent, bent, *constants, length, weight[part], corners, mixed, values
+                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, *numbers)
             return [energies, pull, values]
 
         for whole, apart in zip(computed(term.n_elements), computed(1), strict=True):
