@@ -56,7 +56,7 @@ def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyp
                         values[k, i, j] = size if row == c and i == j else 0.0
 
 
-@cached(fastmath=True)
+@cached(fastmath={"reassoc", "contract", "nsz"})
 def square_without(vector, left_out):  # type: ignore[no-untyped-def]
     """Sum of the squares of ``vector`` (n,) without those of its entries ``left_out`` (m,), which ascend."""
     total, begin = 0.0, 0

@@ -156,7 +156,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
-    rubbing = term.rubbing(stage, x, frozen, damped.felt, dt, sheets=sheets)
+    rubbing = term.rubbing(stage, x, system.v, frozen, damped.felt, dt, sheets=sheets)
     points, beta, along, ways, more, obstacle, moved = rubbing
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.by_stage:

@@ -47,6 +47,9 @@ than what sticks, all go as far: if what is pressed least, as a sheet's border, 
 sheet would follow long before it has to. Else light pairs go less far, as they must again whenever they part
 and meet."""
 
+BESIDE = 0.3
+"""By how much more than friction may stop what sticks in a step, over that, where less holds what slides:
+formulas of second order overshoot in steps longer than its springs swing."""
 
 SOFTER = 0.25
 """Stiffness between sheets over that on obstacles, of pairs which are pressed little: springs as stiff as the
@@ -148,13 +151,14 @@ class CoulombFriction(Elastic):
         of_vertex = (what[:, 0] != EDGE_EDGE) & (what[:, 2] == 0.0)
         self._vertex = np.where(of_vertex, self.stencil[:, 0], -1)
         self._force = self._limit = self._spring = what[:, FORCE].copy()
+        self._drops = np.zeros(n, dtype=np.bool_)
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(what[:, SLID] > 0.5, kinetic, static) * self._force
             longest = ELASTIC * self._contact.barrier.gap
             stiffest = np.where(self._obstacle < 0, SOFTER, 1.0) * self._stiffest
             self._spring = np.maximum(stiffest, self._limit / longest)
-            drops = kinetic < static
+            self._drops = drops = kinetic < static
             self._spring[drops] = static[drops] * self._force[drops] / longest
             self._limit, self._spring = (what[:, GRIP] * each for each in (self._limit, self._spring))
         self._of: ObstacleMoves | None = None  # what is remembered of a stage
@@ -334,7 +338,15 @@ class CoulombFriction(Elastic):
         self._renew(x, frozen.places, self._known._replace(what=old))
 
     def rubbing(
-        self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
+        self,
+        stage: Array,
+        x: Array,
+        v: Array,
+        frozen: ObstacleMoves,
+        damping: Array,
+        dt: float,
+        *,
+        sheets: bool,
     ) -> Rubbing:
         contact = self._contact
         *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
@@ -357,13 +369,22 @@ class CoulombFriction(Elastic):
         # what sticks is owed nothing, what has just come is given all later
         goes_on = (acted > 0.0) & ((rubs > 0.0) | (given == 0.0))
         self._owed = np.where(goes_on, dt * (owed - pays), 0.0)
-        points, beta, obstacle = self.stencil[rub], self._beta[rub], self._obstacle[rub]
-        length = np.linalg.norm(slip[rub], axis=1, keepdims=True)
-        along = np.divide(slip[rub], length, out=np.zeros((len(rub), 3)), where=length > 0.0)
-        ways = np.einsum("ec,ecim->eim", self._along(along, rub), self._ways[rub])
-        more = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
+        lacks = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
+        # what sticks comes to rest at once: swinging, its springs would pull by twice what holds it still
+        held = np.flatnonzero((self._drops & ~slides)[: self.n_owned])
+        pull = self._spring[held] * np.linalg.norm(slip[held], axis=1)
+        room = (1.0 + BESIDE) * self._limit[held] - pull
+        these = np.concatenate([rub, held])
+        points, beta, obstacle, ways = (
+            of[these] for of in (self.stencil, self._beta, self._obstacle, self._ways)
+        )
         moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
-        return Rubbing(points, beta, along, ways, more, obstacle, moved)
+        rate = np.einsum("ecik,eik->ec", ways, v[points]) - self._along(moved / dt, these)
+        rate[: len(rub)] = self._along(slip[rub], rub)
+        length = np.linalg.norm(rate, axis=1, keepdims=True)
+        rate = np.divide(rate, length, out=np.zeros_like(rate), where=length > 0.0)
+        along, ways = np.einsum("ec,eck->ek", rate, self._tangents[these]), np.einsum("ec,ecim->eim", rate, ways)
+        return Rubbing(points, beta, along, ways, np.concatenate([lacks, room]), obstacle, moved)
 
     def moments(self, x: Array, frozen: ObstacleMoves) -> tuple[Ints, Array]:
         of = np.flatnonzero(self._obstacle[: self.n_owned] < 0)

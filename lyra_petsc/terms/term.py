@@ -214,18 +214,18 @@ class Dashpots(NamedTuple):
 
 
 class Rubbing(NamedTuple):
-    """Pairs that slide, and what friction lacks.
+    """Pairs that slide, and what friction lacks; and those that stick where less holds what slides.
 
     Attributes
     ----------
     points, beta : (m, 4)
         As `Elastic.touching_points` has them.
     along : (m, 3)
-        Unit vectors of the ways that they slid.
+        Unit vectors of the ways that they slid, or go on.
     ways : (m, 4, 3)
         Gradients of the lengths of these by the positions of the points.
     more : (m,)
-        By how much friction [N] was too small in one step; below 0, too large.
+        By how much friction [N] was too small in one step, or may be larger; below 0, too large.
     obstacle : (m,)
         What is touched, −1 between sheets.
     moved : (m, 3)
@@ -518,10 +518,11 @@ class Elastic(Term):
         return 0
 
     def rubbing(
-        self, stage: Array, x: Array, frozen: Any, damping: Array, dt: float, *, sheets: bool
+        self, stage: Array, x: Array, v: Array, frozen: Any, damping: Array, dt: float, *, sheets: bool
     ) -> Rubbing:
-        """What slides in a step of length dt [s] over a stage at positions ``stage`` to x (n_local, 3), in
-        which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that `slips`.
+        """What slides in a step of length dt [s] over a stage at positions ``stage`` to x, with velocities v
+        (n_local, 3), in which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that
+        `slips`.
 
         On obstacles, and with ``sheets`` on sheets.
         """

@@ -131,6 +131,38 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     assert ways[1] > 0.05
 
 
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
+def test_what_is_let_go_where_it_lies_stands_by_friction_at_rest(comm: MPI.Comm, integrator: str) -> None:
+    """Springs of what sticks must not swing beyond what they can hold: by less friction it would slide on."""
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
+
+    def let_go(above: float, static: float, kinetic: float, end: float) -> tuple[float, float]:
+        """Its distance over the gap at the end, and its way [m]."""
+        place = [above * GAP * component for component in NORMAL]
+        content = {
+            "mesh": grid(0.3, 0.3, 3, 3) | {"transform": {"rotate": turn, "translate": place}},
+            "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+            "gravity": [0.0, 0.0, -G],
+            "contact": {"gap": GAP, "friction": {"static": static, "kinetic": kinetic}, "self": False},
+            "obstacles": {"slope": PLANE},
+            "time": {"end": end, "step": 0.01, "integrator": integrator},
+        }
+        simulation = SteppedScene(comm, scene_of(content))
+        system = simulation.problem.system
+        start = system.x.copy()
+        while not simulation.finished:
+            simulation.step()
+        distance, way = (values.mean(axis=0) for values in (system.x, system.x - start))
+        simulation.destroy()
+        return float(distance @ NORMAL) / GAP, float(way @ DOWN)
+
+    lies, _ = let_go(0.95, 3.0, 3.0, 1.0)
+    limit = math.tan(SLOPE)
+    assert let_go(lies, 1.01 * limit, 0.6 * limit, 0.3)[1] < 1.5e-2 * GAP
+    assert let_go(lies, 0.99 * limit, 0.6 * limit, 0.3)[1] > 5.0 * GAP
+
+
 def test_friction_on_what_tilts_has_a_potential(comm: MPI.Comm) -> None:
     """Else no line search finds a way: what turns with a plane beside its normal is no way along it."""
     tilted = {"axis": [1.0, 0.0, 0.0], "degrees": 30.0}
