@@ -383,7 +383,10 @@ class CoulombFriction(Elastic):
         rate[: len(rub)] = self._along(slip[rub], rub)
         length = np.linalg.norm(rate, axis=1, keepdims=True)
         rate = np.divide(rate, length, out=np.zeros_like(rate), where=length > 0.0)
-        along, ways = np.einsum("ec,eck->ek", rate, self._tangents[these]), np.einsum("ec,ecim->eim", rate, ways)
+        along, ways = (
+            np.einsum("ec,eck->ek", rate, self._tangents[these]),
+            np.einsum("ec,ecim->eim", rate, ways),
+        )
         return Rubbing(points, beta, along, ways, np.concatenate([lacks, room]), obstacle, moved)
 
     def moments(self, x: Array, frozen: ObstacleMoves) -> tuple[Ints, Array]:
