@@ -532,11 +532,8 @@ class StageEquations:
         most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
         for _ in range(SEARCHES):
             whole = gone == 0.0 and most == 1.0  # mostly
-            x, ahead = self.ahead(v, way) if whole else self.ahead(v + gone * way, (most - gone) * way)
-            seen = fraction = self.discretisation.largest_step(x, ahead)
-            if seen < FEW:
-                x, ahead = self._look(v + gone * way, (most - gone) * way)
-                seen = fraction = self.discretisation.largest_step(x, ahead)
+            x, ahead, seen = self._look(*((v, way) if whole else (v + gone * way, (most - gone) * way)))
+            fraction = seen
             if self.discretisation.near:
                 frozen = self.active.frozen
                 parts = [term.largest_step(x, ahead, frozen[term]) for term in self.active.limiting]
@@ -548,12 +545,17 @@ class StageEquations:
                 break
         return gone
 
-    def _look(self, v: Array, way: Array) -> tuple[Array, Array]:
-        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `ahead` gives;
-        collective.
+    def _look(self, v: Array, way: Array, least: float = FEW) -> tuple[Array, Array, float]:
+        """What `ahead` gives for the way from v by ``way`` (n_owned, 3) [m/s], and the part of it on which
+        stencils are known; where that is less than ``least``, they are searched all along it; collective.
         """
-        self._follow(*self.ahead(v, way))
-        return self.ahead(v, way)
+        x, ahead = self.ahead(v, way)
+        seen = self.discretisation.largest_step(x, ahead)
+        if seen >= least:
+            return x, ahead, seen
+        self._follow(x, ahead)
+        x, ahead = self.ahead(v, way)
+        return x, ahead, self.discretisation.largest_step(x, ahead)
 
     def pushed_apart(self, v: Array, way: Array) -> Array | None:
         """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
@@ -564,9 +566,7 @@ class StageEquations:
         """
         if not self.active.limiting:
             return None
-        x, ahead = self.ahead(v, way)
-        if self.discretisation.largest_step(x, ahead) < 1.0:
-            x, ahead = self._look(v, way)
+        x, ahead, _ = self._look(v, way, 1.0)
         if not self.discretisation.near:
             return None
         n, frozen, pushed = len(way), self.active.frozen, False
@@ -584,9 +584,7 @@ class StageEquations:
 
     def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
         """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
-        x, ahead = self.ahead(v, way)
-        if self.discretisation.largest_step(x, ahead) < 1.0:
-            x, ahead = self._look(v, way)
+        x, ahead, _ = self._look(v, way, 1.0)
         frozen = self.active.frozen
         found = {term: term.springs(x, ahead, frozen[term]) for term in self.active.limiting}
         return {term: springs for term, springs in found.items() if springs is not None}
@@ -671,12 +669,7 @@ class StageEquations:
         """
         gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
-            there = v + gone * way, (1.0 - gone) * way
-            x, ahead = self.ahead(*there)
-            seen = self.discretisation.largest_step(x, ahead)
-            if seen < FEW:
-                x, ahead = self._look(*there)
-                seen = self.discretisation.largest_step(x, ahead)
+            x, ahead, seen = self._look(v + gone * way, (1.0 - gone) * way)
             ahead *= seen
             part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
             free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
