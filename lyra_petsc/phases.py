@@ -42,8 +42,11 @@ JACOBIAN_AGAIN = "AssembleAgain"
 FROZEN = "AssembleFrozen"
 """Once an attempt at a step: damping, loads and geometry that stay as they are during it."""
 
-SWEEP, TRANSFER, GALERKIN = "MGSweep", "MGTransfer", "MGGalerkin"
-"""Of the multigrid: a level's Gauss-Seidel sweep, transfers between levels, coarser matrices."""
+GALERKIN = "MGGalerkin"
+"""Of the multigrid: coarser matrices."""
+
+SWEEP, TRANSFER = PETSc.Log.Event("MGSweep"), PETSc.Log.Event("MGTransfer")
+"""A level's Gauss-Seidel sweep, and transfers between levels; both too often to look them up by name."""
 
 COMPILE = PETSc.Log.Event("CompileKernels")
 """Once for each kernel that is compiled and not loaded from the disk, with those that it calls."""

@@ -120,7 +120,8 @@ class BlockRows:
         if not term.n_elements:
             return
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
-        weights = np.require(weights, requirements=("C", "W"))  # as kernels are compiled for
+        if not weights.flags.carray:  # as kernels are compiled for
+            weights = weights.copy()
         term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, predicted)
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:

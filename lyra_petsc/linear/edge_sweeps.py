@@ -22,6 +22,7 @@ from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, sca
 from lyra_petsc.linear.edge_couplings import AHEAD_EDGES
 from lyra_petsc.linear.gauss_seidel import (
     NEGLIGIBLE,
+    begin,
     flushed,
     invert_diagonal,
     negligible,
@@ -70,15 +71,6 @@ def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
     for k in range(Index(len(weight))):
         total += weight[k] * (blocks[k, 0] + blocks[k, 4] + blocks[k, 8])
     return total
-
-
-@cached()
-def _begin(b, n, n_owned, r, of_edges):  # type: ignore[no-untyped-def]
-    """b (n_local, 3) of the first n rows into r (n_local, 4), of other owned rows into of_edges."""
-    for row in range(Index(n)):
-        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
-    for row in range(Index(n), Index(n_owned)):
-        of_edges[row, 0], of_edges[row, 1], of_edges[row, 2] = b[row, 0], b[row, 1], b[row, 2]
 
 
 @cached(fastmath=True)
@@ -305,7 +297,8 @@ class SweepsWithEdges:
         if not self._clean:
             self._changing[:] = 0.0
             self._clean = True
-        _begin(b, n, n_owned, self.r, self.of_edges)
+        begin(b, self.r[:n])
+        self.of_edges[n:n_owned] = b[n:n_owned]
         self.r[n_owned:] = 0.0  # to which turns of edges are added
 
     def add(self, rows: Ints, more: Floats) -> None:

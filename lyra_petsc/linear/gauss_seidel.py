@@ -221,6 +221,13 @@ def add_interpolated(start, parents, weights, free, coarse, x):  # type: ignore[
         x[row, 2] += free[row, 2] * e2
 
 
+@cached()
+def begin(b, r):  # type: ignore[no-untyped-def]
+    """The first rows of b (n_local, 3) into r (n, 4)."""
+    for row in range(Index(len(r))):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+
+
 class BlockSweeps:
     """Sweeps over a pattern's rows, and their residual.
 
@@ -268,7 +275,7 @@ class BlockSweeps:
 
     def begin(self, b: Floats) -> None:
         """Let the residual be b (n_local, 3): x is zero."""
-        self.r[:, :3] = b[: len(self.r)]
+        begin(b, self.r)
 
     def add(self, rows: Ints, more: Floats) -> None:
         """Add to the residual of rows (n,)."""

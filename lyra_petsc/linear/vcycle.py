@@ -133,6 +133,7 @@ class Smoother:
             growth = (sums[found, None] - SAFE) / 2.0
             self._sweeps.shrink(rows, 1.0 + growth)
             self._increase = (growth * diagonal[found]).astype(np.float32).reshape(-1, 3, 3)
+        self._seen = np.zeros((len(found), 3), dtype=np.float32)
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
@@ -144,19 +145,19 @@ class Smoother:
         else:
             self.x[:] = 0.0
             self._sweeps.begin(self.b)
-            self._seen = np.zeros((len(self._lagged), 3), dtype=np.float32)
+            self._seen[:] = 0.0
         seen = self.x[self.points.n_owned :].copy()
-        with PETSc.Log.Event(SWEEP):
+        with SWEEP:
             self._sweeps.backward(self.x)
             PETSc.Log.logFlops(self._sweeps.flops)
         self._subtract_ghosts(seen)
         for number in range(1, self.n_sweeps):
             seen = self.x[self.points.n_owned :].copy()
-            with PETSc.Log.Event(SWEEP):
+            with SWEEP:
                 self._sweeps.backward_again(self.x, number)
                 PETSc.Log.logFlops(self._sweeps.flops)
             self._subtract_ghosts(seen)
-        with PETSc.Log.Event(TRANSFER):
+        with TRANSFER:
             if self._turns is not None:
                 assert not isinstance(self._sweeps, sweeps.BlockSweeps)
                 self._turns.gather(self._sweeps.of_edges, self._sweeps.r)
@@ -185,7 +186,7 @@ class Smoother:
 
         Ghosts are interpolated here as by their owners, without a message: ``before`` left them up to date.
         """
-        with PETSc.Log.Event(TRANSFER):
+        with TRANSFER:
             self._coarse.update_ghosts(coarse)
             self._add_interpolated(coarse)
             PETSc.Log.logFlops(self._transfer_flops)
@@ -199,7 +200,7 @@ class Smoother:
         if len(lagged):
             right, self._seen = self.b[lagged], self.x[lagged]
             self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
-        with PETSc.Log.Event(SWEEP):
+        with SWEEP:
             self._sweeps.forward(self.b, self.x, number)
             PETSc.Log.logFlops(self._sweeps.flops)
         if len(lagged):
