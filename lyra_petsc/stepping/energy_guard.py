@@ -306,7 +306,8 @@ class EnergyGuard:
         meets = strict and self._system.touches and self._system.integrator.order > 1
         most, most_in_all = (IMPACT_GAIN, IMPACT_SUM) if meets else (LARGEST_GAIN, LARGEST_SUM)
         good = of_step <= max(most * new.scale, step.noise)
-        good = good and of_steps <= max(most_in_all * new.scale, step.noise)
+        # one that makes nothing cannot mend what others made
+        good = good and (of_steps <= max(most_in_all * new.scale, step.noise) or new.recent[-1] <= 0.0)
         good = bool(self._system.points.comm.bcast(good, root=0))
         if good:
             self.gains, self._pull = new, self._next_pull

@@ -303,8 +303,13 @@ class SteppedScene:
                         halvings += 1
             rejected += 1
         if system.integrator is not self._usual:
+            by_end = system.integrator.order == 1
             system.integrator = self._usual
             self._usual.disturbed()
+            if by_end:  # before velocities jumped at the end, over which stiff damping would accelerate much
+                rate = (system.stage_velocity - v_before[:n]) / (end - self.time)
+                moves = system.prescribed.free & (system.mass[:, None] > 0.0)
+                self._usual.start_from(np.where(moves, rate, 0.0))
             if self.local_error is not None:
                 self.local_error.disturbed()
         if self._equilibrium is not None and self.control.is_end(end):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from physics import grid, scene_of, shape
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.energy_guard import _with_gain
+from lyra_petsc.stepping.energy_guard import Balance, GuardState, _with_gain
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
@@ -108,6 +108,39 @@ def test_what_is_given_back_of_a_loss_passes_out_of_sight_with_it() -> None:
     assert _with_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
     assert _with_gain([-0.2], 0.05, 1) == [-0.2, 0.05]
     assert _with_gain([0.1], -0.05, 4) == [0.1, -0.05]
+
+
+def test_a_step_that_makes_nothing_stands_whatever_others_made() -> None:
+    """As where contact begins, with less that may be made in all."""
+    one = simulation(MPI.COMM_SELF, "alpha2", FREE)
+    assert one.guard is not None
+    stood = []
+    for gain in (-1e-6, 1e-6):
+        one.guard.gains = GuardState(start=0.0, scale=1.0, total=0.2, recent=[0.2])
+        step = Balance(gain, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1e-12)
+        stood.append(one.guard.stands(step, strict=True))
+    one.destroy()
+    assert stood == [True, False]
+
+
+@pytest.mark.parallel(2)
+def test_after_backward_euler_stiff_damping_makes_no_energy(comm: MPI.Comm) -> None:
+    """Moments curl a plate on a floor and let go of it: velocities jump where it touches."""
+    content = {
+        "mesh": grid(0.4, 0.4, 4, 4, "alternating") | {"transform": {"translate": [-0.2, -0.2, 0.03]}},
+        "material": {"young": 1e7, "poisson": 0.3, "thickness": 0.001, "density": 0.3, "damping": 0.005},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"friction": 0.4},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}},
+        "loads": [{"group": "left", "moment": 0.05}, {"group": "right", "moment": -0.05, "from": 0.1}],
+        "solver": {},
+    }
+    one = simulation(comm, "bdf2", content, 0.25, 0.005)
+    run(one)
+    notes, rejected = list(one.notes), one.totals["rejected"]
+    one.destroy()
+    assert any("repeated by backward Euler" in note for note in notes)
+    assert rejected < 20
 
 
 def test_a_step_that_was_repeated_is_counted() -> None:

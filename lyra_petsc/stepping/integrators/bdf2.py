@@ -113,10 +113,11 @@ class Bdf2(Integrator):
         for i, (x, v, dt) in enumerate(self._past):
             arrays |= {f"past_position_{i}": x, f"past_velocity_{i}": v}
             numbers[f"past_dt_{i}"] = dt
-        return arrays, numbers
+        return arrays if self._past else self._starter.memory()[0], numbers
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
         self._starter = GeneralisedAlpha(0.0)
+        self._starter.restore(arrays, numbers)
         self._past = [
             (arrays[f"past_position_{i}"], arrays[f"past_velocity_{i}"], float(numbers[f"past_dt_{i}"]))
             for i in range(2)
