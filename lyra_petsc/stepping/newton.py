@@ -181,7 +181,7 @@ class Newton:
         if self._contact is not None and not useless:
             changed |= self._foresee(x, residual, y)
         bent = self._arcs is not None and self.globalisation.trusts and self._bend(x, residual, y)
-        if self.globalisation.trusts and not bent:
+        if self._equations.active.edged and self.globalisation.trusts and not bent:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps and not bent:
             changed |= self._limit(x, residual, y)

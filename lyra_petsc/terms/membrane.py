@@ -143,7 +143,7 @@ def kernels_of(law: str) -> Kernels:
     ):
         """Add weight (E,) times the Hessian blocks [N/m] to the block rows, where ``offsets`` say.
 
-        Their geometric part has the stress of the strain at z, linearised at y; y = z = x: exact. The
+        Their geometric part has the stress of the strain at z, linearised at y; without these, at x. The
         regularised one has in its place what extension along the material axes alone makes, none of it
         compressive, as the original Lyra. A translation does nothing, so that three blocks are enough.
         """
@@ -151,7 +151,10 @@ def kernels_of(law: str) -> Kernels:
             fetch_ahead(e, offsets, values, 6)
             m, w = Index(law[e]), weight[e] * area[e]
             f = _deformation(x, s, e, inverse)
-            e0, e1, e2 = _linearised(_deformation(z, s, e, inverse), _deformation(y, s, e, inverse))
+            if y is None:
+                e0, e1, e2 = _green(f)
+            else:
+                e0, e1, e2 = _linearised(_deformation(z, s, e, inverse), _deformation(y, s, e, inverse))
             s0, s1, s2 = stress(e0, e1, e2, c, m)
             c11, c12, c22, c33, c13, c23 = tangent(e0, e1, e2, c, m)
             if blend > 0.0:
@@ -224,7 +227,7 @@ class Membrane(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        y, z = (x, x) if predicted is None else predicted
+        y, z = (None, None) if predicted is None else predicted
         constants = self._inverse, self._area, *self.laws
         self._kernels.add_hessian(
             x, y, z, self.stencil, blend, *constants, weight, offsets[self.name], values
