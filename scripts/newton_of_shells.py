@@ -2,12 +2,13 @@
 
     python scripts/newton_of_shells.py [NAME[:CELLS,CELLS…]] …
 
-NAME is annulus, hemisphere, open-cylinder, half-cylinder or diaphragms; without names all of them. The table
-has the cells along a side, Newton and linear iterations, CPU time [s] and the longest way of a vertex [m].
-All
-but the annulus are meshes of pattern `alternating`.
+NAME is annulus, hemisphere, open-cylinder, half-cylinder, diaphragms or channel; without names all of them.
+The table has the cells along a side (of the channel: across a flange), Newton and linear iterations, CPU time
+[s] and the longest way of a vertex [m]. All but the annulus are meshes of pattern `alternating`.
 
-Source of the shells: Sze, Liu & Lo, Finite Elements in Analysis and Design 40 (2004) 1551-1569.
+Sources of the shells: Sze, Liu & Lo, Finite Elements in Analysis and Design 40 (2004) 1551-1569; of the
+channel Chroscielewski, Makowski & Stumpf, Int. J. Numer. Meth. Engng 35 (1992) 63-94, with a load beyond its
+limit.
 """
 
 from __future__ import annotations
@@ -88,12 +89,31 @@ def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
     )
 
 
+def channel(bench: Bench, n: int) -> dict[str, Any]:
+    """Thin cantilever that 150 N at a corner of its free end twist until it snaps."""
+    length, flange, web = 36.0, 2.0, 6.0
+    flat, faces = rectangle(
+        round(0.5 * n * length / flange), 5 * n, length, 2.0 * flange + web, alternating=True
+    )
+    along, across = flat[:, 0], flat[:, 1] - flange
+    up = np.clip(across, 0.0, web)
+    vertices = np.column_stack([along, np.abs(across - up), up])
+    corner = int(np.argmin(np.linalg.norm(vertices - [length, 0.0, web], axis=1)))
+    return scene(
+        bench.mesh(vertices, faces),
+        {"young": 1e7, "poisson": 0.333, "thickness": 0.05, "density": 1.0},
+        handles=[{"box": plane_box("x", 0.0, length), "clamp": True}],
+        loads=[{"nodes": [corner], "force": [0, 0, -150.0]}],
+    )
+
+
 SHELLS: dict[str, tuple[Callable[[Bench, int], dict[str, Any]], tuple[int, ...]]] = {
     "annulus": (annulus, (6, 12)),
     "hemisphere": (hemisphere, (16,)),
     "open-cylinder": (open_cylinder, (16, 24)),
     "half-cylinder": (half_cylinder, (12, 16, 24)),
     "diaphragms": (diaphragms, (16, 24)),
+    "channel": (channel, (2, 3)),
 }
 
 

@@ -57,6 +57,9 @@ GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
 LEAP, LEAP_ITERATIONS = 1e3, 30
 """Further growth of Δτ, until such a solve has taken more iterations; so it is with what sufficed before."""
 
+MOST_RESUMED = 3
+"""Such solves in a load step that are gone on with where they ended: a snap may take more iterations."""
+
 BELOW, RISE = 0.5, 2.0
 """With contact, how far Δτ may grow over one that was too long, and by what that grows in each solve: sheets
 fall for a while before they rest, during which longer ones fail again and again.
@@ -194,7 +197,7 @@ class Equilibrium:
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
         system.applied.factor = factor
-        newton = linear = solves = anew = 0
+        newton = linear = solves = anew = resumed = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
         touched = system.active.touched()
@@ -251,6 +254,8 @@ class Equilibrium:
                 self._careful = max(min(self._careful, BELOW * ceiling), self._integrator.pseudo)
                 ceiling *= RISE
                 self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
+            elif leap and resumed < MOST_RESUMED and self._go_on(attempt):
+                resumed += 1
             elif leap:  # too far, also where without inertia no preconditioner can be set up
                 leaps = self._sufficed == ANY and not arrived and not touches
                 self._integrator.pseudo = self._careful
@@ -349,6 +354,23 @@ class Equilibrium:
         self._stepper.snes.setTolerances(max_it=allowed)
         self._stepper.convergence.farthest = np.inf
         return attempt
+
+    def _go_on(self, attempt: Attempt) -> bool:
+        """Let the state be the iterate of least energy of a solve that ran out of iterations on its way down,
+        if it did; collective.
+
+        Not with contact, whose stencils may be others there, nor where loads would follow.
+        """
+        system = self._system
+        out = attempt.newton_iterations >= LEAP_ITERATIONS
+        if not out or self._follows or system.discretisation.guards:
+            return False
+        lowest = self._stepper.lowest()
+        if lowest is None:
+            return False
+        system.state.set(lowest, np.zeros_like(lowest))
+        system.active.carry_frames(system.x)
+        return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:
         """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -36,6 +37,8 @@ class Watchdog:
     ----------
     best : PETSc.Vec or None
         The iterate of least energy.
+    energy : float
+        That energy [W].
     lost : bool
         The next step must lead back to it.
     """
@@ -46,7 +49,7 @@ class Watchdog:
 
     def begin(self) -> None:
         """A new solve."""
-        self._energy = math.inf
+        self.energy = math.inf
         self._excess = math.inf
         self._left = PATIENCE
         self._searches, self._penalty = 0, PENALTY
@@ -62,16 +65,16 @@ class Watchdog:
         """Note iterate u of this energy, known to ``noise``; collective."""
         if self._searches > 0:
             self._searches -= 1
-        if not energy > self._energy + noise:
-            if energy < self._energy - noise:
+        if not energy > self.energy + noise:
+            if energy < self.energy - noise:
                 self._left, self._excess = PATIENCE, math.inf
             elif self._left > 1:  # two iterates may take turns
                 self._left -= 1
-            self._energy = energy
+            self.energy = energy
             self._forget()
             self.best = u.copy()
             return
-        excess = energy - self._energy
+        excess = energy - self.energy
         self._left -= 1
         if excess < HALVED * self._excess:
             self._excess = excess
@@ -113,6 +116,7 @@ class Globalisation:
         self._snes, self._equations, self._convergence = snes, equations, convergence
         self._shape = (equations.points.n_owned, 3)
         self._watchdog = Watchdog()
+        self._first = -math.inf
         self.begin()
 
     def begin(self) -> None:
@@ -130,7 +134,19 @@ class Globalisation:
         kinks = self._equations.touches and self._equations.integrator.moves
         self._near = kinks and not self._convergence.balanced
         energy, size = self._at
+        if self._snes.getIterationNumber() == 0:
+            self._first = energy
         self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
+
+    def lowest(self) -> Array | None:
+        """The iterate (n_owned, 3) [m/s] of least energy since frames last followed, if that is less than the
+        first one's.
+        """
+        best = self._watchdog.best
+        if best is None or not self._watchdog.energy < self._first:
+            return None
+        found: Array = best.getArray(readonly=True).reshape(self._shape).copy()
+        return found
 
     def go_back(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let the step y lead back to the best iterate if full steps have led nowhere; whether it does."""

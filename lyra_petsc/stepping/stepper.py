@@ -428,6 +428,16 @@ class Stepper:
         """
         return self._newton.tangent(force)
 
+    def lowest(self) -> Array | None:
+        """Positions (n_owned, 3) of the iterate of least energy of the last solve, if that is less than where
+        Newton's method started; collective.
+        """
+        velocity = self._newton.globalisation.lowest()
+        if velocity is None:
+            return None
+        positions: Array = self._equations.evaluate_at(velocity)[0][: len(velocity)].copy()
+        return positions
+
     @property
     def convergence(self) -> Convergence:
         """The test that ends its nonlinear solves."""

@@ -11,6 +11,7 @@ from physics import grid, rotation, scene_of
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
+from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.arcs import FARTHEST, STRAIGHT, Arcs
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -108,3 +109,29 @@ def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> N
         while not trial.simulation.finished:
             newton += trial.step().newton_iterations
     assert newton <= most
+
+
+def test_a_leap_that_runs_out_of_iterations_is_gone_on_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, starts = Bench(MPI.COMM_SELF, exact=False), list[np.ndarray]()
+    content = open_cylinder_scene(bench, 8, "alternating")[0] | {
+        "gravity": [0, 0, 0],
+        "time": {"analysis": "static", "step": 0.1},
+        "petsc": {"ts_adapt_dt_max": 0.1},
+    }
+    solve = equilibrium.Equilibrium._solve
+
+    def watched(self: equilibrium.Equilibrium, before: float, factor: float, most: int | None) -> Any:
+        starts.append(self._system.x.copy())
+        return solve(self, before, factor, most)
+
+    monkeypatch.setattr(equilibrium.Equilibrium, "_solve", watched)
+    found = []
+    for most in (equilibrium.LEAP_ITERATIONS, 3):
+        starts.clear()
+        monkeypatch.setattr(equilibrium, "LEAP_ITERATIONS", most)
+        with bench.simulation(content) as trial:
+            trial.step()
+            found.append(trial.x)
+            moved, n = np.abs(trial.x - trial.start).max(), len(trial.x)
+    assert np.abs(starts[1] - starts[0])[:n].max() > 0.5 * moved
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4 * moved)
