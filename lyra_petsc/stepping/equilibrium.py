@@ -75,7 +75,7 @@ MOST_ITERATIONS, GIVEN_UP = 20, 1e6
 """Of Newton's method with all of the stiffness, and the growth of the force in one, by stretching, at which
 it is given up."""
 
-HARD = 40
+HARD = 14
 """Newton iterations of a load step after which all of the stiffness is tried first in the next one."""
 
 NO_POTENTIAL = (
