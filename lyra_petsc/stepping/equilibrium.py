@@ -71,7 +71,7 @@ LONGEST = 1e7
 ANY = float(np.finfo(np.float64).max)
 """Beyond all Δτ."""
 
-HARD = 40
+HARD = 14
 """Newton iterations of a load step after which all of the stiffness is tried first in the next one."""
 
 NO_POTENTIAL = (

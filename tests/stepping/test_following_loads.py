@@ -150,6 +150,13 @@ def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
+def test_long_increments_take_few_iterations(comm: MPI.Comm) -> None:
+    tip, newton, _ = curled(comm, 50.0, 0.25)
+    np.testing.assert_allclose(tip, pressed_tip(50.0), atol=6e-3)
+    assert newton <= 75  # 62; 101 where all of the stiffness is tried first after 40 iterations alone
+
+
+@pytest.mark.parallel
 def test_it_curls_on_where_the_symmetric_part_is_indefinite(comm: MPI.Comm) -> None:
     """From 57 B/L³ on; all of the stiffness is regular, as the rod has one shape at each load."""
     tip, newton, notes = curled(comm, 80.0, 0.125)
