@@ -336,7 +336,8 @@ def _ends(kind, points, e, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
 @leaf()
 def _note(number, ends, at, count, apart, beta, e, one, other, share, delta, b1, b2, b3):  # type: ignore[no-untyped-def]  # fmt: skip
     """Count a nearest point on an edge, or twice a vertex, ``share`` times; how many there are."""
-    both, place = (min(one, other) << 32) | max(one, other), 0
+    both = (min(one, other) << 32) | (max(one, other) & 0xFFFFFFFF)  # points of obstacles are below 0
+    place = 0
     while place < number and ends[place] != both:
         place += 1
     if place < number:

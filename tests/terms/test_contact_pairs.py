@@ -578,6 +578,22 @@ def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
     assert np.abs(np.diff(along, 2)).max() < 0.1 * np.abs(np.diff(along)).max()
 
 
+def test_a_vertex_feels_an_obstacle_as_it_feels_a_sheet() -> None:
+    """Whose points have numbers below 0, so that edges are told apart in another way."""
+    pairs, x, _, shares = before_a_surface(0.1)
+    x[25:, :2], x[25:, 2] = [[2, 2], [2.01, 2.02], [1.98, 2], [1.99, 1.99], [3.01, 2.01]], 0.2
+    found, _, _ = felt_before(x, pairs, shares)
+    places = np.column_stack([pairs[:, :1] - 25, ~pairs[:, 1:]])
+    n = len(pairs)
+    of = np.full(n, VERTEX_TRIANGLE), places, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
+    met = met_of(x[25:].copy(), x[:25].copy(), *of, shares, counted=n, room=999)
+    assert len(met["at"]) == len(found["at"])
+    for vertex in range(5):
+        here, there = (each["weight"][pairs[each["at"], 0] == 25 + vertex] for each in (met, found))
+        np.testing.assert_allclose(np.sort(here), np.sort(there), atol=1e-12)
+    assert met["weight"] @ met["energy"] == pytest.approx(found["weight"] @ found["energy"], rel=1e-12)
+
+
 def test_negative_normal_forces_are_taken_off_those_of_the_same_side() -> None:
     up, down = [0.0, 0.0, 1.0], [0.0, 0.1, -1.0]
     # two vertices; the first one is between two layers, and that below it is hollow
