@@ -145,10 +145,15 @@ class Meeting(NamedTuple):
     felt: Array
 
     @property
+    def square(self) -> Array:
+        """|g|² [m²], (m,)."""
+        found: Array = np.einsum("mk,mk->m", self.felt[:, :3], self.felt[:, :3])
+        return found
+
+    @property
     def stiffness(self) -> Array:
         """b″ times the square of the distance's gradient [N/m], (m,)."""
-        found: Array = np.einsum("mk,mk,m->m", self.felt[:, :3], self.felt[:, :3], self.felt[:, 4])
-        return found
+        return self.felt[:, 4] * self.square
 
 
 _NONE = np.empty(0)
@@ -736,7 +741,7 @@ class ContactBarrier(Elastic):
 
     def dashpots(self, x: Array, frozen: Places) -> Dashpots:
         met = self.meeting(x, frozen.after)
-        square = np.sum(met.felt[:, :3] ** 2, axis=1)
+        square = met.square
         of = np.flatnonzero((met.weight > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
         at, square, beta = met.at[of], square[of], met.beta[of]
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]

@@ -422,9 +422,18 @@ def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
     return 10 + 2 * common - size - others
 
 
+@leaf()
+def _precedes(keys, a, others, b):  # type: ignore[no-untyped-def]
+    """Whether the key in row a comes before that of others in row b."""
+    for k in range(10):
+        if keys[a, k] != others[b, k]:
+            return keys[a, k] < others[b, k]
+    return False
+
+
 @kernel()
 def find(keys, among, what, place):  # type: ignore[no-untyped-def]
-    """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does.
+    """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does; both ascend.
 
     Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 34);
     of those that slide, whose elastic parts are equally long, the one with the larger normal force.
@@ -436,7 +445,14 @@ def find(keys, among, what, place):  # type: ignore[no-untyped-def]
     for b in range(len(among)):
         row = Index(among[b, 0] & (room - 1))
         following[b], first[row] = first[row], b
+    same = 0
     for a in range(len(keys)):
+        while same < len(among) and _precedes(among, same, keys, a):
+            same += 1
+        alone = same + 1 >= len(among) or _precedes(among, same, among, same + 1)
+        if same < len(among) and alone and not _precedes(keys, a, among, same):
+            place[a] = same  # none is more alike
+            continue
         place[a], best, longest, largest = -1, -1, 0.0, 0.0
         b = first[Index(keys[a, 0] & (room - 1))]
         while b >= 0:
