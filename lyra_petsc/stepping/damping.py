@@ -125,6 +125,14 @@ class Damping:
             return self._multiple.product(self._blocks, v)
         return self._blocks.product(self._own(), v)
 
+    def product_at(self, x: Array, v: Array) -> Array:
+        """D v with the geometry of positions x (n_local, 3); that of the step is there again afterwards."""
+        kept, self._at, self._stored = self._at, x, False
+        out = self._blocks.product(self._own(), v)
+        self._at, self._stored = kept, False
+        self.product.forget()
+        return out
+
     def into(self, values: Array, diagonal: Array) -> None:
         """Let ``values`` (n_stored, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
         self.let_go()

@@ -204,10 +204,9 @@ class EnergyGuard:
         system = self._system
         if not system.damping.acts or system.integrator.order == 1 or system.integrator.by_stage:
             return works, 0.0
-        # about the middle, chords of what turns stretch nothing
-        system.damping.freeze(0.5 * (x0 + x1), system.damping.frozen)
         moved = x1 - x0
-        force = system.damping.product(moved / system.dt)
+        # about the middle, chords of what turns stretch nothing
+        force = system.damping.product_at(0.5 * (x0 + x1), moved / system.dt)
         heat = float(np.vdot(force, moved[: len(force)]))
         return replace(works, damping=force.take(system.prescribed.at)), heat - works.damped
 
