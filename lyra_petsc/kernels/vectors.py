@@ -29,14 +29,14 @@ def _check(*arrays: Any) -> None:
         raise TypingError("contiguous arrays of two dimensions and one type are expected")
 
 
-def _without_result(names: str, given: tuple[Any, ...], write: Callable[[Code], None]) -> Any:
+def _without_result(write: Callable[[Code], None], **given: Any) -> Any:
     """What numba takes of an operation with these arguments, which ``write`` writes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        write(Code(context, builder, signature, arguments, names))
+        write(Code(context, builder, signature, arguments, " ".join(given)))
         return context.get_dummy_value()
 
-    return types.void(*given), generate
+    return types.void(*given.values()), generate
 
 
 def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
@@ -83,7 +83,7 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
             target = code.at(vectors, code.number(numbers, k), WIDTH)
             code.store(code.plus(code.load(target), total), target)
 
-    return _without_result("blocks columns out lo hi factors", (blocks, columns, out, lo, hi, factors), write)
+    return _without_result(write, blocks=blocks, columns=columns, out=out, lo=lo, hi=hi, factors=factors)
 
 
 def _gather_edges(typing: Any, blocks: Any, places: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
@@ -134,7 +134,7 @@ def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi:
                 more = code.builder.extract_element(total, LANE(i))
                 code.builder.store(code.plus(code.builder.load(target), more), target)
 
-    return _without_result("blocks places out lo hi factors", (blocks, places, out, lo, hi, factors), write)
+    return _without_result(write, blocks=blocks, places=places, out=out, lo=lo, hi=hi, factors=factors)
 
 
 def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) -> Any:
@@ -152,7 +152,7 @@ def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) ->
             eight = code.plus(eight, code.identity(diagonal))
             code.add_block(code.at(begin, code.builder.ashr(at, INDEX(1)), 9), eight, ninth)
 
-    return _without_result("blocks at diagonal pairs", (blocks, at, diagonal, pairs), write)
+    return _without_result(write, blocks=blocks, at=at, diagonal=diagonal, pairs=pairs)
 
 
 def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
@@ -172,7 +172,7 @@ def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -
             blocks.append((eight, ninth))
         code.add_six(offsets, blocks)
 
-    return _without_result("blocks offsets e n six", (blocks, offsets, e, n, six), write)
+    return _without_result(write, blocks=blocks, offsets=offsets, e=e, n=n, six=six)
 
 
 def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three: Any) -> Any:
@@ -193,7 +193,7 @@ def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three:
             made.append((code.plus(eight, code.identity(g)), ninth))
         _add_balanced(code, code.six_offsets(), made)
 
-    return _without_result("blocks offsets e f three", (blocks, offsets, e, f, three), write)
+    return _without_result(write, blocks=blocks, offsets=offsets, e=e, f=f, three=three)
 
 
 def _add_balanced(code: Code, offsets: list[Any], three: list[Any]) -> None:
@@ -217,7 +217,7 @@ def _add_corners(typing: Any, blocks: Any, offsets: Any, e: Any, three: Any) -> 
         made = [(code.filled(nine[:8], code.eight), nine[8]) for nine in code.tuples("three")]
         _add_balanced(code, code.six_offsets(), made)
 
-    return _without_result("blocks offsets e three", (blocks, offsets, e, three), write)
+    return _without_result(write, blocks=blocks, offsets=offsets, e=e, three=three)
 
 
 def _put(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
@@ -232,7 +232,7 @@ def _put(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
         code.store(code.swapped(at, eight, code.transposed(eight))[0], target)
         builder.store(builder.load(builder.gep(source, [last])), builder.gep(target, [last]))
 
-    return _without_result("blocks k out at", (blocks, k, out, at), write)
+    return _without_result(write, blocks=blocks, k=k, out=out, at=at)
 
 
 def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
@@ -243,7 +243,7 @@ def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
         for last in (0, 8):  # it may lie on two cache lines
             code.fetch(code.builder.gep(block, [INDEX(last)]))
 
-    return _without_result("blocks k", (blocks, k), write)
+    return _without_result(write, blocks=blocks, k=k)
 
 
 # their callers leave out ``typing``

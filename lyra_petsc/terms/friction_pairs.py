@@ -445,13 +445,13 @@ def find(keys, among, what, place):  # type: ignore[no-untyped-def]
     for b in range(len(among)):
         row = Index(among[b, 0] & (room - 1))
         following[b], first[row] = first[row], b
-    same = 0
+    there = 0  # the first row of ``among`` that does not come before the key
     for a in range(len(keys)):
-        while same < len(among) and _precedes(among, same, keys, a):
-            same += 1
-        alone = same + 1 >= len(among) or _precedes(among, same, among, same + 1)
-        if same < len(among) and alone and not _precedes(keys, a, among, same):
-            place[a] = same  # none is more alike
+        while there < len(among) and _precedes(among, there, keys, a):
+            there += 1
+        alone = there + 1 >= len(among) or _precedes(among, there, among, there + 1)
+        if there < len(among) and alone and not _precedes(keys, a, among, there):
+            place[a] = there  # the same key: none is more alike
             continue
         place[a], best, longest, largest = -1, -1, 0.0, 0.0
         b = first[Index(keys[a, 0] & (room - 1))]
