@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lyra_petsc.api.scenes import load
     from lyra_petsc.api.simulations import Simulation, Step
     from lyra_petsc.errors import InputError, LyraError, OutputError, SolverError
-    from lyra_petsc.experiments.fit.work import fit, gradient
+    from lyra_petsc.experiments.fit.fit_runner import fit, gradient
     from lyra_petsc.scene.schema import Scene
     from lyra_petsc.show.notebook import Run, run
 
@@ -49,8 +49,8 @@ _HOMES = {
     "Scene": "scene.schema",
     "Simulation": "api.simulations",
     "Step": "api.simulations",
-    "fit": "experiments.fit.work",
-    "gradient": "experiments.fit.work",
+    "fit": "experiments.fit.fit_runner",
+    "gradient": "experiments.fit.fit_runner",
     "load": "api.scenes",
     "run": "show.notebook",
 }

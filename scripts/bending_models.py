@@ -17,8 +17,8 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.answers import data
 from lyra_petsc.experiments.verification.flat_plates import flat_mesh, held
+from lyra_petsc.experiments.verification.verification_case import data
 from lyra_petsc.show.report.plots import Series, work_precision
 
 PLATES = data("linear_plate")["deflection"]

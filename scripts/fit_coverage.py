@@ -19,9 +19,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 import lyra_petsc
+from lyra_petsc.experiments.fit.fit_runner import fit_scene
 from lyra_petsc.experiments.fit.model import Model
 from lyra_petsc.experiments.fit.readings import readings_of
-from lyra_petsc.experiments.fit.work import fit_scene
 
 NOISE = 0.01
 

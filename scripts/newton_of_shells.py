@@ -24,7 +24,6 @@ from mpi4py import MPI
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import (
     cylinder,
     open_cylinder_scene,
@@ -32,6 +31,7 @@ from lyra_petsc.experiments.verification.cases.shells import (
     slit_annulus_scene,
     symmetric,
 )
+from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 
 LOAD_STEPS = 15
 

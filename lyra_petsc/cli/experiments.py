@@ -148,16 +148,16 @@ def verify(
     Interrupted
         A signal; what had been done is in the folder.
     """
-    from lyra_petsc.experiments.verification import answers
-    from lyra_petsc.experiments.verification.answers import Verification
+    from lyra_petsc.experiments.verification import verification_case
     from lyra_petsc.experiments.verification.cases import CASES
+    from lyra_petsc.experiments.verification.verification_case import Verification
 
     if listed:
         return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
     cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
     again = command(comm, "verify", [*names, *words_of({"--quick": quick})])
     results = Results(comm, out, Verification(), ranks=comm.size, command=again, force=force)
-    run = partial(answers.run_case, comm, quick=quick, watch=watched(comm))
+    run = partial(verification_case.run_case, comm, quick=quick, watch=watched(comm))
     return _run(comm, results, cases, run, len(CASES.modules))
 
 
@@ -185,10 +185,10 @@ def stress(
     Interrupted
         A signal; what had been done is in the folder.
     """
-    from lyra_petsc.experiments.stress import trials
+    from lyra_petsc.experiments.stress import stress_runner
     from lyra_petsc.experiments.stress.cases import FAMILIES, selected
+    from lyra_petsc.experiments.stress.stress_runner import Stress
     from lyra_petsc.experiments.stress.stress_scenes import Scope, StressCase, setting_of
-    from lyra_petsc.experiments.stress.trials import Stress
 
     if quick and full:
         raise InputError("give one of --quick and --full", key="--quick")
@@ -202,7 +202,7 @@ def stress(
     launcher = case_launcher(comm, "stress", ranks)
     first = FOLDER / (scene.stem if scene is not None else "sheet")
     folder = out or on_root(comm, lambda: first if force else free_name(first))
-    results: Results[trials.StressOutcome] | None = None
+    results: Results[stress_runner.StressOutcome] | None = None
 
     def kept() -> str:
         ended = results is not None and results.outcomes
@@ -211,19 +211,19 @@ def stress(
     watch = watched(comm, kept)
     if launcher is None:
         # a base scene that does not run is refused before anything is written
-        clock = trials.BaseClock(comm, setting, watch)
+        clock = stress_runner.BaseClock(comm, setting, watch)
         setting = replace(setting, size=clock.size)
     asked = [*([] if scene is None else [str(scene)]), *words_of({"--set": settings})]
     asked += words_of({"--trust-mesh": trust_mesh, "--quick": quick, "--full": full})
 
-    def run(case: StressCase) -> trials.StressOutcome:
+    def run(case: StressCase) -> stress_runner.StressOutcome:
         if launcher is not None:
-            return trials.launched(launcher, case, asked, watch)
-        return trials.run_case(comm, case, setting, clock, watch)
+            return stress_runner.launched(launcher, case, asked, watch)
+        return stress_runner.run_case(comm, case, setting, clock, watch)
 
     if job is not None:
         outcome = run(cases[0])
-        on_root(comm, lambda: trials.save(outcome, job))
+        on_root(comm, lambda: stress_runner.save(outcome, job))
         return 0 if outcome.passed else FAILED
     words = [*asked, *words_of({"--only": ",".join(names), "--ranks": ranks})]
     again, view = command(comm, "stress", words), Stress(setting, len(cases))
@@ -253,7 +253,7 @@ def fabric(
     Interrupted
         A signal; what had been done is in the folder.
     """
-    from lyra_petsc.experiments.fabric import records, textile_tests
+    from lyra_petsc.experiments.fabric import fabric_report, textile_tests
     from lyra_petsc.experiments.fabric.specimens import fabric_of
 
     if (material is None) == (cloth is None):
@@ -268,19 +268,19 @@ def fabric(
     asked = [named, *words_of({"--set": settings})]
     watch = watched(comm)
 
-    def run(case: records.FabricCase) -> records.FabricOutcome:
+    def run(case: fabric_report.FabricCase) -> fabric_report.FabricOutcome:
         if launcher is not None:
             return textile_tests.launched(launcher, case, asked, watch)
         return textile_tests.run_case(comm, case, tested, watch)
 
     if job is not None:
         outcome = run(next(case for case in cases if case.name == only))
-        on_root(comm, lambda: records.save(outcome, job))
+        on_root(comm, lambda: fabric_report.save(outcome, job))
         return 0 if outcome.passed else FAILED
     first = Path("fabric") / f"{Path(named).stem}-{test}"
     folder = out or on_root(comm, lambda: first if force else free_name(first))
     again = command(comm, "fabric", [test, *asked, *words_of({"--ranks": ranks})])
-    view = records.Fabric(named)
+    view = fabric_report.Fabric(named)
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, len(cases))
 

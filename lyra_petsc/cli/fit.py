@@ -17,7 +17,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
 from lyra_petsc.experiments.fit.estimate import Trial
 from lyra_petsc.experiments.fit.fit_report import Fit, FitOutcome, outcome_of
-from lyra_petsc.experiments.fit.work import FIT, Observer, fit_scene, unknowns_of
+from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene, unknowns_of
 from lyra_petsc.experiments.results import Results
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root

@@ -17,7 +17,7 @@ from lyra_petsc.experiments.results import Results
 from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
 from lyra_petsc.experiments.study.study_report import Study
-from lyra_petsc.experiments.study.work import Work, choose_references
+from lyra_petsc.experiments.study.study_runner import Work, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import default_scene

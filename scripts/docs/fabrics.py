@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from lyra_petsc.experiments.fabric.records import FabricCase, Record, restore, save
+from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, restore, save
 from lyra_petsc.experiments.fabric.specimens import fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import cases_of, run_case
 from lyra_petsc.scene.materials.library import measured

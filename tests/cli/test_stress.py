@@ -20,7 +20,7 @@ from launch import (
 )
 
 from lyra_petsc.experiments.stress.cases import FAMILIES
-from lyra_petsc.experiments.stress.trials import Stress
+from lyra_petsc.experiments.stress.stress_runner import Stress
 
 TWO = ["--only", "one-triangle,chain-1e6"]
 

@@ -13,9 +13,9 @@ from physics import SteppedScene, grid, scene_of
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import symmetric
 from lyra_petsc.experiments.verification.rods import pressed_tip
+from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 from lyra_petsc.phases import Phases
 from lyra_petsc.stepping.following_loads import FollowingLoads, newton_way
 from lyra_petsc.terms.term import Load

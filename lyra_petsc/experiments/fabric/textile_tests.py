@@ -32,7 +32,7 @@ from lyra_petsc.experiments.drape import (
     folds,
     shadow,
 )
-from lyra_petsc.experiments.fabric.records import (
+from lyra_petsc.experiments.fabric.fabric_report import (
     Curve,
     FabricCase,
     FabricOutcome,

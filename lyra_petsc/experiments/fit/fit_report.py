@@ -11,7 +11,7 @@ import numpy as np
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.fit.estimate import Estimate
-from lyra_petsc.experiments.fit.work import Fitted
+from lyra_petsc.experiments.fit.fit_runner import Fitted
 from lyra_petsc.experiments.results import View, aligned
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
 from lyra_petsc.show.report.plots import colour, drawn, empty_figure, surface

@@ -28,7 +28,7 @@ from lyra_petsc.experiments.study.plan import (
     described,
     in_words,
 )
-from lyra_petsc.experiments.study.work import SAFETY, Reference, StudyRow, Work, refines_time
+from lyra_petsc.experiments.study.study_runner import SAFETY, Reference, StudyRow, Work, refines_time
 from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.summary import versions
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short

@@ -22,7 +22,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import SIDES, irregular_rectangle, rectangle, rectangle_script, sides
-from lyra_petsc.experiments.verification.answers import grid, isotropic, scene
+from lyra_petsc.experiments.verification.verification_case import grid, isotropic, scene
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.parallel import on_root

@@ -13,7 +13,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.drape import DISC, disc_of, drape_coefficient, folds, shadow
 from lyra_petsc.experiments.fabric import textile_tests
-from lyra_petsc.experiments.fabric.records import FabricCase, outcome_of, restore, save
+from lyra_petsc.experiments.fabric.fabric_report import FabricCase, outcome_of, restore, save
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
 from lyra_petsc.scene.materials.curves import force_at

@@ -15,8 +15,8 @@ from mpi4py import MPI
 import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.fit.estimate import Trial, Unknown, conclude, search
+from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene
 from lyra_petsc.experiments.fit.readings import Places
-from lyra_petsc.experiments.fit.work import FIT, Observer, fit_scene
 
 TRUE = 4.2e-5
 

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from lyra_petsc.experiments.stress.cases import selected
 from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.stress_runner import StressOutcome, run_case
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
@@ -22,7 +23,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     damp,
     sheet,
 )
-from lyra_petsc.experiments.stress.trials import StressOutcome, run_case
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 

@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.stress import trials
+from lyra_petsc.experiments.stress import stress_runner
 from lyra_petsc.experiments.stress.cases import selected
-from lyra_petsc.experiments.stress.stress_scenes import (
-    Scope,
-    Setting,
-    StressCase,
-    as_it_is,
-    setting_of,
-    sheet,
-)
-from lyra_petsc.experiments.stress.trials import (
+from lyra_petsc.experiments.stress.stress_runner import (
     PICTURES,
     BaseClock,
     Stress,
@@ -27,6 +19,14 @@ from lyra_petsc.experiments.stress.trials import (
     row_of,
     run_case,
     save,
+)
+from lyra_petsc.experiments.stress.stress_scenes import (
+    Scope,
+    Setting,
+    StressCase,
+    as_it_is,
+    setting_of,
+    sheet,
 )
 
 SMALL = Setting(sheet(6), False, Scope.QUICK)
@@ -106,7 +106,7 @@ def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None
 
 @pytest.mark.parallel(2)
 def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(trials.LONGEST, Scope.QUICK, 0.0)
+    monkeypatch.setitem(stress_runner.LONGEST, Scope.QUICK, 0.0)
     outcome = run_case(comm, StressCase("a", "b", as_it_is), SMALL)
     assert "has had its time" in outcome.failures["converged"].words
 

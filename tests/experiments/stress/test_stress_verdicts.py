@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from lyra_petsc.experiments.stress.step_balance import Record, StepBalance, of_physics, speed
+from lyra_petsc.experiments.stress.stress_runner import StressOutcome
 from lyra_petsc.experiments.stress.stress_scenes import StressCase, as_it_is
-from lyra_petsc.experiments.stress.trials import StressOutcome
 from lyra_petsc.stepping.simulation import StepReport
 
 GOOD = StepBalance(

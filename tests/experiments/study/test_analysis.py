@@ -15,7 +15,7 @@ from lyra_petsc.experiments.study.study_report import (
     mark_front,
     observed_orders,
 )
-from lyra_petsc.experiments.study.work import (
+from lyra_petsc.experiments.study.study_runner import (
     Chain,
     Estimate,
     StudyRow,

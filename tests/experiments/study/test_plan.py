@@ -10,7 +10,7 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.study.plan import Plan, Request, make_plan
-from lyra_petsc.experiments.study.work import (
+from lyra_petsc.experiments.study.study_runner import (
     choose_references,
     make_family,
     physical_overrides,

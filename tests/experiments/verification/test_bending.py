@@ -11,7 +11,6 @@ from mpi4py import MPI
 from physics import reference
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import hinges
 from lyra_petsc.experiments.verification.cases.hinges import (
     expected,
@@ -26,6 +25,7 @@ from lyra_petsc.experiments.verification.rods import (
     overhang_weight,
     tall_cantilever,
 )
+from lyra_petsc.experiments.verification.verification_case import run_case
 
 PUBLISHED = reference("cantilevers")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import CASES
+from lyra_petsc.experiments.verification.verification_case import run_case
 
 SOME = (
     "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip", "column",

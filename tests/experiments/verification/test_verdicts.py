@@ -11,7 +11,8 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted, SolverError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.cases import CASES
+from lyra_petsc.experiments.verification.verification_case import (
     Claim,
     Converges,
     ErrorRow,
@@ -22,7 +23,6 @@ from lyra_petsc.experiments.verification.answers import (
     observed_order,
     run_case,
 )
-from lyra_petsc.experiments.verification.cases import CASES
 
 
 def row(n: float, error: float) -> ErrorRow:

@@ -28,7 +28,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     family,
     scale,
 )
-from lyra_petsc.experiments.verification.answers import FLOOR, grid
+from lyra_petsc.experiments.verification.verification_case import FLOOR, grid
 from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.mesh.start_crossings import overlaps_of
 from lyra_petsc.parallel import on_root

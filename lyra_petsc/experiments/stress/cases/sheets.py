@@ -41,7 +41,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     sheet,
     weigh,
 )
-from lyra_petsc.experiments.verification.answers import grid
+from lyra_petsc.experiments.verification.verification_case import grid
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 

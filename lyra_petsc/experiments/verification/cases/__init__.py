@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lyra_petsc.experiments.case import Registry, in_modules
-from lyra_petsc.experiments.verification.answers import VerificationCase
+from lyra_petsc.experiments.verification.verification_case import VerificationCase
 
 CASES: Registry[VerificationCase] = Registry(
     "lyra_petsc.experiments.verification.cases",

@@ -15,18 +15,6 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import (
-    ASSEMBLED,
-    STATIC,
-    Claim,
-    Converges,
-    Exact,
-    Measured,
-    at_finest,
-    case,
-    isotropic,
-    scene,
-)
 from lyra_petsc.experiments.verification.cases.hinges import expected
 from lyra_petsc.experiments.verification.flat_plates import (
     DENSITY,
@@ -44,6 +32,18 @@ from lyra_petsc.experiments.verification.rods import (
     heavy_coupled_strip,
     overhang_weight,
     tall_cantilever,
+)
+from lyra_petsc.experiments.verification.verification_case import (
+    ASSEMBLED,
+    STATIC,
+    Claim,
+    Converges,
+    Exact,
+    Measured,
+    at_finest,
+    case,
+    isotropic,
+    scene,
 )
 from lyra_petsc.parallel import on_root
 

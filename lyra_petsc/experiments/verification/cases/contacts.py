@@ -22,7 +22,8 @@ from lyra_petsc.experiments.drape import (
     shadow,
 )
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rings, rounded
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import plate_material
+from lyra_petsc.experiments.verification.verification_case import (
     FLOOR,
     STATIC,
     Converges,
@@ -37,7 +38,6 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
     worst,
 )
-from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.terms.contact import ContactBarrier

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
+from lyra_petsc.experiments.verification.rods import stretches
+from lyra_petsc.experiments.verification.verification_case import (
     Converges,
     Exact,
     Measured,
@@ -20,8 +22,6 @@ from lyra_petsc.experiments.verification.answers import (
     isotropic,
     scene,
 )
-from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
-from lyra_petsc.experiments.verification.rods import stretches
 
 ALONG = "cells along the strip"
 

@@ -19,7 +19,8 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import DENSITY, held, lowest_modes, small_motions, strip
+from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     Converges,
     Exact,
@@ -29,7 +30,6 @@ from lyra_petsc.experiments.verification.answers import (
     grid,
     scene,
 )
-from lyra_petsc.experiments.verification.flat_plates import DENSITY, held, lowest_modes, small_motions, strip
 from lyra_petsc.terms.bending import Bending
 
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import lowest_modes
+from lyra_petsc.experiments.verification.rods import stretches
+from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
     Converges,
@@ -28,8 +30,6 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
     worst,
 )
-from lyra_petsc.experiments.verification.flat_plates import lowest_modes
-from lyra_petsc.experiments.verification.rods import stretches
 
 MATERIALS = {
     "isotropic": {"c11": 1e3 / 0.91, "c12": 300.0 / 0.91, "c22": 1e3 / 0.91, "c33": 350.0 / 0.91},

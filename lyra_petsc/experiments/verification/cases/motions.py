@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.verification_case import (
     Converges,
     Exact,
     Measured,

@@ -14,7 +14,14 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import (
+    KINDS,
+    flat_mesh,
+    held,
+    lowest_modes,
+    plate_material,
+)
+from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
     Converges,
@@ -25,13 +32,6 @@ from lyra_petsc.experiments.verification.answers import (
     data,
     farthest,
     scene,
-)
-from lyra_petsc.experiments.verification.flat_plates import (
-    KINDS,
-    flat_mesh,
-    held,
-    lowest_modes,
-    plate_material,
 )
 from lyra_petsc.terms.midedge import MidEdge
 

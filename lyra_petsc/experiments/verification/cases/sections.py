@@ -9,7 +9,9 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import walls
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.cases.cantilevers import critical
+from lyra_petsc.experiments.verification.flat_plates import lowest_squares, plate_material
+from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
     Converges,
@@ -17,8 +19,6 @@ from lyra_petsc.experiments.verification.answers import (
     case,
     scene,
 )
-from lyra_petsc.experiments.verification.cases.cantilevers import critical
-from lyra_petsc.experiments.verification.flat_plates import lowest_squares, plate_material
 
 PATTERNS = ("diagonal", "alternating")
 MEMBRANE = 1e6

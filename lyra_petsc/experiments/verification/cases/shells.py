@@ -11,7 +11,9 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import (
+from lyra_petsc.experiments.verification.flat_plates import plate_material
+from lyra_petsc.experiments.verification.rods import cantilever, pressed_tip
+from lyra_petsc.experiments.verification.verification_case import (
     STATIC,
     Converges,
     Measured,
@@ -23,8 +25,6 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
     worst,
 )
-from lyra_petsc.experiments.verification.flat_plates import plate_material
-from lyra_petsc.experiments.verification.rods import cantilever, pressed_tip
 
 TABLES = data("shells")
 LINEAR = TABLES["linear"]

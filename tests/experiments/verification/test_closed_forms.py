@@ -12,11 +12,11 @@ from physics import reference
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
-from lyra_petsc.experiments.verification.answers import data
 from lyra_petsc.experiments.verification.cases.hanging import middle, of_chain, of_strip
 from lyra_petsc.experiments.verification.cases.membranes import answer
 from lyra_petsc.experiments.verification.cases.motions import level_fall
 from lyra_petsc.experiments.verification.flat_plates import arc
+from lyra_petsc.experiments.verification.verification_case import data
 
 
 def test_the_level_fall_is_the_tabulated_one() -> None:
