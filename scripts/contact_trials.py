@@ -151,7 +151,7 @@ class Multipliers(ContactBarrier):
     def energies(self, x: Array, frozen: Places) -> Array:
         return super().energies(x, frozen) if self.solving else np.zeros(self.n_owned)
 
-    def touching(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
+    def find_contacts(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
         met = self.meeting(x, places)
         rows = np.flatnonzero((met.weight > 0.0) & (met.felt[:, 3] != 0.0))
         at, felt = met.at[rows], met.felt[rows]

@@ -149,7 +149,7 @@ class Discretisation:
             self._reach = 0.5 * min(term.skin for term in self._searching)
         for term in asked:
             if term.search_distance == 0.0:
-                self._found[term] = self._sent(*term.known())
+                self._found[term] = self._sent(*term.current_elements())
         more, fixed = layout.ghosts[:0], self._fixed_layout.ghosts
         if any(len(stencil) for stencil, _ in self._found.values()):
             end = layout.start + layout.n_owned
@@ -191,7 +191,7 @@ class Discretisation:
     @property
     def guards(self) -> bool:
         """Whether ways must be looked at before they are gone: a term has to see who meets there."""
-        return any(np.isfinite(term.unseen) for term in self._changing)
+        return any(np.isfinite(term.approach_limit) for term in self._changing)
 
     def largest_step(self, x: Array, way: Array) -> float:
         """Fraction, up to 1, of the way (n_owned, 3) [m] from x that vertices may go until stencils are
@@ -200,7 +200,7 @@ class Discretisation:
         if not self.guards or not self._places:
             return 1.0
         n = self.layout.n_vertices
-        reach = 0.5 * min(term.unseen for term in self._searching)
+        reach = 0.5 * min(term.approach_limit for term in self._searching)
         x, way = x[:n], way[:n]
         if self._is_known(x, reach):
             for part in (1.0, self._searched) if 0.0 < self._searched < 1.0 else (1.0,):

@@ -80,23 +80,23 @@ class ActiveTerms:
         turning = [term for term in self.moving if not term.pushes]
         return sum(float(term.energies(x, self.frozen[term]).sum()) for term in turning)
 
-    def on_the_way(self, x: Array) -> None:
+    def accept_substep(self, x: Array) -> None:
         """A part of a static load step led to positions x."""
         for term in self.near:
-            term.on_the_way(x, self.frozen[term])
+            term.accept_substep(x, self.frozen[term])
 
-    def lagging(self, x: Array) -> dict[str, Array]:
-        """See `Elastic.lagging`."""
-        return {name: sums for t in self.near for name, sums in t.lagging(x, self.frozen[t]).items()}
+    def friction_lag(self, x: Array) -> dict[str, Array]:
+        """See `Elastic.friction_lag`."""
+        return {name: sums for t in self.near for name, sums in t.friction_lag(x, self.frozen[t]).items()}
 
-    def touched(self) -> dict[Elastic, Any]:
-        """What terms know of what touches, to come back to by `touch_again`."""
-        return {term: term.touched() for term in self.near}
+    def contact_state(self) -> dict[Elastic, Any]:
+        """What terms know of what touches, to come back to by `restore_contacts`."""
+        return {term: term.contact_state() for term in self.near}
 
-    def touch_again(self, touched: Mapping[Elastic, Any]) -> None:
+    def restore_contacts(self, touched: Mapping[Elastic, Any]) -> None:
         """Know just this of what touches."""
         for term, what in touched.items():
-            term.touch_again(what)
+            term.restore_contacts(what)
 
     def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""

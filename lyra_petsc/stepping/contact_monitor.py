@@ -43,8 +43,8 @@ class ContactMonitor:
         here, stiffest = contact.history(x, frozen), contact.largest_stiffness(x, frozen)
         sums = [here["contacts"]]
         if self._friction is not None:
-            sums += self._friction.sticking(x, of.active.frozen[self._friction])
-            sums.append(float(contact.touching(x, frozen.now, contact.n_owned)[2].sum()))
+            sums += self._friction.count_sticking(x, of.active.frozen[self._friction])
+            sums.append(float(contact.find_contacts(x, frozen.now, contact.n_owned)[2].sum()))
         sums = of.points.summed(*sums).tolist()
         extremes = np.array([stiffest, -here["smallest_gap"]])
         of.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)

@@ -200,7 +200,7 @@ class Equilibrium:
         newton = linear = solves = anew = resumed = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
-        touched = system.active.touched()
+        contacts = system.active.contact_state()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
@@ -230,7 +230,7 @@ class Equilibrium:
                 self._integrator.pseudo *= SHRINK
             last = force
             if attempt.converged:
-                system.active.on_the_way(system.x)
+                system.active.accept_substep(system.x)
             if balanced:  # but for friction
                 anew = len(history)
                 longest, leaps = self._integrator.pseudo, not system.active.viscous
@@ -274,7 +274,7 @@ class Equilibrium:
         system.x[:n] = x
         system.points.update_ghosts(system.x)
         system.active.carry_frames(system.x, frozen)
-        system.active.touch_again(touched)
+        system.active.restore_contacts(contacts)
         return dataclasses.replace(
             attempt,
             converged=False,

@@ -81,7 +81,7 @@ class FrictionBalance:
 
     def _sums(self) -> tuple[float, str]:
         """Friction that normal forces now do not allow, over what they allow, and in words what slides."""
-        sums = self._system.active.lagging(self._system.x)
+        sums = self._system.active.friction_lag(self._system.x)
         if not sums:
             return 0.0, ""
         each = self._system.points.summed(*np.concatenate(list(sums.values()))).reshape(-1, 3)

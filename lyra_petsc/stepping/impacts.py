@@ -101,7 +101,7 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     """Add impulses, up to a factor, to rows of out (n_local, 3), between what touches at the stage of the
     pairs that this rank counts.
     """
-    points, beta, normal, force, _ = term.touching_points(system.stage_positions, frozen)
+    points, beta, normal, force, _ = term.contact_points(system.stage_positions, frozen)
     sheet = points >= 0
     between = sheet.all(axis=1)
     beta = np.where(sheet, beta, 0.0)
@@ -156,8 +156,8 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
-    rubbing = term.rubbing(stage, x, system.v, frozen, damped.felt, dt, sheets=sheets)
-    points, beta, along, ways, more, obstacle, moved = rubbing
+    corrections = term.friction_corrections(stage, x, system.v, frozen, damped.felt, dt, sheets=sheets)
+    points, beta, along, ways, more, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.by_stage:
         pairs, moments = term.moments(stage, frozen)

@@ -75,7 +75,7 @@ def worst_pair(system: StageEquations) -> NearPair | None:
         return nearest_pair(system, system.evaluated[0])
 
     def obstruction(term: Elastic) -> Array:
-        return 1.0 - term.free_parts(way.x, way.ahead, system.active.frozen[term], way.part)
+        return 1.0 - term.collision_free_fractions(way.x, way.ahead, system.active.frozen[term], way.part)
 
     return _worst(system, way.x, obstruction)
 
@@ -119,7 +119,7 @@ def _worst(system: StageEquations, x: Array, sizes: Callable[[Elastic], Array]) 
         gap = gap if gap > TOUCHING * term.skin else min(gap, 0.0)
         parts = tuple(tuple(int(numbers[point]) for point in part) for part in pair.parts)
         blocks = system.refused_way is not None or gap <= TIGHT * term.skin
-        return NearPair(parts, pair.obstacle, middle, gap, pair.kept, blocks)
+        return NearPair(parts, pair.obstacle, middle, gap, pair.thickness, blocks)
 
     return worst(points.comm, sized, np.concatenate(first), describe)
 

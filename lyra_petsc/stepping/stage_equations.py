@@ -39,7 +39,7 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Part, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import LARGEST_TURN, Elastic, StepInterval, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import Damped
@@ -72,13 +72,13 @@ class RefusedDisplacement(NamedTuple):
     ----------
     x, ahead : (n_local, 3)
         Where it begins and how far it goes [m].
-    part : Part
+    part : StepInterval
         Of the step, in which obstacles go theirs, too.
     """
 
     x: Array
     ahead: Array
-    part: Part
+    part: StepInterval
 
 
 class StageEquations:
@@ -204,7 +204,7 @@ class StageEquations:
         self.active.freeze(step)
         self._follow(self.x)  # energies at the start of a run are those of all stencils
         for term in self.active.near:
-            term.take_pairs(self.x, self.active.frozen[term])
+            term.initialise_pairs(self.x, self.active.frozen[term])
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -570,10 +570,13 @@ class StageEquations:
         if not self.discretisation.near:
             return None
         n, frozen, pushed = len(way), self.active.frozen, False
-        aims = {term: term.aims(x, ahead, frozen[term]) for term in self.active.limiting}
+        targets = {term: term.target_distances(x, ahead, frozen[term]) for term in self.active.limiting}
         for _ in range(PUSHES):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
-            found = [term.push_apart(x, ahead, frozen[term], aims[term], out, count) for term in aims]
+            found = [
+                term.add_corrections(x, ahead, frozen[term], target, out, count)
+                for term, target in targets.items()
+            ]
             if not self.points.comm.allreduce(any(found), MPI.LOR):
                 break
             aside = np.divide(out[:n], count[:n], out=np.zeros((n, 3)), where=count[:n] > 0.0)
@@ -603,7 +606,7 @@ class StageEquations:
     def release(self, length: Mapping[Elastic, Array]) -> None:
         """Let `springs` go, of a ``length`` [m] where the step leads, without one if it is another."""
         for term in self.active.limiting:
-            term.release(length.get(term))
+            term.release_springs(length.get(term))
 
     def farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
@@ -655,7 +658,7 @@ class StageEquations:
             x, ahead = self.ahead(v, way)
             taken = ahead
             for term in self.active.pushing:
-                taken = term.carried(x, taken, self.active.frozen[term])
+                taken = term.moved_with_obstacles(x, taken, self.active.frozen[term])
             change = taken[:n] != ahead[:n]
             if not self.points.comm.allreduce(bool(change.any()), MPI.LOR):
                 break
@@ -671,8 +674,11 @@ class StageEquations:
         for _ in range(SEARCHES):
             x, ahead, seen = self._look(v + gone * way, (1.0 - gone) * way)
             ahead *= seen
-            part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
-            free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
+            part = StepInterval(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
+            free = [
+                term.is_collision_free(x, ahead, self.active.frozen[term], part)
+                for term in self.active.limiting
+            ]
             if not self._least_of(float(all(free))):
                 break
             if seen == 1.0:
@@ -784,7 +790,7 @@ class StageEquations:
         near, frozen = self.active.near, self.active.frozen
         if not near:
             return []
-        acting = [np.count_nonzero(t.acting(self._xs, frozen[t])[: t.n_owned]) for t in near]
+        acting = [np.count_nonzero(t.active_elements(self._xs, frozen[t])[: t.n_owned]) for t in near]
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
         fixed, every, *numbers = self.points.summed(
             *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
@@ -803,7 +809,7 @@ class StageEquations:
         if not self.discretisation.near:
             self.touches = False
             return self.discretisation.renew_pattern({})
-        acting = {term: term.acting(x, frozen.get(term)) for term in self.active.near}
+        acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.near}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
             self.touches = any(self.points.largest(number))
@@ -814,7 +820,7 @@ class StageEquations:
         """Whether there is anything of which one linear solve cannot tell whether it sticks or slides;
         collective.
         """
-        number = sum(term.n_rubbing for term in self.active.near)
+        number = sum(term.n_friction_pairs for term in self.active.near)
         return self.discretisation.near and any(self.points.largest(number))
 
     @property
@@ -832,7 +838,7 @@ class StageEquations:
         if not self.discretisation.near or not self.integrator.moves or self._at_end:
             return False
         x, ahead, frozen = self.x, self._expected(), self.active.frozen
-        return any(self.points.largest(any(t.collides(x, ahead, frozen[t], far) for t in limiting)))
+        return any(self.points.largest(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

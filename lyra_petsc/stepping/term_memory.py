@@ -76,7 +76,7 @@ def restore_changing(
         if term.name in elements and term.registration.neighbours:
             own = range(layout.start, layout.start + layout.n_owned)
             term.restore_elements(*_brought(system, *elements[term.name]), own)
-            term.take_pairs(system.x, system.active.frozen[term])
+            term.initialise_pairs(system.x, system.active.frozen[term])
 
 
 def _brought(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:

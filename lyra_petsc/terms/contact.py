@@ -31,7 +31,7 @@ from lyra_petsc.terms.contact_search import SheetSearch, Simplices
 from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, Part, UpcomingStep
+from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, StepInterval, UpcomingStep
 
 KEPT = 0.2
 """Part of its distance, or of the gap where it is farther, that a pair keeps in a Newton iteration."""
@@ -275,7 +275,7 @@ class Obstacles:
             found.append((rotation, there - rotation @ way))
         return found
 
-    def taken_along(
+    def contact_displacements(
         self, x: Array, points: Ints, beta: Array, obstacle: Ints, moved: list[tuple[Array, Array]]
     ) -> Array:
         """How far (m, 3) [m] obstacles moved where pairs with points and β (m, 4) touch them at positions x
@@ -330,7 +330,7 @@ class ContactBarrier(Elastic):
         self.itself, self.static = itself, static
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
-        self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
+        self.approach_limit = (EDGES if itself else 1.0) * barrier.gap + self.skin
         self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
         self.stale = False
         self._bulge, self._extents = np.zeros(1), None
@@ -555,7 +555,7 @@ class ContactBarrier(Elastic):
         given = met.at, met.weight, met.beta, met.felt
         contact_pairs.add_gradient(x, frozen.now, *self._of_pairs, given, out, pull)
 
-    def acting(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
+    def active_elements(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
         out = np.zeros(self.n_elements, dtype=np.bool_)
         if self.n_elements:
             out[self.meeting(x, frozen.now).at] = True
@@ -601,7 +601,7 @@ class ContactBarrier(Elastic):
         left, nearer = self.meeting(x, frozen.now).least, contact_pairs.approach(way, still)
         at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
         pairs = self.kind[at], self.points[at], self.offset[at], self.gap[at]
-        return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
+        return float(contact_pairs.free_fraction(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
     def springs(self, x: Array, way: Array, frozen: Places) -> Springs:
         met, room = self.meeting(x, frozen.now), self._room
@@ -619,32 +619,40 @@ class ContactBarrier(Elastic):
         self._springs = Springs(at, self.points[at], beta, normal, scale, self.gap[at], length, counts, acts)
         return self._springs
 
-    def release(self, length: Array | None) -> None:
+    def release_springs(self, length: Array | None) -> None:
         self._foreseen[:] = np.nan
         if length is not None and self._springs is not None:
             self._foreseen[self._springs.at] = self._springs.law(length)[0] / self._springs.scale
         self._springs = None
 
-    def aims(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:
+    def target_distances(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:
         aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
         pairs, presses = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements, np.bool_)
-        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, self._foreseen, aim, before, presses)
+        contact_pairs.target_distances(
+            x, frozen.now, way, *pairs, TOUCHES, self._foreseen, aim, before, presses
+        )
         return aim, before, presses
 
-    def push_apart(
-        self, x: Array, way: Array, frozen: Places, aims: tuple[NDArray[Any], ...], out: Array, count: Array
+    def add_corrections(
+        self,
+        x: Array,
+        way: Array,
+        frozen: Places,
+        targets: tuple[NDArray[Any], ...],
+        out: Array,
+        count: Array,
     ) -> bool:
         pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.push_apart(x, frozen.now, way, *pairs, *aims, SHORT, out, count))
+        return bool(contact_pairs.add_corrections(x, frozen.now, way, *pairs, *targets, SHORT, out, count))
 
-    def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
+    def is_collision_free(self, x: Array, way: Array, frozen: Places, part: StepInterval) -> bool:
         if not self.n_elements:
             return True
         bent = np.flatnonzero(self._bulge > BULGE * self.barrier.gap)
         if len(bent) and np.isin(self.obstacle, bent).any():
             return False
         pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.free_way(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
+        return bool(contact_pairs.free_fraction(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
 
     def distances(self, x: Array, others: Array) -> Array:
         """Distance less thickness and radius [m] of all pairs, (E,)."""
@@ -655,14 +663,14 @@ class ContactBarrier(Elastic):
     def gaps(self, x: Array, frozen: Places) -> Array:
         return self.distances(x, frozen.now)[: self.n_owned]
 
-    def free_parts(self, x: Array, way: Array, frozen: Places, part: Part) -> Array:
+    def collision_free_fractions(self, x: Array, way: Array, frozen: Places, part: StepInterval) -> Array:
         pairs, out = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_owned)
-        contact_pairs.free_ways(x, *_during(frozen, part, way), *pairs, KEPT, out)
+        contact_pairs.free_fractions(x, *_during(frozen, part, way), *pairs, KEPT, out)
         return out
 
-    def collides(self, x: Array, way: Array, frozen: Places, far: float) -> bool:
+    def may_collide(self, x: Array, way: Array, frozen: Places, far: float) -> bool:
         pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.collide(x, *_during(frozen, Part(0.0, 1.0), way), *pairs, far))
+        return bool(contact_pairs.may_collide(x, *_during(frozen, StepInterval(0.0, 1.0), way), *pairs, far))
 
     def pair(self, element: int) -> Pair:
         points, begins = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
@@ -697,11 +705,11 @@ class ContactBarrier(Elastic):
             done -= float(np.vdot(force, x @ (further - turn).T + there - way))
         return done
 
-    def carried(self, x: Array, way: Array, frozen: Places) -> Array:
+    def moved_with_obstacles(self, x: Array, way: Array, frozen: Places) -> Array:
         if not self.moving:
             return way
         pairs, free = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements)
-        contact_pairs.free_ways(x, *_during(frozen, Part(0.0, 1.0), way), *pairs, KEPT, free)
+        contact_pairs.free_fractions(x, *_during(frozen, StepInterval(0.0, 1.0), way), *pairs, KEPT, free)
         taken = way.copy()
         for number, (turn, there) in enumerate(frozen.moved):
             with_it = x @ turn.T + there - x
@@ -715,7 +723,7 @@ class ContactBarrier(Elastic):
                 taken[points[~pushed]] = taken[points[pushed]][0]
         return taken
 
-    def touching(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
+    def find_contacts(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
         """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of what touches among the
         first ``counted`` pairs; none that is as near as another, of a vertex of a sheet, and of others all.
         """
@@ -723,7 +731,7 @@ class ContactBarrier(Elastic):
         room = len(met.at) + counted
         found = np.empty((room, 4)), np.empty((room, 3)), np.empty(room), np.empty(room, dtype=np.int64)
         given = met.at, met.weight, met.beta, met.felt
-        n = contact_pairs.touching(x, places, *self._of_pairs, met.least, given, counted, found)
+        n = contact_pairs.find_contacts(x, places, *self._of_pairs, met.least, given, counted, found)
         beta, normal, force, at = (part[:n] for part in found)
         if (force < 0.0).any():
             contact_pairs.share_negative(self.kind[at], self.points[at, 0], normal, force)
@@ -735,8 +743,8 @@ class ContactBarrier(Elastic):
         of_vertex = (self.kind[at] != EDGE_EDGE) & (self.points[at, 0] >= 0)
         return np.where(of_vertex, self.points[at, 0], -1)
 
-    def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
-        beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
+    def contact_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
+        beta, normal, force, at = self.find_contacts(x, frozen.now, self.n_owned)
         return self.points[at], beta, normal, force, self.vertex_of(at)
 
     def dashpots(self, x: Array, frozen: Places) -> Dashpots:
@@ -747,7 +755,7 @@ class ContactBarrier(Elastic):
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]
         stiffness = met.weight[of] * met.felt[of, 4] * square
         points, obstacle = self.points[at], self.obstacle[at]
-        moved = self.obstacles.taken_along(x, points, beta, obstacle, frozen.moved_on)
+        moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.moved_on)
         pushed = np.einsum("ek,ek->e", moved, normal)
         return Dashpots(points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed)
 
@@ -756,7 +764,7 @@ class ContactBarrier(Elastic):
         rank counts: only the owner of a vertex knows all that it is shared between.
         """
         out = np.zeros(len(x))
-        beta, _, force, at = self.touching(x, frozen.now, self.n_owned)
+        beta, _, force, at = self.find_contacts(x, frozen.now, self.n_owned)
         contact_pairs.add_normal_forces(self.points[at], beta, force, out)
         return out
 
@@ -791,7 +799,7 @@ def _edges_of(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
     return edges, (count != 2) | (apart > 2.0 * np.sin(0.5 * SHARP))
 
 
-def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array]:
+def _during(frozen: Places, part: StepInterval, way: Array) -> tuple[Array, Array, Array]:
     """Where obstacles' points stand at the start of a part of the step, the sheets' way, and theirs in it."""
     begin, end = part
     if begin >= 1.0:

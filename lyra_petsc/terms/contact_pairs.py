@@ -891,7 +891,7 @@ def _where(force, gap):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def aims(x, others, way, kind, points, offset, gap, most, foreseen, aim, before, presses):  # type: ignore[no-untyped-def]  # fmt: skip
+def target_distances(x, others, way, kind, points, offset, gap, most, foreseen, aim, before, presses):  # type: ignore[no-untyped-def]  # fmt: skip
     """Least distances less the offsets (E,) [m] that pairs should have after a ``way`` (n_local, 3) [m] of
     Newton's.
 
@@ -1018,13 +1018,14 @@ def chords(delta, gap, least, force, expected, out):  # type: ignore[no-untyped-
 
 
 @kernel()
-def push_apart(x, others, way, kind, points, offset, gap, aim, before, presses, least, out, count):  # type: ignore[no-untyped-def]  # fmt: skip
+def add_corrections(x, others, way, kind, points, offset, gap, aim, before, presses, least, out, count):  # type: ignore[no-untyped-def]  # fmt: skip
     """How pairs that are nearer than they should be after a way are to be pushed apart; how many there are.
 
     And those that press in the linear model, but leave the gap, as tangents of what is round do, pulled back.
 
     Added to ``out`` (n_local, 3) [m], each push times what is added to ``count`` (n_local,), its weight.
-    ``aim``, ``before``, ``presses`` as of `aims`; what is short by less than ``least`` times the gap stays.
+    ``aim``, ``before``, ``presses`` as of `target_distances`; what is short by less than ``least`` times the
+    gap stays.
     """
     p, n, beta, found = np.empty((4, 3)), np.empty(3), np.empty(4), 0
     for e in range(len(kind)):
@@ -1072,7 +1073,7 @@ def approach(way, others_way):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def free_way(x, others, way, others_way, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
+def free_fraction(x, others, way, others_way, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
     """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
 
     Each keeps at least the part ``keep`` of its distance less the offset, or of ``far`` (E,) [m] where that
@@ -1081,11 +1082,11 @@ def free_way(x, others, way, others_way, kind, points, offset, far, keep, most):
     170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
     nearer = approach(way, others_way)
-    return _free_way(x, others, way, others_way, nearer, kind, points, offset, far, keep, most)
+    return _pairs_free_fraction(x, others, way, others_way, nearer, kind, points, offset, far, keep, most)
 
 
 @kernel()
-def _free_way(x, others, way, others_way, nearer, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
+def _pairs_free_fraction(x, others, way, others_way, nearer, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
     """The same; no two points come nearer by more than ``nearer`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(kind)):
@@ -1121,7 +1122,7 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, far, kee
 
 
 @kernel()
-def collide(x, others, way, others_way, kind, points, offset, gap, far):  # type: ignore[no-untyped-def]
+def may_collide(x, others, way, others_way, kind, points, offset, gap, far):  # type: ignore[no-untyped-def]
     """Whether any pair may come into its gap on ways (n_local, 3), (m, 3) [m] on which its parts come nearer
     to each other by more than ``far`` [m].
     """
@@ -1153,7 +1154,7 @@ def alone(kind, points, e):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
+def find_contacts(x, others, kind, points, offset, gap, stiffness, parallel, least, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
     """Find which of the first ``n_counted`` pairs touch.
 
     Of vertices of sheets those that `meeting` found, ``met`` being their numbers, how often each counts, and
@@ -1218,13 +1219,13 @@ def share_negative(kind, vertex, normal, force):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def free_ways(x, others, way, others_way, kind, points, offset, far, keep, out):  # type: ignore[no-untyped-def]
-    """What `free_way` gives for each of the first len(out) pairs alone."""
+def free_fractions(x, others, way, others_way, kind, points, offset, far, keep, out):  # type: ignore[no-untyped-def]
+    """What `free_fraction` gives for each of the first len(out) pairs alone."""
     nearer = approach(way, others_way)
     for e in range(len(out)):
         one = slice(e, e + 1)
         pair = kind[one], points[one], offset[one], far[one]
-        out[e] = _free_way(x, others, way, others_way, nearer, *pair, keep, 1.0)
+        out[e] = _pairs_free_fraction(x, others, way, others_way, nearer, *pair, keep, 1.0)
 
 
 @kernel()

@@ -1,15 +1,16 @@
-"""Coulomb friction of all pairs in contact; its potential in a step is that of ``friction_pairs``.
+"""Coulomb friction of all pairs in contact; ``friction_pairs`` has its potential in a time step.
 
-Pairs, their normals and normal forces are those of the last accepted state; a pair that goes on keeps the
-elastic part of its way, so that what sticks does not creep, and so does a vertex that goes on over what it
-touches. The owner of a pair's first vertex knows it, and tells the owners of the others.
+Pairs, normals and normal forces are those of the last accepted state. A pair that is in contact again, or a
+vertex that moved on to a neighbouring triangle, keeps its elastic slip, so that sticking pairs do not creep.
+The owner of a pair's first vertex stores the pair and sends it to the owners of the others.
 
-The normal forces of a step's equations are those at its start. Where others act in it, vertices that slide
-are owed the difference, and get a part of that by impulses at the end of every step, all of it when they
-leave (`CoulombFriction.rubbing`, `stepping.impacts`), so that friction sums up to μ times the impulse of the
-normal forces by now. Else what comes to lie on a slope would slide on as fast as its weight makes it in a
-step, and be stopped only by what friction could hold beyond that. Between sheets normal forces tremble, and a
-knot would take 40 % more Newton iterations: there only where the stage is before the end, with other forces.
+The equations of a step use the normal forces at its start. Where other forces act in the step, the difference
+is added up for each sliding vertex as an impulse that is owed. At the end of each step a part of it is paid,
+and all of it when the vertex leaves (`CoulombFriction.friction_corrections`, `stepping.impacts`), so that
+friction adds up to μ times the impulse of the normal forces. Otherwise a sheet that lands on a slope would
+keep the velocity that its weight gives it in a step, and only the friction in excess of that would stop it.
+Between sheets, where normal forces oscillate and a knot would need 40 % more Newton iterations, this is done
+only if the stage is before the end of the step, so that the forces differ systematically.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, GRIP, SLID
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, Rubbing, UpcomingStep
+from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, UpcomingStep
 
 WORK, OWED = 0, 1
 """Columns of what is known of vertices: work of friction [J]; impulse of normal forces [N s] that friction
@@ -164,12 +165,12 @@ class CoulombFriction(Elastic):
         self._of: ObstacleMoves | None = None  # what is remembered of a stage
 
     @property
-    def n_rubbing(self) -> int:
+    def n_friction_pairs(self) -> int:
         return len(self._pairs.key)
 
     # -- pairs -------------------------------------------------------------------------------------
 
-    def known(self) -> tuple[Ints, Array]:
+    def current_elements(self) -> tuple[Ints, Array]:
         self.stale, self._known = False, self._pairs
         return self._pairs.stencil, self._pairs.what
 
@@ -178,7 +179,7 @@ class CoulombFriction(Elastic):
         contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
             return
-        beta, normal, force, at = contact.touching(x, places, contact.n_owned)
+        beta, normal, force, at = contact.find_contacts(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         pairs = contact.points, contact.number, contact.kind, contact.obstacle
         friction_pairs.choose(x, contact.stencil, *pairs, beta, normal, at)
@@ -190,7 +191,7 @@ class CoulombFriction(Elastic):
         friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
         self._pairs, self.stale = Pairs(key, what, contact.number[at[order]]), True
 
-    def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
+    def initialise_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
         self._renew(x, frozen.places, self._pairs)
 
     def element_state(self) -> tuple[Ints, Array]:
@@ -209,7 +210,7 @@ class CoulombFriction(Elastic):
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
         key = np.column_stack([vertices, what])
         order = _order(key)
-        # `take_pairs` finds the rest
+        # `initialise_pairs` finds the rest
         rest = np.zeros((len(key), COLUMNS - values.shape[1]))
         rows = np.column_stack([what, slip, values[:, 9], rest])
         self._pairs = Pairs(key[order], rows[order], vertices[order])
@@ -309,7 +310,7 @@ class CoulombFriction(Elastic):
         blend = 0.0 if self._contact.static else blend
         friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
 
-    def sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
+    def count_sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
         """How many pairs that this rank counts stick and slide at positions x (n_local, 3), and the sum of
         the normal forces [N] that they are given in the step.
         """
@@ -337,7 +338,7 @@ class CoulombFriction(Elastic):
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
         self._renew(x, frozen.places, self._known._replace(what=old))
 
-    def rubbing(
+    def friction_corrections(
         self,
         stage: Array,
         x: Array,
@@ -347,9 +348,9 @@ class CoulombFriction(Elastic):
         dt: float,
         *,
         sheets: bool,
-    ) -> Rubbing:
+    ) -> FrictionCorrections:
         contact = self._contact
-        *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
+        *_, force, at = contact.find_contacts(stage, frozen.now, contact.n_owned)
         vertex = contact.vertex_of(at)
         on = (vertex >= 0) & (sheets | (contact.obstacle[at] >= 0))
         slip, _, slides = self._slid(x, *self._state(frozen.end))
@@ -378,7 +379,7 @@ class CoulombFriction(Elastic):
         points, beta, obstacle, ways = (
             of[these] for of in (self.stencil, self._beta, self._obstacle, self._ways)
         )
-        moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
+        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end)
         rate = np.einsum("ecik,eik->ec", ways, v[points]) - self._along(moved / dt, these)
         rate[: len(rub)] = self._along(slip[rub], rub)
         length = np.linalg.norm(rate, axis=1, keepdims=True)
@@ -387,7 +388,7 @@ class CoulombFriction(Elastic):
             np.einsum("ec,eck->ek", rate, self._tangents[these]),
             np.einsum("ec,ecim->eim", rate, ways),
         )
-        return Rubbing(points, beta, along, ways, np.concatenate([lacks, room]), obstacle, moved)
+        return FrictionCorrections(points, beta, along, ways, np.concatenate([lacks, room]), obstacle, moved)
 
     def moments(self, x: Array, frozen: ObstacleMoves) -> tuple[Ints, Array]:
         of = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
@@ -396,15 +397,15 @@ class CoulombFriction(Elastic):
         friction_pairs.add_moments(x, stencil, *state, moments)
         return stencil, -moments
 
-    def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
+    def accept_substep(self, x: Array, frozen: ObstacleMoves) -> None:
         self.accept(x, frozen)
         self._taken_at = frozen.time  # else what obstacles take along would go that way twice
 
-    def lagging(self, x: Array, frozen: ObstacleMoves) -> dict[str, Array]:
+    def friction_lag(self, x: Array, frozen: ObstacleMoves) -> dict[str, Array]:
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
         (slip, _, slides), count = self._slid(x, *self._state(frozen.end)), len(names)
         mine, pull = slice(self.n_owned), self._spring * np.linalg.norm(slip, axis=1)
-        *_, force, at = self._contact.touching(x, frozen.places, self._contact.n_owned)
+        *_, force, at = self._contact.find_contacts(x, frozen.places, self._contact.n_owned)
 
         def by_vertex(vertex: NDArray[np.int32], obstacle: Ints, each: Array) -> Array:
             places, size = vertex.astype(np.int64) * count + obstacle % count, len(self._heat) * count
@@ -420,10 +421,10 @@ class CoulombFriction(Elastic):
         sums = np.stack([wrong.sum(axis=0), pull.sum(axis=0), (more * limit).sum(axis=0)], axis=1)
         return dict(zip(names, sums, strict=True))
 
-    def touched(self) -> tuple[Pairs, Array, Array, float | None]:
+    def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
         return self._pairs, self._heat.copy(), self._on_obstacles, self._taken_at
 
-    def touch_again(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
+    def restore_contacts(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
         self._pairs, self._heat, self._on_obstacles, self._taken_at = touched
         self.stale = True
 

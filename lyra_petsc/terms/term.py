@@ -87,9 +87,10 @@ class UpcomingStep:
     reference: Callable[[float, Ints], Array]
 
 
-class Part(NamedTuple):
-    """A part of a step, as fractions of the time up to its stage, and from 1 to 2 of that to its end; both 1:
-    obstacles stand at the stage.
+class StepInterval(NamedTuple):
+    """An interval of a step: 0 is its start, 1 its stage, 2 its end, and time is linear in between.
+
+    With ``begin`` = ``end`` = 1 obstacles stay where they are at the stage.
     """
 
     begin: float
@@ -97,21 +98,21 @@ class Part(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two parts that an element keeps apart.
+    """The two simplices (vertex, edge or triangle) that an element keeps apart.
 
     Attributes
     ----------
     parts : tuple of tuples of int
-        Local rows of the vertices of each part of a sheet.
+        Local rows of the vertices of each simplex of a sheet: two, or one in front of an obstacle.
     obstacle : str
-        The other part, where ``parts`` has one alone: the name of an obstacle.
-    kept : float
-        Distance [m] that counts as none.
+        Name of the obstacle, empty between sheets.
+    thickness : float
+        Distance [m] of the mid-surfaces at which the gap is zero.
     """
 
     parts: tuple[tuple[int, ...], ...]
     obstacle: str
-    kept: float
+    thickness: float
 
 
 class Term(ABC):
@@ -190,18 +191,19 @@ class Term(ABC):
 
 
 class Dashpots(NamedTuple):
-    """Pairs between whose nearest points distances are damped.
+    """Pairs in contact whose rate of change of distance is damped.
 
     Attributes
     ----------
     points, beta, normal : (m, 4), (m, 4), (m, 3)
-        As `Elastic.touching_points` has them.
+        As from `Elastic.contact_points`.
     stiffness : (m,)
-        Second derivative b″ of the energy by the distance [N/m].
+        Second derivative b″ of the energy with respect to the distance [N/m].
     vertex, obstacle : (m,)
-        Vertex of a sheet that meets something, −1 of others; what it meets, −1 between sheets.
+        Vertex of a sheet that is in contact, −1 for other kinds of pairs; number of the obstacle, −1 between
+        sheets.
     pushed : (m,)
-        By how much the obstacle's motion in the step brought it nearer [m].
+        Distance [m] by which the obstacle's motion in the step reduced that of the pair.
     """
 
     points: Ints
@@ -213,30 +215,34 @@ class Dashpots(NamedTuple):
     pushed: Array
 
 
-class Rubbing(NamedTuple):
-    """Pairs that slide, and what friction lacks; and those that stick where less holds what slides.
+class FrictionCorrections(NamedTuple):
+    """Changes of the friction force of a step, to be applied as impulses at its end.
+
+    Pairs that slid get the friction that is missing for the normal forces which acted; pairs that stick, if
+    the kinetic coefficient is below the static one, may be stopped by additional friction.
 
     Attributes
     ----------
     points, beta : (m, 4)
-        As `Elastic.touching_points` has them.
-    along : (m, 3)
-        Unit vectors of the ways that they slid, or go on.
-    ways : (m, 4, 3)
-        Gradients of the lengths of these by the positions of the points.
-    more : (m,)
-        By how much friction [N] was too small in one step, or may be larger; below 0, too large.
+        As from `Elastic.contact_points`.
+    direction : (m, 3)
+        Unit vectors of the relative motion, tangential to the contact.
+    gradient : (m, 4, 3)
+        Gradients of the relative displacement along ``direction`` with respect to the points' positions.
+    force : (m,)
+        Missing friction [N] of sliding pairs, below 0 where there was too much; largest additional friction
+        of sticking ones.
     obstacle : (m,)
-        What is touched, −1 between sheets.
+        Number of the obstacle, −1 between sheets.
     moved : (m, 3)
-        How far the obstacle moved in the step, times Σ β_i of the sheet's points [m].
+        Displacement of the obstacle in the step, times Σ β_i of the sheet's points [m].
     """
 
     points: Ints
     beta: Array
-    along: Array
-    ways: Array
-    more: Array
+    direction: Array
+    gradient: Array
+    force: Array
     obstacle: Ints
     moved: Array
 
@@ -245,25 +251,26 @@ class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
     search_distance: float = 0.0
-    """Distance [m] within which ``neighbours`` looks for elements; 0 where nothing is looked for."""
+    """Distance [m] within which ``neighbours`` searches for elements; 0: the term does not search."""
 
     stale: bool = False
-    """Whether ``neighbours`` or ``known`` has others to name, though no point has moved far."""
+    """Whether the elements are to be asked for anew, although no point has moved by half the ``skin``."""
 
-    unseen: float = np.inf
-    """Distance [m] by which points that ``neighbours`` did not name may come nearer to each other at most."""
+    approach_limit: float = np.inf
+    """Distance [m] by which two points that ``neighbours`` did not return may approach each other."""
 
     surface: NDArray[np.int32] | None = None
-    """Triangles (F, 3), in local rows, among which ``neighbours`` looks; None where points do."""
+    """Triangles (F, 3), in local rows, that ``neighbours`` searches; None: it searches points."""
 
     pushes: bool = False
-    """Whether what moves works by its forces (`work`), as its motion alone may make the energy infinite."""
+    """Whether the work of moving obstacles is computed from forces (`work`) and not from the energy, which
+    their motion alone may make infinite."""
 
     surface_marks: Ints | None = None
-    """Numbers (F, m) that go with each of them, if any: the last columns of what ``neighbours`` gets."""
+    """Numbers (F, m) of the triangles of ``surface``, if any: further columns of what ``neighbours`` gets."""
 
     skin: float = 0.0
-    """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
+    """Part [m] of ``search_distance`` by which points may approach each other before the next search."""
 
     @property
     def moving(self) -> bool:
@@ -326,93 +333,102 @@ class Elastic(Term):
         return size
 
     slips: bool = False
-    """Whether its force turns within so short a way that one linear solve does not follow it."""
+    """Whether it is friction of contacts, whose force changes too abruptly for one linear solve per step."""
 
     partner: Elastic | None = None
     """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
-    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
-        """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
+    def neighbours(
+        self, x: Array, displacement: Array, numbers: Ints, triangles: Ints
+    ) -> tuple[Ints, Ints] | None:
+        """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``,
+        and whole numbers (E, m) of each, which ``take`` gets as data ``what``.
 
-        And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
-        the points' global numbers, ``triangles`` (F, 3 + m) near ones of ``surface`` with its marks. Where
-        ``unseen`` is given, also those that come so near on their straight ways (N, 3) [m]; None where these
-        are so long that there are too many: it is asked again with shorter ones. Ranks that see the same
-        points must name them in the same order within an element; the owner of the first counts it.
+        ``numbers`` (N,) are the points' global numbers, ``triangles`` (F, 3 + m) near triangles of
+        ``surface`` with their marks. A term with an ``approach_limit`` also returns elements whose points
+        come so near anywhere along straight displacements (N, 3) [m]; None if these are so long that there
+        are too many: it is asked again with shorter ones. Ranks that see the same points must return them in
+        the same order within an element; the owner of the first counts the element.
         """
         raise NotImplementedError
 
-    def known(self) -> tuple[Ints, Ints | Array]:
-        """The same by global numbers, of a term without a ``search_distance``, whenever it is ``stale``: of
-        those whose first vertex this rank owns.
+    def current_elements(self) -> tuple[Ints, Ints | Array]:
+        """Elements and their numbers as from `neighbours`, but in global numbers, of a term without a
+        ``search_distance``; asked whenever it is ``stale``. Only those whose first vertex this rank owns.
         """
         raise NotImplementedError
 
-    def acting(self, x: Array, frozen: Any) -> NDArray[np.bool_]:
-        """Which elements (E,) have a Hessian that is not 0 at positions x (n_local, 3)."""
+    def active_elements(self, x: Array, frozen: Any) -> NDArray[np.bool_]:
+        """Which elements (E,) have a non-zero Hessian at positions x (n_local, 3)."""
         return np.ones(self.n_elements, dtype=np.bool_)
 
-    def largest_step(self, x: Array, way: Array, frozen: Any) -> float:
-        """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
+    def largest_step(self, x: Array, increment: Array, frozen: Any) -> float:
+        """Largest fraction, up to 1, of Newton's increment (n_local, 3) [m] of x that may be applied."""
         return 1.0
 
-    def springs(self, x: Array, way: Array, frozen: Any) -> Springs | None:
-        """What touches, or may after a way (n_local, 3) [m] from x; it is `acting` until `release`. None of a
-        term whose elements are only known where they act.
+    def springs(self, x: Array, increment: Array, frozen: Any) -> Springs | None:
+        """One-sided springs for the pairs that are in contact at x, or may be after an increment (n_local, 3)
+        [m]. Their elements count as active until `release_springs`. None: the term has no such springs.
         """
         return None
 
-    def release(self, length: Array | None) -> None:
-        """Take what springs push by where they are of this length (m,) [m] as foreseen, for `aims`; None:
-        they are not.
+    def release_springs(self, length: Array | None) -> None:
+        """Drop the springs. Their forces at lengths (m,) [m], where given, are those that `target_distances`
+        expects.
         """
 
-    def aims(self, x: Array, way: Array, frozen: Any) -> Any:
-        """What `push_apart` is to reach after a Newton iteration's way (n_local, 3) [m] from x."""
+    def target_distances(self, x: Array, increment: Array, frozen: Any) -> Any:
+        """Distances of pairs that `add_corrections` restores after Newton's increment (n_local, 3) [m]."""
         return None
 
-    def push_apart(self, x: Array, way: Array, frozen: Any, aims: Any, out: Array, count: Array) -> bool:
-        """Whether points are nearer after the way (n_local, 3) [m] from x than they should be.
+    def add_corrections(
+        self, x: Array, increment: Array, frozen: Any, targets: Any, out: Array, weight: Array
+    ) -> bool:
+        """Whether points are nearer after the increment (n_local, 3) [m] of x than their target distances.
 
-        Adds where they should go instead to ``out`` (n_local, 3) [m], of each element with a weight that is
-        added to ``count`` (n_local, 1).
+        Adds corrections of the increment to ``out`` (n_local, 3) [m], each times a weight, and the weights to
+        ``weight`` (n_local, 1).
         """
         return False
 
-    def lets_pass(self, x: Array, way: Array, frozen: Any, part: Part) -> bool:
-        """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in a part of the
-        step.
+    def is_collision_free(self, x: Array, displacement: Array, frozen: Any, interval: StepInterval) -> bool:
+        """Whether nothing collides on the displacement (n_local, 3) [m] from x, while obstacles move as in an
+        interval of the step.
         """
         return True
 
     def gaps(self, x: Array, frozen: Any) -> Array:
-        """Distance less what is to be kept [m] of the parts of each owned element, (n_owned,).
+        """Distance less thickness [m] between the two simplices of each owned element, (n_owned,).
 
-        Empty where elements keep nothing apart.
+        Empty for a term that keeps nothing apart.
         """
         return np.empty(0)
 
-    def free_parts(self, x: Array, way: Array, frozen: Any, part: Part) -> Array:
-        """Fraction, up to 1, of the way (n_local, 3) [m] from x that each owned element lets go, (n_owned,),
-        while obstacles go theirs in a part of the step. Empty as for `gaps`.
+    def collision_free_fractions(
+        self, x: Array, displacement: Array, frozen: Any, interval: StepInterval
+    ) -> Array:
+        """Fraction, up to 1, of the displacement (n_local, 3) [m] from x on which the pair of each owned
+        element does not collide, (n_owned,), while obstacles move as in an interval of the step.
+
+        Empty for a term that keeps nothing apart.
         """
         return np.empty(0)
 
-    def collides(self, x: Array, way: Array, frozen: Any, far: float) -> bool:
-        """Whether any elements of this rank may meet in a step in which points go the way (n_local, 3) [m]
-        from x, and obstacles theirs, coming nearer to each other by more than ``far`` [m].
+    def may_collide(self, x: Array, displacement: Array, frozen: Any, threshold: float) -> bool:
+        """Whether any pair of this rank may come into contact in a step with this displacement (n_local, 3)
+        [m] from x; only pairs that approach by more than ``threshold`` [m] count.
         """
         return False
 
     def pair(self, element: int) -> Pair:
-        """What an element keeps apart."""
+        """The pair of simplices that an element keeps apart."""
         raise NotImplementedError
 
     def obstacle_forces(self, x: Array, frozen: Any, count: int) -> Array | None:
-        """Force [N] on each of a scene's obstacles and its torque [N m] about the origin by this rank's
-        elements, (count, 6); None of a term that knows none.
+        """Force [N] of this rank's elements on each of a scene's obstacles, and its torque [N m] about the
+        origin, (count, 6); None: the term does not act on obstacles.
         """
         return None
 
@@ -429,22 +445,34 @@ class Elastic(Term):
         """
         raise NotImplementedError
 
-    def touching_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints]:
-        """What touches at positions x (n_local, 3), of the pairs that this rank counts: points (m, 4), below
-        0 those of obstacles, their barycentric coordinates β (m, 4), unit normals (m, 3) towards the first,
-        normal forces (m,) [N], and the vertex (m,) of a sheet that meets something, −1 of others.
+    def contact_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints]:
+        """The pairs in contact at positions x (n_local, 3), of those that this rank counts.
+
+        Returns
+        -------
+        points, beta : (m, 4)
+            Local rows, or below 0 points of obstacles, and their coefficients β: the vector between the
+            nearest points is Σ β_i p_i.
+        normal : (m, 3)
+            Unit normals towards the first simplex.
+        force : (m,)
+            Normal forces [N].
+        vertex : (m,)
+            The vertex of a sheet that is in contact, −1 for pairs of other kinds.
         """
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
     def dashpots(self, x: Array, frozen: Any) -> Dashpots:
-        """Pairs whose repulsion stiffens at the end of the step, those that other ranks count, too."""
-        points, beta, normal, force, vertex = Elastic.touching_points(self, x, frozen)
+        """Pairs in contact at the end of the step, including those that other ranks count."""
+        points, beta, normal, force, vertex = Elastic.contact_points(self, x, frozen)
         return Dashpots(points, beta, normal, force, vertex, vertex, force)
 
-    def carried(self, x: Array, way: Array, frozen: Any) -> Array:
-        """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""
-        return way
+    def moved_with_obstacles(self, x: Array, displacement: Array, frozen: Any) -> Array:
+        """Displacements (n_local, 3) [m] from x, changed to those of moving obstacles for vertices in their
+        path.
+        """
+        return displacement
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""
@@ -461,22 +489,23 @@ class Elastic(Term):
         first, last = frozen
         return 0.5 * sum(float((self.energies(x, last) - self.energies(x, first)).sum()) for x in ends)
 
-    def on_the_way(self, x: Array, frozen: Any) -> None:
-        """A part of a static load step led to positions x; for terms that take up there what touches."""
+    def accept_substep(self, x: Array, frozen: Any) -> None:
+        """Accept a part of a static load step that ended at positions x; for terms that update contacts."""
 
-    def lagging(self, x: Array, frozen: Any) -> Mapping[str, Array]:
-        """Sums [N] of friction at positions x (n_local, 3), of this rank's vertices, on each obstacle and of
-        sheets (no name), (3,): by how much it is more than the normal forces there allow, or less where parts
-        slide; friction; and what these allow.
+    def friction_lag(self, x: Array, frozen: Any) -> Mapping[str, Array]:
+        """How far friction is from the limit of the normal forces at positions x (n_local, 3).
+
+        For each obstacle by its name, and between sheets (empty name), three sums [N] over this rank's
+        vertices: error (friction beyond the limit, or below it where pairs slide), friction, limit.
         """
         return {}
 
-    def touched(self) -> Any:
-        """What it knows of what touches, which `touch_again` goes back to."""
+    def contact_state(self) -> Any:
+        """The contacts that the term has stored, for `restore_contacts`."""
         return None
 
-    def touch_again(self, touched: Any) -> None:
-        """Go back to it."""
+    def restore_contacts(self, state: Any) -> None:
+        """Go back to what `contact_state` returned."""
 
     def heat(self, x: Array, frozen: Any) -> float:
         """What of the energy [J] of its owned elements is none when the step to x is accepted, but heat."""
@@ -509,28 +538,27 @@ class Elastic(Term):
     def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
         """Go on with a state of edges at positions x (n_local, 3)."""
 
-    def take_pairs(self, x: Array, frozen: Any) -> None:
-        """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
+    def initialise_pairs(self, x: Array, frozen: Any) -> None:
+        """Store the pairs in contact at positions x (n_local, 3), where a run begins or is resumed."""
 
     @property
-    def n_rubbing(self) -> int:
-        """How many pairs touch that may stick or slide in the next step, of a term that `slips`."""
+    def n_friction_pairs(self) -> int:
+        """Number of pairs in contact that may stick or slide in the next step."""
         return 0
 
-    def rubbing(
+    def friction_corrections(
         self, stage: Array, x: Array, v: Array, frozen: Any, damping: Array, dt: float, *, sheets: bool
-    ) -> Rubbing:
-        """What slides in a step of length dt [s] over a stage at positions ``stage`` to x, with velocities v
-        (n_local, 3), in which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that
-        `slips`.
+    ) -> FrictionCorrections:
+        """Corrections of friction at the end of a step of length dt [s]; of a term that `slips`.
 
-        On obstacles, and with ``sheets`` on sheets.
+        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); dashpots added normal
+        forces ``damping`` (n_owned,) [N]. Friction on obstacles, and with ``sheets`` also between sheets.
         """
         raise NotImplementedError
 
     def moments(self, x: Array, frozen: Any) -> tuple[Ints, Array]:
-        """Vertices (m, 4) of the counted pairs between sheets, and the moments (m, 3) [N m] that their forces
-        have at positions x (n_local, 3); of a term that `slips`.
+        """Vertices (m, 4) of the counted pairs between sheets and the moments (m, 3) [N m] of their forces
+        at positions x (n_local, 3); of a term that `slips`.
         """
         raise NotImplementedError
 

@@ -234,7 +234,7 @@ def test_there_is_room_near_the_start_of_a_way() -> None:
     with Simulation(falling(0.02), MPI.COMM_SELF) as simulation:
         contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
         known, x = simulation.problem.discretisation, simulation.problem.system.x + 1.0
-        reach = 0.5 * contact.unseen
+        reach = 0.5 * contact.approach_limit
         x_way = np.zeros_like(x)
         x_way[:, 0] = 1.0
         known.follow(x, 0.3 * reach * x_way)

@@ -148,7 +148,9 @@ def test_a_strip_is_held_by_what_its_normal_forces_allow(
     assert isinstance(term, ContactBarrier)
     torque = abs(simulation.ledger.obstacle_forces(1)[0, 4])
     allowed = (
-        MU * RADIUS * float(term.touching(system.x, system.active.frozen[term].now, term.n_owned)[2].sum())
+        MU
+        * RADIUS
+        * float(term.find_contacts(system.x, system.active.frozen[term].now, term.n_owned)[2].sum())
     )
     simulation.destroy()
     assert newton < 250

@@ -86,10 +86,10 @@ class Pairs:
         each = blocks_of(self.x, self.others, of, met, blend)
         return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
-    def free_way(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
+    def free_fraction(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
         pairs = self.kind[at], self.points[at], self.offset[at], np.full(len(self), GAP)[at]
-        return float(contact_pairs.free_way(self.x, self.others, way, others_way, *pairs, KEPT, most))
+        return float(contact_pairs.free_fraction(self.x, self.others, way, others_way, *pairs, KEPT, most))
 
 
 MET = ["at", "weight", "beta", "felt"]
@@ -333,7 +333,7 @@ def test_free_ways(name: str, speed: float) -> None:
         others_way[1::2] = 0.0  # planes that do not turn
     limited, found = 0, []
     for e in range(len(pairs)):
-        found.append(fraction := pairs.free_way(way, others_way, e))
+        found.append(fraction := pairs.free_fraction(way, others_way, e))
         assert 0.0 < fraction <= 1.0
         least, last = closest(pairs, e, way, others_way, fraction)
         assert least >= KEPT - 1e-12
@@ -341,8 +341,8 @@ def test_free_ways(name: str, speed: float) -> None:
             limited += 1
             assert last <= KEPT + (1.0 - KEPT) * CLOSE + 1e-12
     assert limited > 5 or speed < 1.0
-    assert pairs.free_way(way, others_way) == min(found)
-    assert pairs.free_way(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
+    assert pairs.free_fraction(way, others_way) == min(found)
+    assert pairs.free_fraction(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
 
 
 def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
@@ -351,7 +351,9 @@ def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
     aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
     still = np.zeros_like(pairs.x)
-    contact_pairs.aims(pairs.x, pairs.others, still, *numbers, 0.7, np.full(n, force), aim, before, presses)
+    contact_pairs.target_distances(
+        pairs.x, pairs.others, still, *numbers, 0.7, np.full(n, force), aim, before, presses
+    )
     left = pairs.distances() - pairs.offset
     touch = (left > 0.0) & (left < GAP)
     assert touch.any()
@@ -393,7 +395,9 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
     way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
     aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, np.full(n, np.nan), aim, before, presses)
+    contact_pairs.target_distances(
+        pairs.x, pairs.others, way, *numbers, most, np.full(n, np.nan), aim, before, presses
+    )
 
     def slopes(delta: Array) -> Array:
         return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])
@@ -420,7 +424,7 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
         moved = way.copy()
         for _ in range(50):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
-            if not contact_pairs.push_apart(x, others, moved, *of, 1e-3, out, count):
+            if not contact_pairs.add_corrections(x, others, moved, *of, 1e-3, out, count):
                 break
             moved[at] += out[at] / np.maximum(count[at], 1e-9)
         else:
@@ -436,7 +440,7 @@ def test_a_common_motion_of_both_is_free() -> None:
         others_way = np.tile([30.0, -20.0, 50.0], (len(pairs.others), 1))
         if len(pairs.others) and pairs.kind[0] == VERTEX_PLANE:
             others_way[1::2] = 0.0
-        assert pairs.free_way(way, others_way) == 1.0
+        assert pairs.free_fraction(way, others_way) == 1.0
 
 
 def test_long_ways_past_each_other_are_judged_at_once() -> None:
@@ -444,7 +448,7 @@ def test_long_ways_past_each_other_are_judged_at_once() -> None:
     pairs = pairs.part(pairs.distances() > pairs.offset)
     way = np.zeros_like(pairs.x)
     way[:, 0] = 1e12 * (1.0 + np.arange(len(way)) % 2)
-    assert 0.0 <= pairs.free_way(way, np.zeros_like(pairs.others)) < 1.0
+    assert 0.0 <= pairs.free_fraction(way, np.zeros_like(pairs.others)) < 1.0
 
 
 def test_planes_that_turn() -> None:
@@ -456,7 +460,7 @@ def test_planes_that_turn() -> None:
     way = rng.normal(size=pairs.x.shape)
     limited = 0
     for e in range(len(pairs)):
-        fraction = pairs.free_way(way, others_way, e)
+        fraction = pairs.free_fraction(way, others_way, e)
         limited += fraction < 1.0
         for t in np.linspace(0.0, fraction, 50):
             point, normal = pairs.others[2 * e], pairs.others[2 * e + 1] + t * others_way[2 * e + 1]
