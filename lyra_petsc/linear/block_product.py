@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import ProductWithEdges
 
 
-MOST_KEPT = 20_000
+MAX_SCRATCH_ROWS = 20_000
 """Rows up to which scratch is kept; more of it is got quickly enough, and assembly needs the room."""
 
 
 @cached(fastmath={"contract", "nsz"})
-def half_stored(indptr, ends, columns, blocks, x, sums, out):  # type: ignore[no-untyped-def]
+def multiply_half(indptr, ends, columns, blocks, x, sums, out):  # type: ignore[no-untyped-def]
     """out (n_owned, 3) = rows · x (n_local, 3) of a symmetric matrix of which one half is stored.
 
     The first block (n_blocks, 9) of a row is the diagonal one; from ``ends`` (n_owned,) on they are in
@@ -36,16 +36,16 @@ def half_stored(indptr, ends, columns, blocks, x, sums, out):  # type: ignore[no
         out[row, 0], out[row, 1], out[row, 2] = s0 + sums[row, 0], s1 + sums[row, 1], s2 + sums[row, 2]
 
 
-def product_of(pattern: BlockPattern, values: Array) -> HalfStored | ProductWithEdges:
+def make_product(pattern: BlockPattern, values: Array) -> HalfStoredProduct | ProductWithEdges:
     """What multiplies by values (n_stored, 3, 3), which are read where they stand."""
     if pattern.edge_couplings is None:
-        return HalfStored(pattern, values)
+        return HalfStoredProduct(pattern, values)
     from lyra_petsc.linear.edge_couplings import ProductWithEdges  # of use for nothing else
 
     return ProductWithEdges(pattern, values)
 
 
-class HalfStored:
+class HalfStoredProduct:
     """Products with symmetric block rows of which one half is stored.
 
     Parameters
@@ -57,9 +57,9 @@ class HalfStored:
     def __init__(self, pattern: BlockPattern, values: Array) -> None:
         self._rows = pattern.indptr, pattern.ends, pattern.columns, values.reshape(-1, 9)
         self._shape = pattern.n_owned, 4
-        self._kept = np.empty(self._shape) if pattern.n_owned <= MOST_KEPT else None
+        self._kept = np.empty(self._shape) if pattern.n_owned <= MAX_SCRATCH_ROWS else None
 
     def __call__(self, x: Array, out: Array) -> None:
         """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
         sums = np.empty(self._shape) if self._kept is None else self._kept
-        half_stored(*self._rows, x, sums, out)
+        multiply_half(*self._rows, x, sums, out)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
-from lyra_petsc.linear.block_product import product_of
+from lyra_petsc.linear.block_product import make_product
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import Elastic
 
@@ -33,7 +33,7 @@ def _add_to_edges(indptr, first, diagonal, flat):  # type: ignore[no-untyped-def
 
 
 @cached()
-def _add_at(source, place, values):  # type: ignore[no-untyped-def]
+def _add_blocks(source, place, values):  # type: ignore[no-untyped-def]
     for k in range(len(place)):
         at = place[k]
         for i in range(3):
@@ -57,7 +57,7 @@ def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyp
 
 
 @cached(fastmath={"reassoc", "contract", "nsz"})
-def square_without(vector, left_out):  # type: ignore[no-untyped-def]
+def squared_norm_without(vector, left_out):  # type: ignore[no-untyped-def]
     """Sum of the squares of ``vector`` (n,) without those of its entries ``left_out`` (m,), which ascend."""
     total, begin = 0.0, 0
     for nth in range(len(left_out) + 1):
@@ -138,7 +138,7 @@ class BlockRows:
             indptr, own = pattern.edge_couplings.numbers.indptr, diagonal[pattern.n_diagonal :]
             _add_to_edges(indptr, first, own, values.reshape(-1))
 
-    def enlarge(self, values: Array, factor: float) -> None:
+    def scale_diagonal(self, values: Array, factor: float) -> None:
         """Multiply the diagonal blocks, and of edges their own entries, by a factor."""
         pattern = self.pattern
         values[pattern.indptr[: pattern.n_diagonal]] *= factor
@@ -150,11 +150,11 @@ class BlockRows:
         np.multiply(source, factor, out=values)
         self.add_diagonal(diagonal, values)
 
-    def add_at(self, source: Array, place: NDArray[np.int64], values: Array) -> None:
+    def add_blocks(self, source: Array, place: NDArray[np.int64], values: Array) -> None:
         """Add blocks (n, 3, 3) to those of ``values`` at ``place`` (n,), none of them twice, and couplings of
         edges to these.
         """
-        _add_at(source, place, values)
+        _add_blocks(source, place, values)
         edges = self.pattern.edge_couplings
         if edges is not None:
             begin, end = (edges.first_group(n) for n in (self.pattern.n_blocks, len(place)))
@@ -165,7 +165,7 @@ class BlockRows:
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
         out = np.empty((self.pattern.n_owned, 3))
-        product_of(self.pattern, values)(x, out)
+        make_product(self.pattern, values)(x, out)
         return out
 
     def beside(self, mask: NDArray[np.bool_]) -> Beside:

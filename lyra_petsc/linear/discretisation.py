@@ -1,11 +1,11 @@
-"""Which rows a rank knows and which of them the matrix couples: made anew as stencils change.
+"""Local rows (owned and ghost) and block pattern of a rank, rebuilt when stencils change.
 
-Terms with fixed stencils give a pattern once. Terms whose stencils change (``Registration.neighbours``) look
-for their elements anew when a vertex has moved by more than half their skin from the way that it was expected
-to go; points of other ranks that they need become further ghosts, after the present ones, so that what fixed
-stencils refer to stays where it is. The pattern behind follows when a matrix is wanted
-(`Discretisation.renew_pattern`), and is kept while it has all blocks. Code that keeps arrays of n_local rows
-or of n_blocks blocks compares them with ``layout`` and ``rows``.
+Fixed stencils determine the pattern once. Terms with changing stencils (``Registration.neighbours``)
+search for elements again when a vertex is farther than half their skin from its expected path. Rows of
+other ranks that their elements need are appended to the ghosts, so that local numbers in fixed stencils stay
+valid. The pattern is updated when a matrix is assembled (`Discretisation.update_pattern`), and kept while it
+has all blocks. Code that keeps arrays of n_local rows or of n_blocks blocks must compare ``layout`` and
+``rows`` with those for which the arrays were made.
 """
 
 from __future__ import annotations
@@ -26,52 +26,51 @@ from lyra_petsc.mesh.near import swept_boxes
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
 
-TELLING = 6
-"""Of the numbers that go with an element, how many tell it from others with its stencil."""
+SORT_COLUMNS = 6
+"""Leading attributes of an element that distinguish it from others with the same stencil."""
 
-SHORTER = *(0.25**k for k in range(12)), 0.0
-"""Parts of a way that are searched one after the other, until there are not too many elements along it."""
+FRACTIONS = *(0.25**k for k in range(12)), 0.0
+"""Fractions of a displacement that are tried in turn, until a search along it finds few enough elements."""
 
-FEW = 0.1
-"""Blocks that are of no use any longer, over all of fixed stencils, up to which they are kept."""
+MAX_UNUSED = 0.1
+"""Largest number of unused blocks that a pattern keeps, relative to the blocks of fixed stencils."""
 
 
 @cached(inline="always")
-def _far(x, origin, i, square):  # type: ignore[no-untyped-def]
-    """1 where point i is farther than the root of a square [m²] from its origin, or no number; else 0."""
+def _is_beyond(x, origin, i, square):  # type: ignore[no-untyped-def]
+    """1 if the distance of point i to its origin, squared, exceeds ``square`` [m²] or is NaN; else 0."""
     a, b, c = x[i, 0] - origin[i, 0], x[i, 1] - origin[i, 1], x[i, 2] - origin[i, 2]
     return 0 if a * a + b * b + c * c <= square else 1
 
 
 @cached()
-def _leaves(x, place, reach):  # type: ignore[no-untyped-def]
-    """Whether some of x are farther than ``reach`` from a place."""
-    square, far = reach * reach, 0
-    for row in range(len(x)):  # without a way out, so that several are looked at together
-        far |= _far(x, place, Index(row), square)
+def _any_beyond(x, origin, radius):  # type: ignore[no-untyped-def]
+    """Whether any point x (n, 3) is farther than ``radius`` from its origin."""
+    square, far = radius * radius, 0
+    for row in range(len(x)):  # no early exit, so that the loop is vectorised
+        far |= _is_beyond(x, origin, Index(row), square)
     return far != 0
 
 
 @cached()
-def _free_part(x, way, origin, reach):  # type: ignore[no-untyped-def]
-    """Fraction, up to 1, of ways (n, 3) that points x (n, 3) go until one is ``reach`` from its origin."""
-    least = 1.0
+def _fraction_within(x, displacement, origin, radius):  # type: ignore[no-untyped-def]
+    """Largest f ≤ 1 for which all x + f displacement (n, 3) are within ``radius`` of their origins."""
+    smallest = 1.0
     for i in range(len(x)):
-        square = mixed = gone = 0.0
+        uu = du = dd = 0.0
         for k in range(3):
-            off = x[i, k] - origin[i, k]
-            square, mixed, gone = square + way[i, k] ** 2, mixed + off * way[i, k], gone + off * off
-        # |gone + f way| = reach
-        left = max(reach * reach - gone, 0.0)
-        if square > left or 2.0 * mixed + square > left:
-            root = math.sqrt(mixed * mixed + square * left)
-            fraction = left / (mixed + root) if mixed > 0.0 else (root - mixed) / square
-            least = min(least, fraction)
-    return least
+            u, d = displacement[i, k], x[i, k] - origin[i, k]
+            uu, du, dd = uu + u**2, du + d * u, dd + d * d
+        # root f of |d + f u|² = radius²
+        remaining = max(radius * radius - dd, 0.0)
+        if uu > remaining or 2.0 * du + uu > remaining:
+            root = math.sqrt(du * du + uu * remaining)
+            smallest = min(smallest, remaining / (du + root) if du > 0.0 else (root - du) / uu)
+    return smallest
 
 
-def _marked(triangles: Ints, term: Elastic) -> Ints:
-    """Triangles (F, 3), with a column of what goes with each if a term has that."""
+def _with_marks(triangles: Ints, term: Elastic) -> Ints:
+    """Triangles (F, 3), with a further column of the term's surface marks, if it has any."""
     return triangles if term.surface_marks is None else np.column_stack([triangles, term.surface_marks])
 
 
@@ -83,18 +82,18 @@ class Discretisation:
     layout : Layout
         With the ghosts that fixed stencils need.
     terms : iterable of Term
-        Those whose Hessians are in the matrix.
+        Terms whose Hessians are assembled into the matrix.
 
     Attributes
     ----------
     layout : Layout
         With the ghosts that all stencils need.
     fixed, rows : BlockRows
-        Of the couplings by fixed stencils, and of all; one and the same where stencils do not change.
-    place : (n,) int64 or None
-        Where the blocks of ``fixed`` stand among those of ``rows``; None: they are the same.
-    near : bool
-        Whether there are elements of changing stencils, on any rank.
+        Block rows of fixed stencils only, and of all stencils; the same object if stencils do not change.
+    fixed_positions : (n,) int64 or None
+        Index in ``rows`` of each block of ``fixed``; None if both are the same.
+    has_near_elements : bool
+        Whether terms with changing stencils have elements, on any rank.
     """
 
     def __init__(self, layout: Layout, terms: Iterable[Term]) -> None:
@@ -108,157 +107,163 @@ class Discretisation:
                 couplings |= term.couplings
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
-        self.place: Ints | None = None
-        self.near = False
-        self._rows_of = layout  # that ``rows`` were made for
-        self._located: set[str] = set()  # terms of whose present stencils the pattern has the offsets
+        self.fixed_positions: Ints | None = None
+        self.has_near_elements = False
+        self._rows_layout = layout  # for which ``rows`` were made
+        self._located: set[str] = set()  # terms whose present stencils have offsets in the pattern
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
-        self._places: list[Array] = []  # on the way along which what is near is known
-        self._at = 0  # of these, where points were last
-        self._reach = 0.0  # how far from it points may be [m]
-        self._searched = 1.0  # part of the way that was asked for
-        self._triangles: dict[Elastic, Ints] = {}  # where a rank has them all
-        self._found: dict[Elastic, tuple[Ints, Ints | Array]] = {}
-        self._extra = np.empty(0, dtype=np.int64)  # keys of the blocks that ``fixed`` has not
+        self._references: list[Array] = []  # positions [m] along the path of the last search
+        self._current = 0  # index of the reference that points were last near
+        self._radius = 0.0  # distance [m] from a reference up to which the search is valid
+        self._fraction = 1.0  # of the expected displacement that was searched
+        self._triangles: dict[Elastic, Ints] = {}  # all triangles, on a single rank
+        self._global_elements: dict[Elastic, tuple[Ints, Ints | Array]] = {}
+        self._extra_keys = np.empty(0, dtype=np.int64)  # keys of the blocks of ``rows`` that ``fixed`` lacks
 
     @property
-    def changes(self) -> bool:
+    def stencils_change(self) -> bool:
         """Whether any stencils depend on the positions."""
         return bool(self._changing)
 
-    def follow(self, x: Array, ahead: Array | None = None, stops: Sequence[float] = ()) -> bool:
-        """Let stencils be those at positions x (n_local, 3) [m]; whether ghosts are others; collective.
+    def update_stencils(self, x: Array, expected: Array | None = None, stops: Sequence[float] = ()) -> bool:
+        """Update the stencils for positions x (n_local, 3) [m]; returns whether ghosts changed; collective.
 
-        ``ahead`` (n_local, 3) [m] is the way that points are expected to go together from there. Where it is
-        that of a step, ``stops`` are the parts of it after which they are asked for.
+        ``expected`` (n_local, 3) [m] is the displacement expected from x. If it is that of a step, ``stops``
+        are the fractions of it at which stencils will be needed.
         """
         if not self._changing:
             return False
         here = x[: self.layout.n_vertices]
-        to = here if ahead is None else here + ahead[: len(here)]
-        asked = self._renewed(here, to)
+        to = here if expected is None else here + expected[: len(here)]
+        asked = self._terms_to_update(here, to)
         if not asked:
             return False
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
-            way = np.zeros_like(x) if ahead is None else ahead
-            part = self._search(x, way)
+            displacement = np.zeros_like(x) if expected is None else expected
+            part = self._search(x, displacement)
             parts = stops if stops and part == 1.0 else (part,)
-            self._places = [here + part * way[: len(here)] for part in (0.0, *parts)]
-            self._at = 0
-            self._reach = 0.5 * min(term.skin for term in self._searching)
+            self._references = [here + part * displacement[: len(here)] for part in (0.0, *parts)]
+            self._current = 0
+            self._radius = 0.5 * min(term.skin for term in self._searching)
         for term in asked:
             if term.search_distance == 0.0:
-                self._found[term] = self._sent(*term.current_elements())
+                self._global_elements[term] = self._exchange_elements(*term.current_elements())
         more, fixed = layout.ghosts[:0], self._fixed_layout.ghosts
-        if any(len(stencil) for stencil, _ in self._found.values()):
+        if any(len(stencil) for stencil, _ in self._global_elements.values()):
             end = layout.start + layout.n_owned
-            stencils = [stencil for stencil, _ in self._found.values()]
+            stencils = [stencil for stencil, _ in self._global_elements.values()]
             beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil in stencils]
             more = np.setdiff1d(np.concatenate(beyond), fixed)
         lacking = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
-        any_here = any(len(stencil) for stencil, _ in self._found.values())
-        others, self.near = (flag > 0.0 for flag in layout.largest(lacking, any_here))
+        any_here = any(len(stencil) for stencil, _ in self._global_elements.values())
+        others, self.has_near_elements = (flag > 0.0 for flag in layout.largest(lacking, any_here))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()
             self.layout = layout = self._fixed_layout.with_ghosts(more)
-        else:  # where nothing is near and nothing was, nothing is new
-            asked = [term for term, n in zip(asked, had, strict=True) if n or len(self._found[term][0])]
+        else:  # terms that had no elements and have none now are up to date
+            found = self._global_elements
+            asked = [term for term, n in zip(asked, had, strict=True) if n or len(found[term][0])]
         for term in self._changing if others else asked:
-            elements = self._elements(*self._found[term])
+            elements = self._local_elements(*self._global_elements[term])
             if others or not np.array_equal(elements.stencil, term.stencil):
                 self._located.discard(term.name)
             term.take(elements)
         return others
 
-    def _renewed(self, here: Array, to: Array) -> list[Elastic]:
-        """Terms whose elements may be others along the way of owned vertices; collective.
+    def _terms_to_update(self, here: Array, to: Array) -> list[Elastic]:
+        """Terms whose elements may change between two positions of the owned vertices; collective.
 
-        If any that search, then all that do, and they come first.
+        If one term must search, all terms that search are returned, before the others.
         """
-        told = self.layout.largest(*(term.stale for term in self._changing))
-        leaves = not (self._is_known(here, self._reach) and (to is here or self._is_known(to, self._reach)))
-        if self._found and not leaves and not any(told):
+        stale = self.layout.largest(*(term.stale for term in self._changing))
+        leaves = not (
+            self._is_covered(here, self._radius) and (to is here or self._is_covered(to, self._radius))
+        )
+        if self._global_elements and not leaves and not any(stale):
             return []
         searches = leaves and bool(self._searching)
-        new = [term for term, stale in zip(self._changing, told, strict=True) if stale]
-        if not self._found:
+        new = [term for term, is_stale in zip(self._changing, stale, strict=True) if is_stale]
+        if not self._global_elements:
             searches, new = True, self._changing
         searches |= any(term in self._searching for term in new)
         return [*(self._searching if searches else []), *(t for t in new if t not in self._searching)]
 
     @property
-    def guards(self) -> bool:
-        """Whether ways must be looked at before they are gone: a term has to see who meets there."""
+    def limits_motion(self) -> bool:
+        """Whether displacements must be checked before points move, since a term detects collisions."""
         return any(np.isfinite(term.approach_limit) for term in self._changing)
 
-    def largest_step(self, x: Array, way: Array) -> float:
-        """Fraction, up to 1, of the way (n_owned, 3) [m] from x that vertices may go until stencils are
-        looked for again; collective.
-        """
-        if not self.guards or not self._places:
+    def searched_fraction(self, x: Array, displacement: Array) -> float:
+        """Fraction ≤ 1 of a displacement (n_owned, 3) [m] from x that the last search covers; collective."""
+        if not self.limits_motion or not self._references:
             return 1.0
         n = self.layout.n_vertices
-        reach = 0.5 * min(term.approach_limit for term in self._searching)
-        x, way = x[:n], way[:n]
-        if self._is_known(x, reach):
-            for part in (1.0, self._searched) if 0.0 < self._searched < 1.0 else (1.0,):
-                if self._is_known(x + part * way, reach):
+        radius = 0.5 * min(term.approach_limit for term in self._searching)
+        x, displacement = x[:n], displacement[:n]
+        if self._is_covered(x, radius):
+            for part in (1.0, self._fraction) if 0.0 < self._fraction < 1.0 else (1.0,):
+                if self._is_covered(x + part * displacement, radius):
                     return part
-        # near several places there may be no room left at the one, and all at the other
-        gone = self.layout.largest(*(_leaves(x, place, reach) for place in self._places))
-        rooms = zip(gone, self._places, strict=True)
-        less = self.layout.largest(
-            *(-_free_part(x, way, place, reach) if not left else 0.0 for left, place in rooms)
-        )
-        return -min(less)
+        # points near several references may move farther from one of them than from another
+        beyond = self.layout.largest(*(_any_beyond(x, origin, radius) for origin in self._references))
+        fractions = [
+            0.0 if far else _fraction_within(x, displacement, origin, radius)
+            for far, origin in zip(beyond, self._references, strict=True)
+        ]
+        return -min(self.layout.largest(*(-fraction for fraction in fractions)))
 
-    def _is_known(self, x: Array, reach: float) -> bool:
-        """Whether all owned vertices x (n, 3) are within ``reach`` [m] of one and the same place of the way
-        that was searched; collective.
-        """
-        if not self._places:
+    def _is_covered(self, x: Array, radius: float) -> bool:
+        """Whether all owned vertices x (n, 3) are within ``radius`` [m] of the same reference; collective."""
+        if not self._references:
             return False
-        if not any(self.layout.largest(_leaves(x, self._places[self._at], reach))):
+        if not any(self.layout.largest(_any_beyond(x, self._references[self._current], radius))):
             return True
-        left = self.layout.largest(*(_leaves(x, place, reach) for place in self._places))
-        self._at = left.index(min(left))
-        return not left[self._at]
+        beyond = self.layout.largest(*(_any_beyond(x, origin, radius) for origin in self._references))
+        self._current = beyond.index(min(beyond))
+        return not beyond[self._current]
 
-    def _search(self, x: Array, way: Array) -> float:
-        """Find the elements of all terms that search, along ways (n_local, 3) [m] that are shortened where
-        there would be too many; to what part of them; collective.
+    def _search(self, x: Array, displacement: Array) -> float:
+        """Find the elements of all terms that search, along displacements (n_local, 3) [m]; collective.
+
+        Displacements are shortened if there are too many elements; returns the fraction that was searched.
         """
-        for part in SHORTER:
-            found = {term: self._near(term, x, part * way) for term in self._searching}
+        for part in FRACTIONS:
+            found = {term: self._find_elements(term, x, part * displacement) for term in self._searching}
             if not any(self.layout.largest(any(each is None for each in found.values()))):
                 break
-        self._searched = part
-        self._found |= {term: each for term, each in found.items() if each is not None}
+        self._fraction = part
+        self._global_elements |= {term: each for term, each in found.items() if each is not None}
         return part
 
-    def _near(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints] | None:
-        """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on
-        their ways (n_local, 3); None if these are too long; collective.
+    def _find_elements(self, term: Elastic, x: Array, displacement: Array) -> tuple[Ints, Ints] | None:
+        """Stencils (E, n) in global numbers, and attributes (E, m), of a term's elements near owned vertices.
+
+        Vertices move by ``displacement`` (n_local, 3); None if that yields too many elements; collective.
         """
         layout, n = self.layout, self.layout.n_vertices
         own = layout.start + np.arange(n)
         if layout.comm.size == 1 and term.surface is not None:
             if term not in self._triangles:
-                self._triangles[term] = _marked(term.surface.astype(np.int64), term)
-            return term.neighbours(x[:n], way[:n], own, self._triangles[term])
+                self._triangles[term] = _with_marks(term.surface.astype(np.int64), term)
+            return term.neighbours(x[:n], displacement[:n], own, self._triangles[term])
         distance, triangles = term.search_distance, np.empty((0, 3), dtype=np.int64)
         if term.surface is None:
-            theirs, moves = self._near_others(own, np.arange(n)[:, None], x, way, distance, own >= 0)
-            numbers, points, ways, moves = np.concatenate([own, theirs]), x[:n], way[:n], moves[:, 0]
+            theirs, moves = self._gather_near(own, np.arange(n)[:, None], x, displacement, distance, own >= 0)
+            numbers, points, displacements, moves = (
+                np.concatenate([own, theirs]),
+                x[:n],
+                displacement[:n],
+                moves[:, 0],
+            )
         else:
             surface, place = term.surface.astype(np.int64), np.arange(layout.n_local)
-            corners = _marked(layout.global_number[surface], term)
+            corners = _with_marks(layout.global_number[surface], term)
             mine = surface[:, 0] < layout.n_owned  # each triangle is sent once
-            # who meets a triangle that reaches out to a ghost counts for its owned vertices, too
-            corners, moves = self._near_others(corners, surface, x, way, distance, mine)
-            # those that touch owned vertices are here already
+            # an element of a triangle with ghost corners also acts on the triangle's owned corners
+            corners, moves = self._gather_near(corners, surface, x, displacement, distance, mine)
+            # triangles with owned corners are local already
             new = ((corners[:, :3] < layout.start) | (corners[:, :3] >= layout.start + n)).all(axis=1)
             corners, moves = corners[new], moves[new].reshape(-1, 2, 3)
             ghosts = np.unique(surface[surface >= n])
@@ -267,32 +272,41 @@ class Discretisation:
             others, first = np.unique(corners[:, :3], return_index=True)
             more = ~np.isin(others, numbers[n:])
             numbers = np.concatenate([numbers, others[more]])
-            points, ways = (np.concatenate([each[:n], each[ghosts]]) for each in (x, way))
+            points, displacements = (np.concatenate([each[:n], each[ghosts]]) for each in (x, displacement))
             moves = moves[first[more]]
             order = n + np.argsort(numbers[n:])
             at = np.minimum(np.searchsorted(numbers[order], corners[:, :3]), max(len(order) - 1, 0))
             triangles = np.concatenate(
-                [_marked(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
+                [_with_marks(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
             )
-        points, ways = np.concatenate([points, moves[:, 0]]), np.concatenate([ways, moves[:, 1]])
-        found = term.neighbours(points, ways, numbers, triangles)
+        points, displacements = (
+            np.concatenate([points, moves[:, 0]]),
+            np.concatenate([displacements, moves[:, 1]]),
+        )
+        found = term.neighbours(points, displacements, numbers, triangles)
         if found is None:
             return None
-        stencil, what = found
+        stencil, attributes = found
         touching = (stencil < n).any(axis=1)
-        return numbers[stencil[touching]], what[touching]
+        return numbers[stencil[touching]], attributes[touching]
 
-    def _near_others(
-        self, numbers: Ints, rows: Ints, x: Array, way: Array, distance: float, mine: NDArray[np.bool_]
+    def _gather_near(
+        self,
+        numbers: Ints,
+        rows: Ints,
+        x: Array,
+        displacement: Array,
+        distance: float,
+        mine: NDArray[np.bool_],
     ) -> tuple[Ints, Array]:
-        """Other ranks' vertices or triangles that are near the box of this one's; collective.
+        """Vertices or triangles of other ranks near the bounding box of those of this rank; collective.
 
         Parameters
         ----------
         numbers, rows : (n, …), (n, m)
-            Global numbers of this rank's with what goes with them, and local rows of their points.
-        x, way : (n_local, 3)
-            Where points are and which way they go [m].
+            Global numbers of the vertices or triangles with their marks, and local rows of their points.
+        x, displacement : (n_local, 3)
+            Positions and displacements [m].
         distance : float [m]
         mine : (n,)
             Which of them this rank sends.
@@ -300,69 +314,70 @@ class Discretisation:
         Returns
         -------
         numbers, moves : (k, …), (k, m, 2, 3)
-            Of the others, with places and ways of their points.
+            The received ones; ``moves`` holds position and displacement of each point.
         """
         comm = self.layout.comm
         received = [(numbers[:0], np.empty((0, rows.shape[1], 2, 3)))]
         if comm.size > 1:
-            low, high = swept_boxes(x, way, rows)
+            low, high = swept_boxes(x, displacement, rows)
             box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
             boxes = np.empty((comm.size, 2, 3))
             comm.Allgather(box, boxes)
             sent: list[tuple[Ints, Array] | None] = []
-            for rank, (least, most) in enumerate(boxes):
+            for rank, (lower, upper) in enumerate(boxes):
                 if rank == comm.rank:
                     sent.append(None)
                     continue
-                near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
+                near = mine & ((low <= upper + distance) & (high >= lower - distance)).all(axis=1)
                 some = rows[near]
-                moves = np.stack([x[some], way[some]], axis=2)
+                moves = np.stack([x[some], displacement[some]], axis=2)
                 sent.append((numbers[near], moves) if len(some) else None)
             received += [part for part in comm.alltoall(sent) if part is not None]
         return np.concatenate([part[0] for part in received]), np.concatenate([part[1] for part in received])
 
-    def _sent(self, stencil: Ints, what: Ints | Array) -> tuple[Ints, Ints | Array]:
-        """Elements by global numbers (E, n) that this rank knows, and what others know of its vertices;
-        collective.
-        """
+    def _exchange_elements(self, stencil: Ints, attributes: Ints | Array) -> tuple[Ints, Ints | Array]:
+        """Elements (E, n) of this rank in global numbers, and those of others on its vertices; collective."""
         comm, bounds = self.layout.comm, self.layout.bounds
         if comm.size == 1:
-            return stencil, what
+            return stencil, attributes
         owners = np.searchsorted(bounds, stencil, side="right") - 1
         parts = [(owners == rank).any(axis=1) for rank in range(comm.size)]
-        sent = [None if rank == comm.rank else (stencil[at], what[at]) for rank, at in enumerate(parts)]
+        sent = [None if rank == comm.rank else (stencil[at], attributes[at]) for rank, at in enumerate(parts)]
         received = [part for part in comm.alltoall(sent) if part is not None]
-        stencils, whats = zip((stencil, what), *received, strict=True)
-        return np.concatenate(stencils), np.concatenate(whats)
+        stencils, attribute_parts = zip((stencil, attributes), *received, strict=True)
+        return np.concatenate(stencils), np.concatenate(attribute_parts)
 
-    def _elements(self, stencil: Ints, what: Ints | Array) -> Elements:
-        """Elements of rows given by global numbers (E, n), and what goes with them (E, m), in local numbers;
-        counted ones come first.
+    def _local_elements(self, stencil: Ints, attributes: Ints | Array) -> Elements:
+        """Elements in local numbers, from global numbers (E, n) and attributes (E, m).
+
+        Elements whose energy this rank counts come first.
         """
         layout = self.layout
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
-        # one order of the elements on any search, so that the same elements are the same stencil
+        # sorted, so that the same elements give the same stencil after every search
         parts = np.flatnonzero(counted), np.flatnonzero(~counted)
-        order = np.concatenate([ascending(part, stencil, what, TELLING) for part in parts])
+        order = np.concatenate([ascending(part, stencil, attributes, SORT_COLUMNS) for part in parts])
         if (order[1:] < order[:-1]).any():
-            stencil, what = stencil[order], what[order]
+            stencil, attributes = stencil[order], attributes[order]
         local = layout.local(stencil.ravel()).reshape(stencil.shape).astype(np.int32)
-        data = {"what": what.astype(np.float64, copy=False), "number": stencil.astype(np.float64)}
+        data = {"what": attributes.astype(np.float64, copy=False), "number": stencil.astype(np.float64)}
         return Elements(local, data, len(parts[0]))
 
-    def renew_pattern(self, acting: Mapping[Elastic, NDArray[np.bool_]]) -> bool:
-        """Let ``rows`` have the blocks of those elements that act (E,); whether they are others than before.
+    def update_pattern(self, acting: Mapping[Elastic, NDArray[np.bool_]]) -> bool:
+        """Give ``rows`` the blocks of elements that act, ``acting`` (E,); returns whether ``rows`` changed.
 
-        Blocks of earlier ones stay while they are `FEW`; other elements have an offset where there is one.
+        Unused blocks stay up to `MAX_UNUSED`; elements that do not act get an offset if their block exists.
         Collective.
         """
-        if not self._changing or (not self.near and self._rows_of is self.layout):
+        if not self._changing or (not self.has_near_elements and self._rows_layout is self.layout):
             return False
         n_local = self.layout.n_local
         stencils = {term.name: term.stencil for term in self._changing}
         pattern = self.rows.pattern
-        fits = fits_layout = self._rows_of is self.layout  # another may have as many rows
+        fits = fits_layout = (
+            self._rows_layout is self.layout
+        )  # not n_local: another layout may have as many rows
         if fits:
             pattern.locate({name: stencil for name, stencil in stencils.items() if name not in self._located})
             self._located = set(stencils)
@@ -370,15 +385,15 @@ class Discretisation:
             fits = not any(pattern.lacks(term.name, acting[term]) for term in acts)
         if not any(self.layout.largest(not fits)):
             return False
-        # with those of elements that do not act yet: some soon will
+        # includes elements that do not act yet, as some soon will
         soon = self.fixed.pattern.missing(stencils.values(), n_local)
-        kept = self._extra if fits_layout else self._extra[:0]
-        few = len(kept) <= len(soon) + FEW * self.fixed.pattern.n_blocks
-        self._extra = union(kept, soon) if few else soon
-        pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
+        kept = self._extra_keys if fits_layout else self._extra_keys[:0]
+        few = len(kept) <= len(soon) + MAX_UNUSED * self.fixed.pattern.n_blocks
+        self._extra_keys = union(kept, soon) if few else soon
+        pattern, self.fixed_positions = self.fixed.pattern.extended(self._extra_keys, n_local)
         self.rows = BlockRows(pattern)
         pattern.locate(stencils)
-        self._rows_of, self._located = self.layout, set(stencils)
+        self._rows_layout, self._located = self.layout, set(stencils)
         return True
 
     def destroy(self) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
-from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, block_of, index_type, union
+from lyra_petsc.linear.pattern import MISSING, BlockPattern, block_of, index_type, row_pointers, union
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -123,8 +123,8 @@ class EdgeCouplings:
         found = [keys(part) for part in elements]
         vertex, place = np.divmod(union(*(key for mixed, _ in found for key in mixed)), max(beyond, 1))
         count = np.bincount(vertex, minlength=first)
-        groups = begins(-(-count // GROUP))
-        at = GROUP * groups[vertex] + np.arange(len(vertex)) - begins(count)[vertex]
+        groups = row_pointers(-(-count // GROUP))
+        at = GROUP * groups[vertex] + np.arange(len(vertex)) - row_pointers(count)[vertex]
         places = np.full(GROUP * groups[-1], -1, dtype=np.int32)
         places[at] = place
         # in place of edges that are not there, one that is near
@@ -133,7 +133,7 @@ class EdgeCouplings:
 
         diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
         one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
-        indptr = begins(np.bincount(one - 3 * first, minlength=len(diagonal)))
+        indptr = row_pointers(np.bincount(one - 3 * first, minlength=len(diagonal)))
         self.numbers = Numbers(indptr.astype(index_type(len(other))), other.astype(np.int32))
 
     # -- where values stand --------------------------------------------------------------------------

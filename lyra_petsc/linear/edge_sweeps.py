@@ -25,7 +25,7 @@ from lyra_petsc.linear.gauss_seidel import (
     begin,
     flushed,
     invert_diagonal,
-    negligible,
+    negligible_size,
     solved,
     store,
     subtract_ghosts,
@@ -236,7 +236,7 @@ class SweepsWithEdges:
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         vectors = memory[of_rows : of_rows + of_vectors].view(np.float32)
-        self._changing = vectors[: 13 * n_local]  # what a cycle begins with is in the rest
+        self._changing = vectors[: 13 * n_local]  # what a cycle row_pointers with is in the rest
         self._clean = False
         self.r = vectors[: 4 * n_local].reshape(-1, 4)
         self.x, self.of_edges, self.moved, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
@@ -282,7 +282,7 @@ class SweepsWithEdges:
         begin = self._rows[0][: len(self._inverse) + 1]
         own = values.reshape(-1)[self._couplings.diagonal(self._n_blocks)]
         least = NEGLIGIBLE * float(own.min(initial=np.inf, where=own > 0.0))
-        store(values, min(least, negligible(begin, values)), self._copy)
+        store(values, min(least, negligible_size(begin, values)), self._copy)
         self._clean = False
 
     def shrink(self, rows: Ints, factor: Array) -> None:

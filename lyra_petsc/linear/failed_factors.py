@@ -10,19 +10,19 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-MADE_OF_FACTORS = frozenset(
+FACTOR_TYPES = frozenset(
     {"lu", "cholesky", "ilu", "icc", "bjacobi", "asm", "gasm", "redundant", "telescope", "ksp"}
 )
 """Preconditioners that options alone make again; multigrid would lose its levels."""
 
-LACKS_ROOM = (-8, -9, -17, -20)
+WORKSPACE_ERRORS = (-8, -9, -17, -20)
 """INFOG(1) where a larger ICNTL(14) helps."""
 
 MARGIN, MORE, LARGEST = 20, 4, 2000
-"""ICNTL(14) that MUMPS begins with [%], the factor by which it grows, and where that ends."""
+"""ICNTL(14) that MUMPS row_pointers with [%], the factor by which it grows, and where that ends."""
 
 
-def forget(ksp: PETSc.KSP) -> bool:
+def replace_failed(ksp: PETSc.KSP) -> bool:
     """Begin anew with a solver whose preconditioner could not be set up; operators must be set again.
 
     Returns whether another solve may succeed with the same matrix, since MUMPS has more workspace now;
@@ -30,7 +30,7 @@ def forget(ksp: PETSc.KSP) -> bool:
     """
     old = ksp.getPC()
     failed = ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
-    if not failed or old.getType() not in MADE_OF_FACTORS:
+    if not failed or old.getType() not in FACTOR_TYPES:
         return False
     larger = _enlarge_workspace(old)
     new = PETSc.PC().create(ksp.comm)
@@ -46,7 +46,7 @@ def _enlarge_workspace(pc: PETSc.PC) -> bool:
     if pc.getType() not in ("lu", "cholesky") or pc.getFactorSolverType() != "mumps":
         return False
     factors = pc.getFactorMatrix()
-    if factors.getMumpsInfog(1) not in LACKS_ROOM:
+    if factors.getMumpsInfog(1) not in WORKSPACE_ERRORS:
         return False
     margin = factors.getMumpsIcntl(14)
     if margin >= LARGEST:

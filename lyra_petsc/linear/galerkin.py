@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.exchange_blocks import SharedBlocks
-from lyra_petsc.linear.pattern import BlockPattern, begins, diagonal_keys, index_type, union
+from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys, index_type, row_pointers, union
 from lyra_petsc.mesh.distribute import local_numbers
 from lyra_petsc.mesh.points import Points
 from lyra_petsc.phases import GALERKIN, logged
@@ -262,7 +262,7 @@ class Galerkin:
         _counts(*rows, width, n_slots, n_keys)
         self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
         self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
-        firsts = begins(n_slots)
+        firsts = row_pointers(n_slots)
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
 
         def made(lo: int, hi: int) -> Ints:
@@ -318,7 +318,7 @@ def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> 
     counts[: points.n_owned, 0] = np.diff(start)
     points.update_ghosts(counts)
     number = counts[:, 0].astype(np.int64)
-    everywhere = begins(number)
+    everywhere = row_pointers(number)
     all_parents, all_weights = np.empty(everywhere[-1], dtype=np.int64), np.empty(everywhere[-1])
     all_parents[: len(parents)], all_weights[: len(weights)] = parents, weights
     row = np.zeros((points.n_local, 3))

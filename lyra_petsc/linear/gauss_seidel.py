@@ -37,7 +37,7 @@ def flushed(value):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def negligible(indptr, values):  # type: ignore[no-untyped-def]
+def negligible_size(indptr, values):  # type: ignore[no-untyped-def]
     """What entries of values (n_blocks, 9) must exceed to count."""
     least = np.float64(np.inf)
     for row in range(Index(len(indptr) - 1)):
@@ -267,7 +267,7 @@ class BlockSweeps:
 
     def store(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""
-        store(values, negligible(self._rows[0], values), self._blocks)
+        store(values, negligible_size(self._rows[0], values), self._blocks)
 
     def shrink(self, rows: Ints, factor: Array) -> None:
         """Divide the inverses of the diagonal blocks of rows (n,) by ``factor`` (n, 1)."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.coarsening import coarsen
 from lyra_petsc.linear.galerkin import Galerkin
-from lyra_petsc.linear.pattern import BlockPattern, begins
+from lyra_petsc.linear.pattern import BlockPattern, row_pointers
 from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
@@ -159,7 +159,7 @@ class Hierarchy:
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
 
-    def new_rows(self) -> None:
+    def rows_changed(self) -> None:
         """``rows`` are those of a new matrix."""
         self._overwritten = False
 
@@ -265,7 +265,7 @@ def _shares(x: Array, triangles: Ints, place: Ints, bounds: Ints, most: int) -> 
         place = np.argsort(number)
         for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
             first, counts = coarse.start[place[lo:hi]], np.diff(coarse.start)[place[lo:hi]]
-            start = begins(counts)
+            start = row_pointers(counts)
             rows = np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
             parents = number_below[coarse.parents[rows]]
             share.append(InterpolationRows(below, start, parents, coarse.weights[rows]))

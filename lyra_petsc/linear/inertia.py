@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.linear.failed_factors import LACKS_ROOM, LARGEST
+from lyra_petsc.linear.failed_factors import LARGEST, WORKSPACE_ERRORS
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.points import Layout
@@ -72,7 +72,7 @@ class Inertia:
             error = factors.getMumpsInfog(1)
             if error >= 0:
                 return Pivots(int(factors.getMumpsInfog(12)), int(factors.getMumpsInfog(28)))
-            if error not in LACKS_ROOM or self._margin >= LARGEST:
+            if error not in WORKSPACE_ERRORS or self._margin >= LARGEST:
                 return None
             self._margin *= 4
 

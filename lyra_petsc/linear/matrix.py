@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
-from lyra_petsc.linear.block_product import MOST_KEPT, product_of
+from lyra_petsc.linear.block_product import MAX_SCRATCH_ROWS, make_product
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
@@ -53,10 +53,10 @@ class _Product:
         self._entries = None if entries is None else weakref.WeakMethod(entries)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
-        self._multiply = product_of(pattern, rows)
+        self._multiply = make_product(pattern, rows)
         self._operations = 2.0 * 9.0 * pattern.n_couplings
         n_local = points.n_local if self._points is not None else 0
-        self._local = np.empty((n_local, 3)) if n_local <= MOST_KEPT else None
+        self._local = np.empty((n_local, 3)) if n_local <= MAX_SCRATCH_ROWS else None
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = A x; collective."""
@@ -107,7 +107,7 @@ class BlockMatrix:
         Of type ``python``.
     rows : (n_stored, 3, 3) float64
         Its block rows; ``set`` tells PETSc that they changed.
-    followers : list of callables
+    observers : list of callables
         Are given the block rows whenever they change.
     """
 
@@ -128,7 +128,7 @@ class BlockMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._blocks = BlockRows(pattern)
         self.rows = self._blocks.zeros() if rows is None else rows
-        self.followers: list[Callable[[Array], None]] = []
+        self.observers: list[Callable[[Array], None]] = []
         self.mat.setPythonContext(_Product(points, pattern, self.rows, summary, entries))
         _set_vec_type(self.mat)
         self.mat.setUp()
@@ -144,9 +144,9 @@ class BlockMatrix:
         if values is not self.rows:
             self.rows[:] = values
         if larger > 0.0:
-            self._blocks.enlarge(self.rows, 1.0 + larger)
-        for follower in self.followers:
-            follower(self.rows)
+            self._blocks.scale_diagonal(self.rows, 1.0 + larger)
+        for observer in self.observers:
+            observer(self.rows)
         self.mat.assemble()
         self.mat.stateIncrease()
 

@@ -54,7 +54,7 @@ class Multigrid:
         self._held, self.hierarchy = held, hierarchy
         self._values: Array = matrix.rows
         self._pc: PETSc.PC | None = None
-        matrix.followers.append(self._follow)
+        matrix.observers.append(self._follow)
 
     def attach(self, ksp: PETSc.KSP) -> None:
         """Give the cycle, which PETSc made when it read the options, its levels; collective."""
@@ -69,7 +69,7 @@ class Multigrid:
 
     def _follow(self, values: Array) -> None:
         self._values = values
-        self.hierarchy.new_rows()
+        self.hierarchy.rows_changed()
 
     def _renew(self) -> Iterator[tuple[Array, Array]]:
         """Block rows of all levels for the matrix as it is now; collective."""

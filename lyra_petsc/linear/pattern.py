@@ -195,7 +195,7 @@ class BlockPattern:
         self.n_owned, self.n_local = n_owned, n_local
         rows, columns = np.divmod(keys, max(n_local, 1))
         self.columns: NDArray[np.int32] = columns.astype(np.int32)
-        self.indptr: Ints = begins(np.bincount(rows, minlength=n_owned))
+        self.indptr: Ints = row_pointers(np.bincount(rows, minlength=n_owned))
 
     def keys(self, n_local: int) -> Ints:
         """Of all blocks, ascending: row · n_local + column."""
@@ -212,7 +212,7 @@ class BlockPattern:
         owned = self.columns < self.n_owned
         if owned.all():
             return self.indptr[1:]
-        ends: Ints = self.indptr[:-1] + np.diff(begins(owned)[self.indptr])
+        ends: Ints = self.indptr[:-1] + np.diff(row_pointers(owned)[self.indptr])
         return ends
 
     @property
@@ -238,7 +238,7 @@ class BlockPattern:
         return values if self.edge_couplings is None else self.edge_couplings.in_blocks(self, values)
 
 
-def begins(counts: NDArray[Any]) -> Ints:
+def row_pointers(counts: NDArray[Any]) -> Ints:
     """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.linear.reasons import last_words
+from lyra_petsc.linear.reasons import error_message
 
 Value = str | int | float | bool | None
 
@@ -63,12 +63,12 @@ def petsc_number(name: str, default: float) -> float:
 
 def refused(error: Exception) -> InputError:
     """What PETSc has against an option."""
-    return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
+    return InputError(f"PETSc refuses it: {error_message(error)}", key=culprits(error))
 
 
 def quoted(error: Exception) -> list[str]:
     """The options that an error of PETSc names, or whose value it quotes."""
-    told = re.split(r"[\s;:,']+", last_words(error))
+    told = re.split(r"[\s;:,']+", error_message(error))
     options = {f"-{name}": (value or "").strip() for name, value in PETSc.Options().getAll().items()}
     named = [name for name in options if name in told]
     named = named or [name for name, value in options.items() if value and value in told]

@@ -164,7 +164,7 @@ def _factorisations(ranks: int) -> list[str]:
     return ["cholesky"] if ranks == 1 else []
 
 
-def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
+def break_even_iterations(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
         prices = {"block-jacobi": 1.0} | dict.fromkeys(INCOMPLETE, PRICE_INCOMPLETE)

@@ -40,7 +40,7 @@ _PRECONDITIONER = {
 }
 
 
-def in_words(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
+def failure_reason(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
     """Why a nonlinear solve failed."""
     reason = snes.getConvergedReason()
     words = _SNES.get(reason, f"SNES stopped with reason {reason}")
@@ -55,7 +55,7 @@ def preconditioner_failed(ksp: PETSc.KSP) -> bool:
     return ksp.getConvergedReason() in _PRECONDITIONER
 
 
-def last_words(error: Exception) -> str:
+def error_message(error: Exception) -> str:
     """The innermost message of an error from within PETSc, in one line."""
     lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]
     told = [line for line in lines if line and "() at " not in line and not line.startswith(NO_REASON)]

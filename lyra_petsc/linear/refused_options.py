@@ -71,7 +71,7 @@ def check_options() -> None:
     _check_end()
     if is_set("ts_init_time"):
         raise InputError(
-            "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
+            "a run row_pointers at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
         )
     if is_set("snes_convergence_test"):
         raise InputError(

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.kernels.vectors import put
-from lyra_petsc.linear.pattern import BlockPattern, begins, index_type
+from lyra_petsc.linear.pattern import BlockPattern, index_type, row_pointers
 from lyra_petsc.mesh.points import Points
 
 KINDS = {"aij": "AIJ", "baij": "BAIJ"}
@@ -117,7 +117,7 @@ class StoredRows:
             self.begin, self.below = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
             self._kept[~own] = points.ghosts[columns[~own] - n] > points.start
         else:
-            self.begin = begins(np.bincount(columns[own], minlength=n) - 1)
+            self.begin = row_pointers(np.bincount(columns[own], minlength=n) - 1)
             self.below = np.empty(self.begin[-1], dtype=index_type(len(columns)))
             _transposes(indptr, columns, self.begin[:-1].copy(), self.below)
         self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
@@ -128,7 +128,7 @@ class StoredRows:
         indptr, columns, kept = self._pattern.indptr, self._pattern.columns, self._kept
         numbers = self._points.global_number
         if not kept.all():
-            columns, values, indptr = columns[kept], values[kept], begins(_per_row(kept, indptr))
+            columns, values, indptr = columns[kept], values[kept], row_pointers(_per_row(kept, indptr))
         _set(mat, indptr, numbers[columns], values)
         edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
         for lo, hi in itertools.pairwise(edges):
@@ -146,7 +146,7 @@ def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
 
 def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
     """How many blocks (n_blocks,) of each row are flagged."""
-    counts: Ints = np.diff(begins(flags)[indptr])
+    counts: Ints = np.diff(row_pointers(flags)[indptr])
     return counts
 
 

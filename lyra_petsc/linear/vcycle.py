@@ -235,7 +235,7 @@ class Coarsest:
 
     def set(self, values: Array, free: Array) -> None:
         """Take new block rows (n_blocks, 3, 3); collective."""
-        failed_factors.forget(self._ksp)
+        failed_factors.replace_failed(self._ksp)
         self.matrix.set(values)
         self._ksp.setOperators(self.matrix.mat)
 

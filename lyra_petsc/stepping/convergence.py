@@ -45,7 +45,7 @@ class Convergence:
         Mean edge length [m], for the step tolerance.
     floor : float
         Norm [N] of the residual's round-off.
-    linear_limit : float
+    break_even_iterations : float
         Linear iterations per Newton iteration above which another preconditioner is cheaper.
 
     Attributes
@@ -77,11 +77,11 @@ class Convergence:
         spacing: float,
         floor: float,
         *,
-        linear_limit: float,
+        break_even_iterations: float,
     ) -> None:
         self._equations, self._tolerances, self.spacing = equations, tolerances, spacing
         self._floor = self._least_floor = floor
-        self._linear_limit = linear_limit
+        self._break_even_iterations = break_even_iterations
         self.usual, self.farthest = 0.0, np.inf
         self.begin()
 
@@ -129,14 +129,14 @@ class Convergence:
             self._moved_by(moved)
             self.usual += RECENT * (spent - self._spent - self.usual)
         slow = iteration > 0 and residual > STALLED * before
-        if slow and self._equations.discretisation.near:
+        if slow and self._equations.discretisation.has_near_elements:
             self._floor = max(self._least_floor, roundoff_of_contact(self._equations))
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
         self._spent = spent
-        if self.usual > self._linear_limit:
+        if self.usual > self._break_even_iterations:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol = (
@@ -169,7 +169,7 @@ class Convergence:
         """
         equations, was_good = self._equations, self._was_good
         self._was_good = True
-        if was_good or not (equations.discretisation.guards and equations.integrator.moves):
+        if was_good or not (equations.discretisation.limits_motion and equations.integrator.moves):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
         return (self.norm > part * enough or self.left > part * near) and equations.may_impact

@@ -136,13 +136,13 @@ class Damping:
     def into(self, values: Array, diagonal: Array) -> None:
         """Let ``values`` (n_stored, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
         self.let_go()
-        rows, place = self._discretisation.rows, self._discretisation.place
+        rows, place = self._discretisation.rows, self._discretisation.fixed_positions
         if self.acts and place is None:
             rows.scale(self._own(), 1.0, diagonal, values)
         else:
             rows.set_diagonal(diagonal, values)
             if self.acts and place is not None:
-                rows.add_at(self._own(), place, values)
+                rows.add_blocks(self._own(), place, values)
 
     def with_stiffness_into(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
@@ -154,7 +154,9 @@ class Damping:
         (n,), in the flat form, afterwards.
         """
         self.let_go()
-        other = self._discretisation.place is not None or any(term.n_elements for term in self._undamped)
+        other = self._discretisation.fixed_positions is not None or any(
+            term.n_elements for term in self._undamped
+        )
         if not self._gamma or other:
             return False
         if self._at is None or not np.array_equal(x, self._at):

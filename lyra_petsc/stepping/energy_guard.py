@@ -156,7 +156,7 @@ class EnergyGuard:
         """Of the step just taken from x0, v0 (n_local, 3), from what the ledger says of it; collective."""
         system = self._system
         layout, n = system.points, system.points.n_owned
-        if system.discretisation.changes:  # there may be other ghosts by now
+        if system.discretisation.stencils_change:  # there may be other ghosts by now
             x0, v0 = fitted(x0, n, layout.n_local), fitted(v0, n, layout.n_local)
             for values in (x0, v0):
                 layout.update_ghosts(values)

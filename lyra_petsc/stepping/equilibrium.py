@@ -199,7 +199,7 @@ class Equilibrium:
         system.applied.factor = factor
         newton = linear = solves = anew = resumed = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
-        ceiling, touches = np.inf, system.discretisation.guards
+        ceiling, touches = np.inf, system.discretisation.limits_motion
         contacts = system.active.contact_state()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
@@ -301,7 +301,7 @@ class Equilibrium:
         moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
         (largest,) = system.points.largest(float(np.abs(moved).max(initial=0.0)))
         pull = self._pull
-        if largest > 0.0 and system.discretisation.guards:
+        if largest > 0.0 and system.discretisation.limits_motion:
             self._rate = None  # with contact guesses are others
             return 0
         if largest > 0.0:
@@ -363,7 +363,7 @@ class Equilibrium:
         """
         system = self._system
         out = attempt.newton_iterations >= LEAP_ITERATIONS
-        if not out or self._follows or system.discretisation.guards:
+        if not out or self._follows or system.discretisation.limits_motion:
             return False
         lowest = self._stepper.lowest()
         if lowest is None:

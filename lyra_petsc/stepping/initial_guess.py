@@ -19,7 +19,7 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
         out[:], ahead = 0.0, None
-        if isinstance(integrator, Static) and not system.discretisation.guards:
+        if isinstance(integrator, Static) and not system.discretisation.limits_motion:
             ahead = integrator.ahead
             if ahead is not None:
                 out[:] = ahead / integrator.pseudo
@@ -28,11 +28,11 @@ def first_guess(system: StageEquations, out: Array) -> bool:
         return ahead is not None
     going_on = system.v[:n].copy()
     system.prescribe(going_on)
-    if integrator.order > 1 and not system.discretisation.guards:
+    if integrator.order > 1 and not system.discretisation.limits_motion:
         out[:] = going_on
         return False
     staying = system.beginning()
-    if system.discretisation.guards:
+    if system.discretisation.limits_motion:
         going_on = staying + system.largest_step(staying, going_on - staying) * (going_on - staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]
     out[:] = staying if less else going_on

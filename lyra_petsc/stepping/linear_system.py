@@ -186,7 +186,7 @@ class LinearSystem:
 
     def _create(self) -> None:
         discretisation = self._equations.discretisation
-        self._equations.renew_pattern()  # stencils may have changed since the last matrix
+        self._equations.update_pattern()  # stencils may have changed since the last matrix
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
         kind = presets.matrix_type(self._preset)
@@ -221,10 +221,10 @@ class LinearSystem:
         found = self._interpolations
         if found is None:
             found = interpolations(discretisation.layout, self._surface, multigrid.most_levels())
-        if discretisation.changes:
+        if discretisation.stencils_change:
             self._interpolations = found
         below = None
-        if self._equations.active.coarse and not discretisation.changes:
+        if self._equations.active.coarse and not discretisation.stencils_change:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)
@@ -240,7 +240,7 @@ class LinearSystem:
     def renew(self) -> bool:
         """Follow changed stencils; whether the matrices are others."""
         discretisation = self._equations.discretisation
-        if not self._equations.renew_pattern() and discretisation.rows is self._rows:
+        if not self._equations.update_pattern() and discretisation.rows is self._rows:
             return False
         self._free(for_good=False)
         self._create()

@@ -108,7 +108,7 @@ class Newton:
         self._from: PETSc.Vec | None = None
         self._reach = 0.0
         self._began_convex = False
-        still = not (equations.integrator.moves or equations.discretisation.guards)
+        still = not (equations.integrator.moves or equations.discretisation.limits_motion)
         self._corrects = still and linear.factors and bool(equations.active.edged)
         self._arcs: Arcs | None = None
         if self._corrects:
@@ -117,7 +117,7 @@ class Newton:
             self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
         self.forcing = Forcing(
-            self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.guards
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.limits_motion
         )
 
     def begin_step(self) -> None:
@@ -131,7 +131,7 @@ class Newton:
         self._linear.shift.begin()
         self.convergence.begin()
         self.globalisation.begin()
-        self.forcing.begin(near=self._equations.discretisation.near, collides=collides)
+        self.forcing.begin(near=self._equations.discretisation.has_near_elements, collides=collides)
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
@@ -199,7 +199,7 @@ class Newton:
         """Let the linear system at velocities v be easier to solve, after that failed; whether it can be;
         collective.
         """
-        if failed_factors.forget(self._ksp) or self._linear.better_preconditioner(v):
+        if failed_factors.replace_failed(self._ksp) or self._linear.better_preconditioner(v):
             return True
         if not self._blend.raise_():
             return False

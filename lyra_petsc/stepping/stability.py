@@ -117,7 +117,7 @@ class Examination:
                 reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
                 "that factors are made for"
             )
-        system.renew_pattern()
+        system.update_pattern()
         values = system.discretisation.rows.zeros()
         add_exact_hessian(system, values)
         self._inertia = Inertia(points, system.discretisation.rows.pattern, values)

@@ -26,7 +26,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.linear.block_rows import square_without
+from lyra_petsc.linear.block_rows import squared_norm_without
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms
@@ -215,7 +215,7 @@ class StageEquations:
         self.new_iterate(None)
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
-        ahead = self._expected() if self.discretisation.guards else None
+        ahead = self._expected() if self.discretisation.limits_motion else None
         stops = () if ahead is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
         self._follow(self.x, ahead, stops)
         self._freeze(t0 + after)
@@ -364,7 +364,7 @@ class StageEquations:
 
             if self.stage.after < self.dt:  # what is met behind the stage has its energy from here on
                 self._follow(self._xs, self.x - self._xs, (1.0,))
-            if not self.discretisation.near:
+            if not self.discretisation.has_near_elements:
                 self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
                 return
             if self.watches_impacts:
@@ -534,7 +534,7 @@ class StageEquations:
             whole = gone == 0.0 and most == 1.0  # mostly
             x, ahead, seen = self._look(*((v, way) if whole else (v + gone * way, (most - gone) * way)))
             fraction = seen
-            if self.discretisation.near:
+            if self.discretisation.has_near_elements:
                 frozen = self.active.frozen
                 parts = [term.largest_step(x, ahead, frozen[term]) for term in self.active.limiting]
                 fraction = self._least_of(min([fraction, *parts]))
@@ -550,12 +550,12 @@ class StageEquations:
         stencils are known; where that is less than ``least``, they are searched all along it; collective.
         """
         x, ahead = self.ahead(v, way)
-        seen = self.discretisation.largest_step(x, ahead)
+        seen = self.discretisation.searched_fraction(x, ahead)
         if seen >= least:
             return x, ahead, seen
         self._follow(x, ahead)
         x, ahead = self.ahead(v, way)
-        return x, ahead, self.discretisation.largest_step(x, ahead)
+        return x, ahead, self.discretisation.searched_fraction(x, ahead)
 
     def pushed_apart(self, v: Array, way: Array) -> Array | None:
         """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
@@ -567,7 +567,7 @@ class StageEquations:
         if not self.active.limiting:
             return None
         x, ahead, _ = self._look(v, way, 1.0)
-        if not self.discretisation.near:
+        if not self.discretisation.has_near_elements:
             return None
         n, frozen, pushed = len(way), self.active.frozen, False
         targets = {term: term.target_distances(x, ahead, frozen[term]) for term in self.active.limiting}
@@ -698,7 +698,7 @@ class StageEquations:
         # one linear solve has found it, or Newton's method has looked at the way to the stage
         x = self.evaluate_at(v)[0] if self.integrator.iterates else self.x
         way = end - x[:n]
-        if not self.discretisation.near and self.discretisation.largest_step(x, way) == 1.0:
+        if not self.discretisation.has_near_elements and self.discretisation.searched_fraction(x, way) == 1.0:
             return True
         v = v if self.integrator.iterates else self.velocity_of_staying()
         return self._may_go(v, way / self.stage.reach, after=True)
@@ -707,7 +707,9 @@ class StageEquations:
 
     def _follow(self, x: Array, ahead: Array | None = None, stops: Sequence[float] = ()) -> None:
         """Let stencils be those at positions x (n_local, 3), and make room for their ghosts."""
-        if not self.discretisation.changes or not self.discretisation.follow(x, ahead, stops):
+        if not self.discretisation.stencils_change or not self.discretisation.update_stencils(
+            x, ahead, stops
+        ):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
@@ -759,7 +761,7 @@ class StageEquations:
 
     def _counted(self, name: str, part: Array) -> tuple[str, Array]:
         """A part of F, whose square goes into `largest_force`."""
-        self._squares.append(square_without(part.reshape(-1), self.prescribed.not_counted))
+        self._squares.append(squared_norm_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
@@ -801,19 +803,19 @@ class StageEquations:
         ]
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
 
-    def renew_pattern(self) -> bool:
+    def update_pattern(self) -> bool:
         """Let block rows have all blocks of the Jacobian where it was last evaluated; whether they are
         others; collective.
         """
         x, frozen = self._xs, self.active.frozen
-        if not self.discretisation.near:
+        if not self.discretisation.has_near_elements:
             self.touches = False
-            return self.discretisation.renew_pattern({})
+            return self.discretisation.update_pattern({})
         acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.near}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
             self.touches = any(self.points.largest(number))
-        return self.discretisation.renew_pattern(acting)
+        return self.discretisation.update_pattern(acting)
 
     @property
     def slips(self) -> bool:
@@ -821,13 +823,13 @@ class StageEquations:
         collective.
         """
         number = sum(term.n_friction_pairs for term in self.active.near)
-        return self.discretisation.near and any(self.points.largest(number))
+        return self.discretisation.has_near_elements and any(self.points.largest(number))
 
     @property
     def may_impact(self) -> bool:
         """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
         limiting = self.active.limiting
-        if not (limiting and self.discretisation.near):
+        if not (limiting and self.discretisation.has_near_elements):
             return False
         way = self.stage.reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
         return self.points.largest(float(way))[0] > IMPACT * min(term.skin for term in limiting)
@@ -835,7 +837,7 @@ class StageEquations:
     def collides(self, far: float) -> bool:
         """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""
         limiting = self.active.limiting
-        if not self.discretisation.near or not self.integrator.moves or self._at_end:
+        if not self.discretisation.has_near_elements or not self.integrator.moves or self._at_end:
             return False
         x, ahead, frozen = self.x, self._expected(), self.active.frozen
         return any(self.points.largest(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))

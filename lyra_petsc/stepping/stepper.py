@@ -118,7 +118,7 @@ class Stepper:
             static=static,
             newton=self._iterates,
             iterations=0.0 if static else expected_iterations(equations, step),
-            contact=equations.discretisation.guards,
+            contact=equations.discretisation.limits_motion,
         )
 
     @property
@@ -171,8 +171,10 @@ class Stepper:
         self.snes = snes = ts.getSNES()
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
-        limit = presets.linear_limit(points.n_global, self.presets)
-        convergence = Convergence(equations, scene.solver, self._spacing, self._floor, linear_limit=limit)
+        limit = presets.break_even_iterations(points.n_global, self.presets)
+        convergence = Convergence(
+            equations, scene.solver, self._spacing, self._floor, break_even_iterations=limit
+        )
         self._newton = newton = Newton(
             snes,
             equations,
@@ -184,9 +186,9 @@ class Stepper:
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
-        if equations.discretisation.changes or (equations.active.edged and self._iterates):
+        if equations.discretisation.stencils_change or (equations.active.edged and self._iterates):
             snes.setUpdate(self._update)
-        if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.guards:
+        if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.limits_motion:
             from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
 
             snes.setMonitor(ContactMonitor(equations, lambda: newton.allowed))
@@ -285,12 +287,16 @@ class Stepper:
         before = equations.x[: self._shape[0]].copy() if equations.edges_lag else None
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
         stuck: FailedSolve | None = None
-        if equations.discretisation.guards and not equations.may_move():
+        if equations.discretisation.limits_motion and not equations.may_move():
             self._trace.begin()
             stuck = self._trace.stuck(equations.velocity_of_staying())
             return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=stuck)
         velocity, words = self._solve(t0)
-        if velocity is not None and equations.discretisation.guards and not equations.may_end(velocity):
+        if (
+            velocity is not None
+            and equations.discretisation.limits_motion
+            and not equations.may_end(velocity)
+        ):
             velocity, words = None, MEETS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
         outcome = self._newton.convergence
@@ -326,7 +332,9 @@ class Stepper:
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         finite = self.ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
         too_old = self.linear.reuse.reused and self._linear_failed and finite
-        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_() or too_old):
+        if not self._iterates and (
+            failed_factors.replace_failed(self.ksp) or self.linear.shift.raise_() or too_old
+        ):
             self.linear.reuse.renew()
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
@@ -368,7 +376,9 @@ class Stepper:
         self.ts.setTimeStep(length)
         self._newton.begin_step()
         if not self._iterates and not is_set("ksp_rtol"):
-            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.discretisation.near else ONCE)
+            self.ksp.setTolerances(
+                rtol=ONCE_IN_CONTACT if equations.discretisation.has_near_elements else ONCE
+            )
         self._trace.begin()
         try:
             self.ts.step()
@@ -378,7 +388,7 @@ class Stepper:
             together = all_here(equations.points.comm)
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
-                f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
+                f"PETSc stopped in the step from t = {t0:g} s: {reasons.error_message(error)}; "
                 f"{kept} is kept; check {culprits(error)}",
                 collective=together,
             ) from None
@@ -393,7 +403,7 @@ class Stepper:
             if self.stopped_by:
                 self._linear_failed = False
                 return None, f"{self.stopped_by} stopped Newton's method short of solver.force_tolerance"
-            return None, reasons.in_words(self.snes, self.ksp)
+            return None, reasons.failure_reason(self.snes, self.ksp)
         velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
         if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
@@ -460,7 +470,7 @@ class Stepper:
         except PETSc.Error as error:
             asked = [f"-{name}" for name in PETSc.Options().getAll() if name.startswith("ts_monitor")]
             raise InputError(
-                f"PETSc cannot: {reasons.last_words(error)}", key=" or ".join(sorted(asked))
+                f"PETSc cannot: {reasons.error_message(error)}", key=" or ".join(sorted(asked))
             ) from None
 
     # -- callbacks ---------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ class WholeStiffness:
         Of those with a potential none that is unstable is taken. On failure the state is the one before.
         """
         system, n = self._system, self._system.points.n_owned
-        if system.active.viscous or system.discretisation.guards:
+        if system.active.viscous or system.discretisation.limits_motion:
             return None
         x = system.x[:n].copy()
         system.begin_step(before, factor)

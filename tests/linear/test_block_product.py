@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from lyra_petsc.linear.block_product import half_stored
-from lyra_petsc.linear.block_rows import square_without
+from lyra_petsc.linear.block_product import multiply_half
+from lyra_petsc.linear.block_rows import squared_norm_without
 
 N, GHOSTS = 23, 4
 
@@ -34,7 +34,7 @@ def test_as_a_dense_product(kind: type, tolerance: float) -> None:
     x = np.random.default_rng(2).standard_normal((N + GHOSTS, 3)).astype(kind)
     out = np.full((N, 3), np.nan, dtype=kind)
     ends = rank[:-1] + present[:, :N].sum(axis=1)
-    half_stored(rank, ends, columns, blocks, x, np.full((N, 4), np.nan, dtype=kind), out)
+    multiply_half(rank, ends, columns, blocks, x, np.full((N, 4), np.nan, dtype=kind), out)
     np.testing.assert_allclose(out, np.einsum("rcij,cj->ri", rows, x), rtol=tolerance, atol=20 * tolerance)
 
 
@@ -43,7 +43,7 @@ def test_nothing_of_the_next_block_or_row_gets_in() -> None:
     blocks[1], x = 1.0, np.full((3, 3), np.nan)
     x[0] = 1.0
     columns = np.array([1, 0, 2], dtype=np.int32)
-    half_stored(np.array([1, 2]), np.array([2]), columns, blocks, x, np.full((1, 4), np.nan), out)
+    multiply_half(np.array([1, 2]), np.array([2]), columns, blocks, x, np.full((1, 4), np.nan), out)
     assert out.tolist() == [[3.0, 3.0, 3.0]]
 
 
@@ -51,9 +51,9 @@ def test_other_arrays_are_refused() -> None:
     blocks, x, sums, out = np.ones((1, 9)), np.ones((1, 3)), np.empty((1, 4)), np.empty((1, 3))
     given = np.array([0, 1]), np.array([1]), np.array([0], dtype=np.int32)
     with pytest.raises(TypingError, match="contiguous arrays of two dimensions and one type"):
-        half_stored(*given, blocks, x.astype(np.float32), sums, out)
+        multiply_half(*given, blocks, x.astype(np.float32), sums, out)
     with pytest.raises(TypingError, match="contiguous arrays"):
-        half_stored(*given, np.ones((3, 9))[::2], x, sums, out)
+        multiply_half(*given, np.ones((3, 9))[::2], x, sums, out)
 
 
 @pytest.mark.parametrize("left_out", [[], [0], [4], [0, 1, 3], [0, 1, 2, 3, 4]])
@@ -61,4 +61,4 @@ def test_squares_without_entries_that_may_be_anything(left_out: list[int]) -> No
     vector = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     expected = float(np.sum(np.delete(vector, left_out) ** 2))
     vector[left_out] = 1e200
-    assert square_without(vector, np.array(left_out, dtype=np.int64)) == expected
+    assert squared_norm_without(vector, np.array(left_out, dtype=np.int64)) == expected

@@ -73,12 +73,12 @@ def test_sums_and_multiples_are_the_dense_ones() -> None:
     check(sums, 3.0 * dense + more)
     rows.set_diagonal(diagonal, sums)
     check(sums, more)
-    rows.add_at(values, np.arange(pattern.n_blocks), sums)
+    rows.add_blocks(values, np.arange(pattern.n_blocks), sums)
     check(sums, dense + more)
     # beside couplings of vertices that were not there
     pair = np.array([[0, 19], [3, N_LOCAL]], dtype=np.int32)
     extended, place = pattern.extended(pattern.missing([pair], N_LOCAL + 1), N_LOCAL + 1)
-    BlockRows(extended).add_at(values, place, sums := BlockRows(extended).zeros())
+    BlockRows(extended).add_blocks(values, place, sums := BlockRows(extended).zeros())
     wide = expanded(extended, sums, N_LOCAL + 1)
     np.testing.assert_array_equal(wide[:, :, :N_LOCAL].reshape(dense.shape), dense)
 
@@ -102,7 +102,7 @@ def test_prescribed_unknowns_are_decoupled() -> None:
 
 def test_larger_diagonals() -> None:
     pattern, values, dense = mixed_rows(definite=True)
-    BlockRows(pattern).enlarge(values, 1.5)
+    BlockRows(pattern).scale_diagonal(values, 1.5)
     found = np.diag(expanded(pattern, values, N_LOCAL).reshape(dense.shape)) / np.diag(dense)
     np.testing.assert_allclose(found, 1.5)
 

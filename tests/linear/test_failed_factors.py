@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import grid, shape, stepped
 
-from lyra_petsc.linear.failed_factors import MARGIN, forget
+from lyra_petsc.linear.failed_factors import MARGIN, replace_failed
 from lyra_petsc.linear.hierarchy import Level
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.presets import PRESETS
@@ -39,7 +39,7 @@ def test_a_better_matrix_has_factors_again(kind: str) -> None:
     ksp.setOperators(mat)
     ksp.solve(b, x)
     assert ksp.getConvergedReason() == FAILED
-    assert not forget(ksp)
+    assert not replace_failed(ksp)
     assert ksp.getConvergedReason() == FAILED
     fill(3.0)
     ksp.setOperators(mat)
@@ -48,7 +48,7 @@ def test_a_better_matrix_has_factors_again(kind: str) -> None:
     np.testing.assert_allclose(x.getArray(), 1.0 / 14.0, rtol=1e-4)
     # nothing failed
     pc = ksp.getPC()
-    assert not forget(ksp)
+    assert not replace_failed(ksp)
     assert ksp.getPC() == pc
 
 
@@ -88,7 +88,7 @@ def test_petscs_multigrid_keeps_its_levels() -> None:
     b.set(1.0)
     ksp.solve(b, x)
     assert ksp.getConvergedReason() == FAILED
-    assert not forget(ksp)
+    assert not replace_failed(ksp)
     assert ksp.getPC() == pc
     assert pc.getMGLevels() == 1
 

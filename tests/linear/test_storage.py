@@ -78,7 +78,7 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
         points, pattern = simulation.problem.points, simulation.problem.pattern
         assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
         told = []
-        ours.followers.append(lambda rows: told.append(rows.copy()))
+        ours.observers.append(lambda rows: told.append(rows.copy()))
         x, y = ours.mat.createVecs()
         z, t = y.duplicate(), y.duplicate()
         x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))

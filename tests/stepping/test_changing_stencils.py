@@ -256,7 +256,7 @@ def test_derivatives(comm: MPI.Comm) -> None:
     for _ in range(12):
         simulation.step()
     layout, term = system.points, term_of(simulation)
-    system.renew_pattern()
+    system.update_pattern()
     rng = np.random.default_rng(2)
     random = rng.standard_normal((layout.n_vertices_global, 3))
     way = np.zeros((layout.n_local, 3))

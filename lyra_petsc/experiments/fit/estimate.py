@@ -22,7 +22,7 @@ from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.case import StoredArray
 from lyra_petsc.linear.petsc_options import culprits, is_set
-from lyra_petsc.linear.reasons import last_words
+from lyra_petsc.linear.reasons import error_message
 
 QUANTILE = 1.959963984540054
 """Half the width of a 95 % interval over the standard deviation."""
@@ -253,7 +253,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     except PETSc.Error as error:
         if failure:
             raise failure[0] from None
-        raise InputError(f"PETSc cannot: {last_words(error)}", key=culprits(error)) from None
+        raise InputError(f"PETSc cannot: {error_message(error)}", key=culprits(error)) from None
     finally:
         for thing in (tao, matrix, start, lower, upper, values):
             thing.destroy()
