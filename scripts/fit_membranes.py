@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import measured
 
@@ -67,7 +67,7 @@ def slopes(e: Array) -> Array:
 
 def fitted(name: str, strained: list[list[float]]) -> dict[str, object]:
     """What the file says of a cloth."""
-    rest = at_rest(resolve(Material(cloth=name))[0])
+    rest = at_rest(resolve_material(Material(cloth=name))[0])
     e, stress = samples(rest, strained)
     size, left = np.linalg.norm(stress * NORM), (stress - e @ rest) * NORM
     basis = (slopes(e) * NORM[:, None]).reshape(left.size, -1)

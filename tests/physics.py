@@ -93,7 +93,7 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
 
 def gathered(layout: Layout, owned: Array) -> Array:
     """Rows of the owned vertices (n_vertices or more, …) in mesh order, on every rank; collective."""
-    return layout.gathered(owned)
+    return layout.gather(owned)
 
 
 @contextmanager
@@ -206,9 +206,9 @@ class Simulation:
         layout, state = self.problem.points, self.system.state
         rows = slice(0, layout.n_vertices)
         if x is not None:
-            state.x[rows] = x[layout.original]
+            state.x[rows] = x[layout.mesh_vertices]
         if v is not None:
-            state.v[rows] = v[layout.original]
+            state.v[rows] = v[layout.mesh_vertices]
         state.update_ghosts()
 
     def energy(self, name: str) -> float:

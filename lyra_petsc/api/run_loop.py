@@ -19,7 +19,7 @@ from lyra_petsc.output.stored import import_ahead
 from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.load import STORED, bent_as_stored
+from lyra_petsc.scene.load import STORED, with_stored_bending_model
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
@@ -68,7 +68,7 @@ def simulate(
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
         import_ahead()
         if choice.resume:
-            scene = on_root(comm, lambda: bent_as_stored(scene, directory.path / STORED)) or scene
+            scene = on_root(comm, lambda: with_stored_bending_model(scene, directory.path / STORED)) or scene
         simulation = SteppedScene(comm, scene, phases)
         try:
             recorder = Recorder(simulation)

@@ -108,7 +108,7 @@ class Simulation:
         self._stepping: SteppedScene | None = stepping
         problem = stepping.problem
         self.mesh: Mesh | None = problem.mesh
-        self.vertices: NDArray[np.int64] = problem.points.original
+        self.vertices: NDArray[np.int64] = problem.points.mesh_vertices
         elements = problem.membrane.elements
         self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned].astype(np.int64)
         _OPEN.add(self)

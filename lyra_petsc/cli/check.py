@@ -14,7 +14,7 @@ from rich.table import Table
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.cli.run import read_scene, say
-from lyra_petsc.mesh.gmsh_fence import in_words, standing
+from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
@@ -95,7 +95,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
         ("steps", plan_of_steps),
         ("linear solver", f"{simulation.stepper.preset}: {_solver_options(simulation)}"),
         ("partitioner", problem.partitioner),
-        *_fences(scene),
+        *_sandbox(scene),
     ):
         plan.add_row(name, value)
     console.print(plan)
@@ -106,11 +106,11 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
         console.print(f"note: {note}")
 
 
-def _fences(scene: Scene) -> list[tuple[str, str]]:
+def _sandbox(scene: Scene) -> list[tuple[str, str]]:
     """How gmsh is sandboxed; only for scenes with gmsh scripts."""
     if not scene.has_scripts:
         return []
-    return [("gmsh's fences", in_words(standing(), trusted=scene.trusts_meshes))]
+    return [("gmsh's sandbox", describe_sandbox(supported_layers(), trusted=scene.trusts_meshes))]
 
 
 def _contact(scene: Scene) -> list[tuple[str, str]]:

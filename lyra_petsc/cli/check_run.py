@@ -13,7 +13,7 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.start_crossings import Overlaps, overlaps_of
+from lyra_petsc.mesh.start_crossings import Overlaps, find_overlaps
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root
@@ -51,7 +51,7 @@ def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: 
     at_corner = have_common_vertex(run.triangles, pairs)
     boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
     overlaps = {
-        one.name: overlaps_of(one, x, run.triangles, time, is_box=one.name in boxes) for one in obstacles
+        one.name: find_overlaps(one, x, run.triangles, time, is_box=one.name in boxes) for one in obstacles
     }
     return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc import __version__
-from lyra_petsc.mesh.gmsh_fence import in_words, standing
+from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
 
 OLDEST_PETSC = (3, 18)
 
@@ -114,7 +114,7 @@ def info(comm: Any) -> str:
     for name, describe in PARTS.items():
         lines.append((name, _described(name, describe, facts)))
     if comm.rank == 0:
-        lines.append(("gmsh's fences", in_words(standing())))
+        lines.append(("gmsh's sandbox", describe_sandbox(supported_layers())))
     facts.mpi_libraries = loaded_mpi_libraries()
     ranks = ", ".join(f"{count} on {host}" for host, count in facts.ranks_per_host.items())
     lines.append(("ranks", ranks))

@@ -17,7 +17,7 @@ from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.scene.json_schema import schema_file
-from lyra_petsc.scene.materials.library import names
+from lyra_petsc.scene.materials.library import material_names
 from lyra_petsc.scene.schema import FIELDS, MeshSource
 
 CLOTHS = 4
@@ -67,7 +67,7 @@ def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_
         title=_quoted(scene.stem),
         mesh=_GRID if file is None or mesh is None else _mesh(file, mesh, scene),
         handle=_GRID_HANDLE if mesh is None else _handle(mesh),
-        cloths=", ".join(names()[:CLOTHS]),
+        cloths=", ".join(material_names()[:CLOTHS]),
         fields=", ".join(name for name in FIELDS if name != "velocity"),
     )
 

@@ -17,7 +17,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import LyraError, SolverError
 from lyra_petsc.parallel import all_here, on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.midedge import MidEdge
@@ -102,7 +102,7 @@ class Trial:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
-        return self.simulation.problem.points.gathered(owned)
+        return self.simulation.problem.points.gather(owned)
 
     @property
     def x(self) -> Array:
@@ -124,13 +124,13 @@ class Trial:
         problem = self.simulation.problem
         for target, values in ((problem.system.x, x), (problem.system.v, v)):
             if values is not None:
-                target[: problem.points.n_vertices] = values[problem.points.original]
+                target[: problem.points.n_vertices] = values[problem.points.mesh_vertices]
                 problem.points.update_ghosts(target)
         for term in problem.system.active.elastic if x is not None else ():
             if isinstance(term, MidEdge):
-                own = term.edge_places < 3 * problem.points.n_owned
+                own = term.edge_indices < 3 * problem.points.n_owned
                 directors = term.anew(problem.system.x)
-                problem.system.x.reshape(-1)[term.edge_places[own]] = directors[own]
+                problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
                 problem.system.active.refreeze({term: term.frames})
         self.simulation.ledger.measure()  # from which steps reckon what they did to energy
@@ -254,7 +254,7 @@ class Bench:
         if self._exact:
             filled = {"solver": TIGHT} | filled
             filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
-        scene = checked(Scene, filled, file="scene of the case")
+        scene = validated(Scene, filled, file="scene of the case")
         if self._trust_mesh:
             scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps

@@ -29,7 +29,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import active
 from lyra_petsc.terms.rest import RestShape
@@ -103,7 +103,7 @@ class Body:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.mesh = scene, mesh_of(scene)
+        self.scene, self.mesh = scene, build_scene_mesh(scene)
         self.rest = RestShape(scene, self.mesh)
 
     @cached_property

@@ -157,7 +157,7 @@ class Discretisation:
             more = np.setdiff1d(np.concatenate(beyond), fixed)
         lacking = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
         any_here = any(len(stencil) for stencil, _ in self._global_elements.values())
-        others, self.has_near_elements = (flag > 0.0 for flag in layout.largest(lacking, any_here))
+        others, self.has_near_elements = (flag > 0.0 for flag in layout.global_max(lacking, any_here))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()
@@ -177,7 +177,7 @@ class Discretisation:
 
         If one term must search, all terms that search are returned, before the others.
         """
-        stale = self.layout.largest(*(term.stale for term in self._changing))
+        stale = self.layout.global_max(*(term.stale for term in self._changing))
         leaves = not (
             self._is_covered(here, self._radius) and (to is here or self._is_covered(to, self._radius))
         )
@@ -207,20 +207,20 @@ class Discretisation:
                 if self._is_covered(x + part * displacement, radius):
                     return part
         # points near several references may move farther from one of them than from another
-        beyond = self.layout.largest(*(_any_beyond(x, origin, radius) for origin in self._references))
+        beyond = self.layout.global_max(*(_any_beyond(x, origin, radius) for origin in self._references))
         fractions = [
             0.0 if far else _fraction_within(x, displacement, origin, radius)
             for far, origin in zip(beyond, self._references, strict=True)
         ]
-        return -min(self.layout.largest(*(-fraction for fraction in fractions)))
+        return -min(self.layout.global_max(*(-fraction for fraction in fractions)))
 
     def _is_covered(self, x: Array, radius: float) -> bool:
         """Whether all owned vertices x (n, 3) are within ``radius`` [m] of the same reference; collective."""
         if not self._references:
             return False
-        if not any(self.layout.largest(_any_beyond(x, self._references[self._current], radius))):
+        if not any(self.layout.global_max(_any_beyond(x, self._references[self._current], radius))):
             return True
-        beyond = self.layout.largest(*(_any_beyond(x, origin, radius) for origin in self._references))
+        beyond = self.layout.global_max(*(_any_beyond(x, origin, radius) for origin in self._references))
         self._current = beyond.index(min(beyond))
         return not beyond[self._current]
 
@@ -231,7 +231,7 @@ class Discretisation:
         """
         for part in FRACTIONS:
             found = {term: self._find_elements(term, x, part * displacement) for term in self._searching}
-            if not any(self.layout.largest(any(each is None for each in found.values()))):
+            if not any(self.layout.global_max(any(each is None for each in found.values()))):
                 break
         self._fraction = part
         self._global_elements |= {term: each for term, each in found.items() if each is not None}
@@ -383,7 +383,7 @@ class Discretisation:
             self._located = set(stencils)
             acts = [term for term in self._changing if term.n_elements]
             fits = not any(pattern.lacks(term.name, acting[term]) for term in acts)
-        if not any(self.layout.largest(not fits)):
+        if not any(self.layout.global_max(not fits)):
             return False
         # includes elements that do not act yet, as some soon will
         soon = self.fixed.pattern.missing(stencils.values(), n_local)

@@ -225,7 +225,7 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
-    parts = comm.gather((surface.x, corners, layout.original))
+    parts = comm.gather((surface.x, corners, layout.mesh_vertices))
     shares: list[list[InterpolationRows]] = []
     if parts is not None:
         x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))

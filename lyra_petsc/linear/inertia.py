@@ -127,7 +127,7 @@ class Inertia:
         return lowest, mode
 
     def _dot(self, one: Array, other: Array) -> float:
-        return float(self._layout.summed(float(np.vdot(one, other)))[0])
+        return float(self._layout.global_sum(float(np.vdot(one, other)))[0])
 
     def _free_solver(self) -> None:
         if self._ksp is not None:

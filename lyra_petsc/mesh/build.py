@@ -15,7 +15,7 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
-from lyra_petsc.mesh.measures import lay_out
+from lyra_petsc.mesh.measures import plane_coordinates
 from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
@@ -267,23 +267,23 @@ def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
     return Group(0, np.unique(members), no_triangles, no_edges)
 
 
-def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
+def build_scene_mesh(scene: Scene, report: Callable[[str], None] | None = None) -> Mesh:
     """`build_mesh` of a scene's sources, with its obstacles; scripts are trusted if the scene's are."""
-    mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=tell)
+    mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, report=report)
     for name, obstacle in (scene.obstacles or {}).items():
         if obstacle.mesh is not None:
             source = MeshSource(file=obstacle.mesh.file, transform=obstacle.mesh.transform)
-            mesh.obstacles[name], notes = _surface(source, scene.trusts_meshes, tell)
+            mesh.obstacles[name], notes = _surface(source, scene.trusts_meshes, report)
             mesh.notes += [f"obstacle {name}: {note}" for note in notes]
     return mesh
 
 
 def _surface(
-    source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None
+    source: MeshSource, trust_scripts: bool, report: Callable[[str], None] | None
 ) -> tuple[TriangleSurface, list[str]]:
     """The surface of an obstacle at t = 0 without unused points, and what the reader of its file noted."""
     try:
-        sheet = _read(source, trust_scripts, tell)
+        sheet = _read(source, trust_scripts, report)
         used, numbers = np.unique(sheet.triangles, return_inverse=True)
         whole = Sheet(sheet.points[used], numbers.reshape(-1, 3).astype(np.int64))
         check_topology(whole, file=source.file)
@@ -306,7 +306,7 @@ def build_mesh(
     *,
     file: object | None = None,
     trust_scripts: bool = False,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Mesh:
     """Read, transform, check and join the mesh sources of a scene.
 
@@ -325,7 +325,7 @@ def build_mesh(
         The scene file, for messages about keys.
     trust_scripts : bool
         Give gmsh its scripts as they are, whatever they say.
-    tell : callable, optional
+    report : callable, optional
         Called with a line now and then while gmsh is at work.
 
     Raises
@@ -344,7 +344,7 @@ def build_mesh(
         if source.grid is not None:
             check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
-            sheet = _read(source, trust_scripts, tell)
+            sheet = _read(source, trust_scripts, report)
             piece = _prepare(sheet, source, key, file)
         except MemoryError:
             raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
@@ -365,7 +365,7 @@ def build_mesh(
     return mesh
 
 
-def _read(source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None) -> Sheet:
+def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None] | None) -> Sheet:
     if source.grid is not None:
         return grid_sheet(source.grid)
     assert source.file is not None
@@ -374,7 +374,7 @@ def _read(source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] |
         from lyra_petsc.mesh.geo_file import mesh_geo
 
         return mesh_geo(
-            source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, tell=tell
+            source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, report=report
         )
     if suffix == ".msh":
         from lyra_petsc.mesh.msh_file import read_msh
@@ -400,7 +400,7 @@ def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) ->
         rest = rest if seams else laid
     else:
         check_shape(rest[sheet.triangles], "rest", **where)
-        uv = lay_out(rest, sheet.triangles)
+        uv = plane_coordinates(rest, sheet.triangles)
     check_shape(positions[sheet.triangles], "start", **where)
     with_uv = sheet.uv is not None
     flat = np.full(len(sheet.triangles), with_uv)

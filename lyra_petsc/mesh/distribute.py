@@ -1,7 +1,7 @@
-"""Hand each rank its part of the mesh: its block rows, its elements, their constants.
+"""Distribution of the mesh from rank 0: each rank gets its block rows and elements with their constants.
 
-Each rank gets every element that touches a row it owns, so that assembly needs no communication
-beyond the ghost update; elements it counts (energies) come first.
+Each rank gets every element that couples a row it owns, so that assembly needs no communication but the
+update of ghosts. Its counted elements come first: each element is counted (in energies) on one rank only.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from lyra_petsc.mesh.points import Layout, Numbering, Unknowns
 
 
 @dataclass
-class Whole:
-    """The whole mesh with its elements, on rank 0.
+class GlobalMesh:
+    """The mesh with its elements before distribution, on rank 0.
 
     Attributes
     ----------
     n_vertices : int
     triangles : (F, 3) int64
-        For the partitioner's graph.
+        Make the graph for the partitioner.
     elements : dict of name → Elements
-        In mesh numbering.
+        In the numbering of the mesh.
     vertex_data : dict of name → (V, …) array
     edges : (N, 2) int64 or None
-        Vertices of the mesh's edges, where elements couple unknowns on edges.
+        Vertices of the edges of the mesh; needed where elements couple unknowns of edges.
     owner : (V,) int64 or None
-        Rank of each vertex, where that is settled already.
-    places : (V, 3) or None
-        Where the vertices begin [m], if they may touch.
+        Rank of each vertex; None: a partitioner determines it.
+    positions : (V, 3) or None
+        Start positions [m] if vertices may touch, for a partition by bisection of space.
     """
 
     n_vertices: int
@@ -44,12 +44,12 @@ class Whole:
     vertex_data: dict[str, Array]
     edges: Ints | None = None
     owner: Ints | None = None
-    places: Array | None = None
+    positions: Array | None = None
 
 
 @dataclass
-class Part:
-    """One rank's share.
+class LocalMesh:
+    """The part of the mesh that one rank has.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Part:
         In local numbering; counted elements first.
     vertex_data : dict of name → (n_vertices, …) array
     partitioner : str
-        What cut the mesh.
+        Name of the partitioner.
     """
 
     layout: Layout
@@ -69,7 +69,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Rows:
-    """Block rows of the whole mesh (rank 0).
+    """Block rows of all ranks, on rank 0.
 
     Attributes
     ----------
@@ -78,9 +78,10 @@ class Rows:
     vertex, vertex_owner : (V,) int64
         Row of each vertex, and the rank that owns it.
     edge, edge_owner, component : (N,) int64
-        The same of each edge's unknown, and which of the three of its row it is; −1 for edges without one.
+        Row and owner of the unknown of each edge, and which of the three of its row it is; −1 for edges
+        without unknown.
     unknowns : list of Unknowns
-        Of each rank.
+        One for each rank.
     """
 
     bounds: Ints
@@ -92,8 +93,8 @@ class Rows:
     unknowns: list[Unknowns]
 
     @classmethod
-    def build(cls, vertices: Numbering, whole: Whole) -> Rows:
-        """The rows of numbered vertices, and of the edges whose unknowns elements couple."""
+    def build(cls, vertices: Numbering, whole: GlobalMesh) -> Rows:
+        """The rows of the numbered vertices, and of the edges whose unknowns are coupled by elements."""
         n_ranks = len(vertices.bounds) - 1
         n_vertices = np.diff(vertices.bounds)
         n_edges, edges_of = np.zeros_like(n_vertices), [np.empty(0, dtype=np.int64)] * n_ranks
@@ -103,8 +104,7 @@ class Rows:
         if used:
             assert whole.edges is not None
             chosen = np.unique(np.concatenate(used))
-            # an edge goes with its lesser vertex: so three unknowns of a row belong to edges around one
-            # vertex
+            # the rank of its vertex of lower number owns an edge: the edges of a row surround one vertex
             ends = np.sort(vertices.number[whole.edges[chosen]], axis=1)
             owner = np.searchsorted(vertices.bounds, ends[:, 0], side="right") - 1
             order = np.lexsort((ends[:, 1], ends[:, 0], owner))
@@ -113,10 +113,10 @@ class Rows:
             edges_of = np.split(order, np.cumsum(n_edges)[:-1])
             bounds = np.concatenate([[0], np.cumsum(n_vertices + -(-n_edges // 3))])
             vertex = vertices.number + (bounds - vertices.bounds)[vertices.owner]
-            place = np.arange(len(chosen)) - (np.cumsum(n_edges) - n_edges)[owner]
+            number = np.arange(len(chosen)) - (np.cumsum(n_edges) - n_edges)[owner]
             edge, edge_owner, component = (np.full(len(whole.edges), -1, dtype=np.int64) for _ in range(3))
-            edge[chosen] = bounds[owner] + n_vertices[owner] + place // 3
-            edge_owner[chosen], component[chosen] = owner, place % 3
+            edge[chosen] = bounds[owner] + n_vertices[owner] + number // 3
+            edge_owner[chosen], component[chosen] = owner, number % 3
         by_number = np.argsort(vertices.number)
         unknowns = [
             Unknowns(n_vertices, n_edges, by_number[lo:hi], edges)
@@ -125,8 +125,10 @@ class Rows:
         return cls(bounds, vertex, vertices.owner, edge, edge_owner, component, unknowns)
 
 
-def touched_by(elements: Elements, at_vertex: Ints, at_edge: Ints, index: Ints | slice = slice(None)) -> Ints:
-    """What (n, …) vertices have, then edges, that the elements ``index`` (n,) touch."""
+def gather_stencils(
+    elements: Elements, at_vertex: Ints, at_edge: Ints, index: Ints | slice = slice(None)
+) -> Ints:
+    """Values (n, m) at the vertices, then at the edges, that the elements ``index`` (n,) couple."""
     vertices: Ints = at_vertex[elements.stencil[index]]
     if elements.edges is None:
         return vertices
@@ -134,13 +136,13 @@ def touched_by(elements: Elements, at_vertex: Ints, at_edge: Ints, index: Ints |
 
 
 def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
-    """Elements of each rank from the owners (E, n) of their rows.
+    """Elements of each rank, from the owners (E, n) of the rows of their stencils.
 
     Returns
     -------
     list of (indices, n_owned)
-        Per rank the elements that touch a row it owns, those it counts first. An element is counted
-        by the owner of its first vertex.
+        For each rank the elements that couple a row it owns, the ``n_owned`` counted ones first. An element
+        is counted by the owner of its first vertex.
     """
     n_elements = len(owner)
     pairs = (
@@ -152,21 +154,21 @@ def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
     ends = np.searchsorted(ranks, np.arange(n_ranks + 1))
     pieces = []
     for rank in range(n_ranks):
-        mine = elements[ends[rank] : ends[rank + 1]]
-        counted = owner[mine, 0] == rank
-        pieces.append((np.concatenate([mine[counted], mine[~counted]]), int(counted.sum())))
+        own = elements[ends[rank] : ends[rank + 1]]
+        counted = owner[own, 0] == rank
+        pieces.append((np.concatenate([own[counted], own[~counted]]), int(counted.sum())))
     return pieces
 
 
-def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
-    """Partition the mesh and give each rank its part; collective. ``whole`` is read on rank 0 only."""
+def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
+    """Partition the mesh and send each rank its part; collective. ``whole`` is needed on rank 0 only."""
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
     graph = vertex_graph([whole.triangles], n_vertices) if whole else None
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"
     else:
-        owner, name = partition(comm, graph, n_vertices, whole.places if whole else None)
-    post = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
+        owner, name = partition(comm, graph, n_vertices, whole.positions if whole else None)
+    messages = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
     if comm.rank == 0:
         assert whole is not None
         assert owner is not None
@@ -176,35 +178,35 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
         pieces = _pieces(whole, rows, comm.size)
         for rank in range(1, comm.size):
             piece = next(pieces)
-            post.send(piece, dest=rank)
-            del piece  # there is no room for the next one beside it
+            messages.send(piece, dest=rank)
+            del piece  # frees its memory before the next one is made
         piece = next(pieces)
     else:
-        piece = post.recv(source=0)
+        piece = messages.recv(source=0)
     bounds, ghosts, unknowns, elements, vertex_data = piece
-    return Part(Layout(comm, bounds, ghosts, unknowns), elements, vertex_data, name)
+    return LocalMesh(Layout(comm, bounds, ghosts, unknowns), elements, vertex_data, name)
 
 
-def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
-    """One picklable piece after the other, so that rank 0 holds one at a time; its own comes last."""
+def _pieces(whole: GlobalMesh, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
+    """Yield the piece of each rank, rank 0's last: only one at a time is in memory."""
     split = {
-        name: split_elements(touched_by(each, rows.vertex_owner, rows.edge_owner), n_ranks)
+        name: split_elements(gather_stencils(each, rows.vertex_owner, rows.edge_owner), n_ranks)
         for name, each in whole.elements.items()
     }
     for rank in (*range(1, n_ranks), 0):
         lo, hi = rows.bounds[rank], rows.bounds[rank + 1]
         elements = {}
-        touched = {
-            name: touched_by(each, rows.vertex, rows.edge, split[name][rank][0])
+        coupled = {
+            name: gather_stencils(each, rows.vertex, rows.edge, split[name][rank][0])
             for name, each in whole.elements.items()
         }
-        every = np.unique(np.concatenate([*map(np.unique, touched.values()), np.empty(0, np.int64)]))
+        every = np.unique(np.concatenate([*map(np.unique, coupled.values()), np.empty(0, np.int64)]))
         ghosts = every[(every < lo) | (every >= hi)]
         for name, (index, n_owned) in ((n, s[rank]) for n, s in split.items()):
             each = whole.elements[name]
             n = each.stencil.shape[1]
-            local = local_numbers(touched[name], ghosts, lo, hi)
-            order = _by_locality(local[:, :n], n_owned)
+            local = local_numbers(coupled[name], ghosts, lo, hi)
+            order = _locality_order(local[:, :n], n_owned)
             index, local = index[order], local[order]
             data = {key: np.ascontiguousarray(v[index]) for key, v in each.data.items()}
             counts = np.promote_types(np.int32, np.min_scalar_type(-len(each.stencil)))
@@ -219,13 +221,13 @@ def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-
 
 
 def local_numbers(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
-    """Local numbers of global ones: owned from 0, ghosts, which ascend, after them."""
+    """Local numbers of global ``numbers``: owned rows (lo to before hi) from 0, then the ascending ghosts."""
     inside = (numbers >= lo) & (numbers < hi)
     return np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
 
 
-def _by_locality(stencil: Ints, n_owned: int) -> Ints:
-    """An order of the elements, counted ones first, that walks through memory."""
+def _locality_order(stencil: Ints, n_owned: int) -> Ints:
+    """Order of the elements by their lowest rows, counted ones first, for locality in memory."""
     if len(stencil) == 0:
         return np.empty(0, dtype=np.int64)
     points = np.sort(stencil, axis=1).T

@@ -1,4 +1,4 @@
-"""Elements of one term: which points they couple and the numbers that belong to them."""
+"""Elements of one term: the points that each couples, and its constants."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from lyra_petsc.arrays import Ints
 
 @dataclass
 class Elements:
-    """A set of like elements, whole (rank 0, mesh numbering) or of one rank (local numbering).
+    """Elements of one kind: all of them (rank 0, numbering of the mesh), or of one rank (local numbering).
 
     Attributes
     ----------
     stencil : (E, n) int
         The vertices that each element couples; local numbers are those of block rows.
     edges : (E, m) int or None
-        The edges whose unknowns it couples: indices into the mesh's edges before distribution, after it
-        places in the flat form of an array over the local block rows (`Layout`).
+        The edges whose unknowns each element couples: before distribution indices into the edges of the
+        mesh, then indices into a flattened array of local block rows (`Layout`).
     data : mapping of name → (E, …) array
-        Constants of each element, sliced along with the stencil when distributed.
+        Constants of each element, distributed with the stencil.
     n_owned : int
-        The first ``n_owned`` elements are counted on this rank (energies, diagnostics); the
-        rest also touch a vertex that it owns. Equal to E before distribution.
-    index : (E,) int64; int32 after distribution, where that counts so far
+        The first ``n_owned`` elements are counted on this rank (energies, diagnostics); the others couple a
+        row that it owns, too. Equal to E before distribution.
+    index : (E,) int64; after distribution int32 where E permits
         Number of each element before distribution.
     """
 
@@ -43,13 +43,13 @@ class Elements:
             self.n_owned = len(self.stencil)
             self.index = np.arange(len(self.stencil), dtype=np.int64)
 
-    def once(self, name: str) -> Elements:
-        """The same elements, where a constant that is one number for all of them takes no memory."""
+    def compress(self, name: str) -> Elements:
+        """The same elements; the constant ``name`` takes no memory if it is one number for all of them."""
         values = self.data.get(name)
         if values is None or len(values) == 0 or values.ndim > 1 or (values != values[0]).any():
             return self
         return replace(self, data={**self.data, name: np.broadcast_to(values[0].copy(), values.shape)})
 
     def without(self, *names: str) -> Elements:
-        """The same elements without these constants, which their term keeps in a form of its own."""
+        """The same elements without these constants, which a term stores in another form."""
         return replace(self, data={key: self.data[key] for key in self.data if key not in names})

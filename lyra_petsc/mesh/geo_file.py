@@ -55,7 +55,7 @@ def mesh_geo(
     *,
     algorithm: str | None = None,
     trusted: bool = False,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Sheet:
     """Mesh a .geo script in two dimensions.
 
@@ -71,7 +71,7 @@ def mesh_geo(
         script.
     trusted : bool
         Give gmsh the script as it is, whatever it says.
-    tell : callable, optional
+    report : callable, optional
         Called with a line now and then while gmsh is at work.
 
     Raises
@@ -86,13 +86,13 @@ def mesh_geo(
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
         if trusted:
             read_bytes(path)  # for its errors
-            _run_gmsh(path, path.absolute(), None, wishes, Path(folder), meshed, tell)
+            _run_gmsh(path, path.absolute(), None, wishes, Path(folder), meshed, report)
         else:
             checked = check_script(path)
             files = checked.files
             copies = Path(folder) / "script"
             copies.mkdir()
-            _run_gmsh(path, checked.write(copies), copies, wishes, Path(folder), meshed, tell)
+            _run_gmsh(path, checked.write(copies), copies, wishes, Path(folder), meshed, report)
         sheet = _read_mesh(path, meshed)
     if len(files) > 1:
         sheet.notes.append(f"the script includes {', '.join(file.name for file in files[1:])}")
@@ -114,7 +114,7 @@ def _run_gmsh(
     wishes: dict[str, Any],
     folder: Path,
     meshed: BinaryIO,
-    tell: Callable[[str], None] | None,
+    report: Callable[[str], None] | None,
 ) -> None:
     """Mesh the script in another process, which writes ``meshed``; its errors are raised here."""
     memory = available_memory()
@@ -145,7 +145,7 @@ def _run_gmsh(
             start_new_session=True,  # Ctrl-C is for the run, which ends us in its own time
         )
         try:
-            errors = _wait(process, told, lambda text: None if tell is None else tell(f"{path.name}: {text}"))
+            errors = _wait(process, told, lambda line: report and report(f"{path.name}: {line}"))
         finally:
             if process.poll() is None:
                 process.kill()
@@ -158,7 +158,7 @@ def _run_gmsh(
         raise InputError(words, file=path)
 
 
-def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str], None]) -> bytes:
+def _wait(process: subprocess.Popen[bytes], told: BinaryIO, report: Callable[[str], None]) -> bytes:
     """Wait for gmsh's process, telling the user now and then; returns what it wrote to stderr."""
     began = time.monotonic()
     pause = FIRST_WORD
@@ -173,7 +173,7 @@ def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str]
         doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading the script"
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
-        tell(f"gmsh {doing}, {time.monotonic() - began:.0f} s so far")
+        report(f"gmsh {doing}, {time.monotonic() - began:.0f} s so far")
     return b""
 
 

@@ -1,9 +1,9 @@
-"""A process of its own for gmsh, which meshes one script: ``python -m … JOB OUTCOME MESH``.
+"""Child process in which gmsh meshes one script: ``python -m … JOB OUTCOME MESH``.
 
-A script may loop for ever, ask for more triangles than there is memory, or end the process it runs in.
-Here that ends this process and not the simulation; ``geo_file`` starts it and reads the outcome. Before it
-sees the script it gives up what gmsh does not need (`gmsh_fence`): so it opens no file to write, and what it
-tells goes to files that were open before.
+A script may loop for ever, ask for more triangles than fit into memory, or end the process it runs in. In
+a child process this does not end the simulation; `geo_file` starts it and reads its results. Before it reads
+the script it enters a sandbox (`gmsh_sandbox`), in which it can open no file for writing: the results go to
+files that `geo_file` has opened.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lyra_petsc.mesh.gmsh_fence import raise_fence
+from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
 
 _EQUILATERAL = math.sqrt(3) / 4
 _SHARE_OF_BOX = 0.25
@@ -55,11 +55,11 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
         Descriptor of the file that gets the mesh (`_write_mesh`).
     """
 
-    def tell(**words: Any) -> None:
+    def report(**words: Any) -> None:
         os.write(outcome, json.dumps(words).encode() + b"\n")
 
     _confine(job["memory"])
-    tell(stage="script")
+    report(stage="script")
     _allow_seconds(job["script_seconds"])
     try:
         with _session() as gmsh, open(mesh, "wb", closefd=False) as file:
@@ -72,20 +72,20 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
                 os.path.dirname(os.path.dirname(np.__file__)),
                 job["folder"],
             ]
-            tell(fence=raise_fence(None if job["folder"] is None else readable))
+            report(sandbox=enter_sandbox(None if job["folder"] is None else readable))
             _set_size(gmsh, job["size"])
             with _errors_told(gmsh, job["script"]):
                 gmsh.merge(job["script"])
-            tell(stage="mesh")
+            report(stage="mesh")
             _allow_seconds(job["mesh_seconds"])
-            _mesh(gmsh, job, lambda count: tell(triangles=round(count)))
+            _mesh(gmsh, job, lambda count: report(triangles=round(count)))
             _write_mesh(gmsh, file)
     except Refused as error:
-        tell(refused=str(error))
+        report(refused=str(error))
     except MemoryError:
-        tell(stage="memory")
+        report(stage="memory")
     else:
-        tell(stage="done")
+        report(stage="done")
     os._exit(0)  # gmsh has nothing to put away that outlives the process
 
 

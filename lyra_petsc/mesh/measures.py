@@ -75,7 +75,7 @@ def bounding_diagonal(points: Array) -> float:
     return float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
 
 
-def lay_out(rest: Array, triangles: Ints) -> Array:
+def plane_coordinates(rest: Array, triangles: Ints) -> Array:
     """Coordinates of each triangle's corners in its own plane.
 
     The first axis is x projected into the plane, or y where the plane is nearly normal to x (x makes

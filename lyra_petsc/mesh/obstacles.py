@@ -133,7 +133,7 @@ def obstacles_of(
     comm : MPI.Comm
     scene : Scene
     mesh : Mesh or None
-        As `build.mesh_of` made it; needed on rank 0 only, and there only for obstacles that are meshes.
+        Of `build.build_scene_mesh`; needed on rank 0 only, and there only for obstacles that are meshes.
     motion : callable
         `terms.motion.Motion`.
 

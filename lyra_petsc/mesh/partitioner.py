@@ -1,5 +1,6 @@
-"""Which rank owns which vertex: a graph partitioner run by PETSc, or cuts through space where sheets may
-touch; and an ordering for locality.
+"""Partition of the vertices over the ranks, and an order of the vertices in which neighbours are close.
+
+The partition is that of a graph partitioner of PETSc, or where sheets may touch a bisection of space.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ PARTS = "mat_partitioning_nparts"
 
 
 def vertex_graph(stencils: list[Ints], n_vertices: int) -> Graph:
-    """Adjacency (row offsets (V+1,), neighbours) of vertices that share an element, without loops."""
+    """Adjacency of vertices that share an element: row offsets (V + 1,) and neighbours, no vertex its own."""
     keys = []
     for stencil in stencils:
         n = stencil.shape[1]
@@ -42,7 +43,7 @@ def _matrix(graph: Graph) -> PETSc.Mat:
 
 
 def locality_order(graph: Graph) -> Ints:
-    """Reverse Cuthill-McKee: position of each vertex in an order that keeps neighbours near."""
+    """Position (V,) of each vertex in the reverse Cuthill-McKee order, which keeps neighbours close."""
     n = len(graph[0]) - 1
     matrix = _matrix(graph)
     permutation, other = matrix.getOrdering("rcm")
@@ -54,35 +55,37 @@ def locality_order(graph: Graph) -> Ints:
     return position
 
 
-def bisection(places: Array, n_ranks: int) -> Ints:
-    """Owner (V,) of vertices at ``places`` (V, 3) by recursive bisection of space, always across the longest
-    side of what is left (Berger & Bokhari, IEEE Trans. Comput. 36 (1987) 570-580).
+def bisection(positions: Array, n_ranks: int) -> Ints:
+    """Owner (V,) of vertices at ``positions`` (V, 3) by recursive bisection of space.
+
+    Each part is cut across the longest side of its bounding box (Berger & Bokhari, IEEE Trans. Comput. 36
+    (1987) 570-580).
     """
-    owner = np.zeros(len(places), dtype=np.int64)
-    parts = [(np.arange(len(places)), range(n_ranks))]
+    owner = np.zeros(len(positions), dtype=np.int64)
+    parts = [(np.arange(len(positions)), range(n_ranks))]
     while parts:
         vertices, ranks = parts.pop()
         if len(ranks) == 1 or not len(vertices):
             owner[vertices] = ranks[0]
             continue
-        at, left = places[vertices], len(ranks) // 2
-        sides = np.argsort(np.ptp(at, axis=0), kind="stable")
-        vertices = vertices[np.lexsort([at[:, side] for side in sides])]
-        cut = len(vertices) * left // len(ranks)
-        parts += [(vertices[:cut], ranks[:left]), (vertices[cut:], ranks[left:])]
+        x, half = positions[vertices], len(ranks) // 2
+        axes = np.argsort(np.ptp(x, axis=0), kind="stable")
+        vertices = vertices[np.lexsort([x[:, axis] for axis in axes])]
+        cut = len(vertices) * half // len(ranks)
+        parts += [(vertices[:cut], ranks[:half]), (vertices[cut:], ranks[half:])]
     return owner
 
 
 def partition(
-    comm: MPI.Comm, graph: Graph | None, n_vertices: int, places: Array | None = None
+    comm: MPI.Comm, graph: Graph | None, n_vertices: int, positions: Array | None = None
 ) -> tuple[Ints | None, str]:
     """Owning rank of each vertex; collective.
 
-    The partitioner is the best that this PETSc has (PT-Scotch, ParMETIS, …), or what
-    ``-mat_partitioning_type`` says. It works on rank 0, where the mesh is: on several ranks the answer of
-    PT-Scotch would depend on the order in which messages arrive, here it is the same in every run. With
-    ``places``, and without that option, it is `bisection`: a graph of the meshes does not know which sheets
-    lie on each other, and would cut between them.
+    ``-mat_partitioning_type`` chooses a graph partitioner. Without this option it is the first that PETSc
+    has of `PREFERRED`, or, where ``positions`` are given, `bisection`: the graph of the meshes does not
+    contain which sheets lie on each other, so that a graph partitioner would cut between them. Graph
+    partitioners run on rank 0 alone: on several ranks the result of PT-Scotch depends on the order in which
+    messages arrive.
 
     Parameters
     ----------
@@ -91,7 +94,7 @@ def partition(
         The whole graph, on rank 0; None elsewhere.
     n_vertices : int
         V, on all ranks.
-    places : (V, 3)
+    positions : (V, 3)
         Positions [m] of vertices that may touch, on rank 0.
 
     Returns
@@ -103,12 +106,12 @@ def partition(
     Raises
     ------
     InputError
-        On all ranks, if PETSc has not the partitioner that was asked for.
+        On all ranks, if PETSc lacks the partitioner of ``-mat_partitioning_type``.
     """
     if comm.size == 1:
         return np.zeros(n_vertices, dtype=np.int64), "none (one rank)"
-    if not PETSc.Options().hasName("mat_partitioning_type") and comm.bcast(places is not None):
-        return (None if places is None else bisection(places, comm.size)), "bisection of space"
+    if not PETSc.Options().hasName("mat_partitioning_type") and comm.bcast(positions is not None):
+        return (None if positions is None else bisection(positions, comm.size)), "bisection of space"
     owner: Ints | None = None
 
     def on_rank_0() -> str:
@@ -117,7 +120,7 @@ def partition(
         matrix, parts = _matrix(graph), PETSc.IS()
         partitioning = PETSc.MatPartitioning().create(PETSc.COMM_SELF)
         partitioning.setAdjacency(matrix)
-        name = _choose(partitioning, comm.size)
+        name = _set_partitioner(partitioning, comm.size)
         partitioning.apply(parts)
         owner = parts.getIndices().astype(np.int64)
         for item in (parts, partitioning, matrix):
@@ -128,13 +131,14 @@ def partition(
     return owner, name
 
 
-def _choose(partitioning: PETSc.MatPartitioning, n_ranks: int) -> str:
+def _set_partitioner(partitioning: PETSc.MatPartitioning, n_ranks: int) -> str:
+    """Set the partitioner and the number of parts; returns the partitioner's name."""
     database = PETSc.Options()
     asked = database.getString("mat_partitioning_type", "")
-    # petsc4py has no other way to say how many parts there are to be
+    # petsc4py has no other way to set the number of parts
     database.setValue(PARTS, n_ranks)
     try:
-        # "average" cuts the numbering into equal pieces, which the locality order makes compact
+        # "average" cuts the numbering, which follows `locality_order`, into equal pieces
         for name in (asked,) if asked else (*PREFERRED, "average"):
             try:
                 partitioning.setType(name)

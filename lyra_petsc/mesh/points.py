@@ -1,4 +1,4 @@
-"""Numbering of points over ranks, owned and ghost points of a rank, and the layout of unknowns."""
+"""Global numbering of points over the ranks, owned and ghost points of a rank, layout of the unknowns."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from lyra_petsc.arrays import Array, Ints, Mask
 
 @dataclass(frozen=True)
 class Numbering:
-    """Global numbering of one kind of point on rank 0: contiguous per rank.
+    """Global numbering, contiguous per rank, of all points of one kind; exists on rank 0.
 
     Attributes
     ----------
     owner : (N,) int64
         Owning rank of each point of the mesh.
     number : (N,) int64
-        New global number of each; rank r owns ``bounds[r]`` to ``bounds[r + 1]``.
+        Global number of each point.
     bounds : (ranks + 1,) int64
+        Rank r owns the numbers from ``bounds[r]`` to before ``bounds[r + 1]``.
     """
 
     owner: Ints
@@ -31,7 +32,7 @@ class Numbering:
 
     @classmethod
     def build(cls, owner: Ints, position: Ints, n_ranks: int) -> Numbering:
-        """Number by owner, within an owner by ``position`` (N,), an order that keeps neighbours near."""
+        """Number points by ``owner`` (N,), then by ``position`` (N,), as of `partitioner.locality_order`."""
         order = np.lexsort((position, owner))
         number = np.empty(len(owner), dtype=np.int64)
         number[order] = np.arange(len(owner))
@@ -41,13 +42,15 @@ class Numbering:
 
 
 class Points:
-    """Points of one kind on a rank: owned first, then ghosts (others' points that its elements touch).
+    """Points of one kind on a rank: the owned ones first, then the ghosts.
+
+    Ghosts are points of other ranks that elements of this rank couple.
 
     Parameters
     ----------
     comm : MPI.Comm
     bounds : (ranks + 1,) int64
-        First global number of each rank's points, and N.
+        First global number of each rank, and the number of all points.
     ghosts : (n_ghost,) int64
         Global numbers of the ghosts, in any order.
     """
@@ -72,7 +75,7 @@ class Points:
         return np.concatenate([owned, self.ghosts])
 
     def local(self, numbers: Ints) -> Ints:
-        """Local numbers of points given by their global ones, all of them owned or ghosts."""
+        """Local numbers of points given by global ``numbers``; each must be owned or a ghost."""
         end = self.start + self.n_owned
         order = np.argsort(self.ghosts, kind="stable")
         inside = (numbers >= self.start) & (numbers < end)
@@ -100,20 +103,20 @@ class Points:
         self._forest.reduceEnd(triple, ghosts, owned, MPI.SUM)
         values[: self.n_owned] = owned
 
-    def summed(self, *numbers: float) -> Array:
-        """Sums over all ranks of each rank's numbers; collective."""
+    def global_sum(self, *numbers: float) -> Array:
+        """Sum of each number over all ranks; collective."""
         sums = np.array(numbers)
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, sums)
         return sums
 
-    def largest(self, *numbers: float) -> list[float]:
-        """The largest of all ranks' each of the numbers; collective."""
+    def global_max(self, *numbers: float) -> list[float]:
+        """Maximum of each number over all ranks; collective."""
         if self.comm.size == 1:
             return list(numbers)
-        most = np.array(numbers, dtype=np.float64)
-        self.comm.Allreduce(MPI.IN_PLACE, most, MPI.MAX)
-        return most.tolist()
+        maxima = np.array(numbers, dtype=np.float64)
+        self.comm.Allreduce(MPI.IN_PLACE, maxima, MPI.MAX)
+        return maxima.tolist()
 
     def destroy(self) -> None:
         """Free the communication objects; collective."""
@@ -124,16 +127,16 @@ class Points:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What the block rows of all ranks hold.
+    """Vertices and edges whose unknowns the block rows hold.
 
     Attributes
     ----------
     n_vertices, n_edges : (ranks,) int64
-        Vertices, and edges that carry an unknown, of each rank.
+        Numbers of vertices, and of edges with an unknown, that each rank owns.
     vertices : (n,) int64
         Index in the mesh of each vertex of this rank.
     edges : (n,) int64
-        Of each edge of this rank, its position among the edges that carry an unknown, in the mesh's order.
+        Index of each edge of this rank, counting only edges with an unknown, in the order of the mesh.
     """
 
     n_vertices: Ints
@@ -143,30 +146,30 @@ class Unknowns:
 
 
 class Layout(Points):
-    """Unknowns of a scene in block rows of three: the coordinates of a vertex, or the unknowns of three
-    edges.
+    """Unknowns of a scene in block rows of three: coordinates of a vertex, or unknowns of three edges.
 
-    Each rank owns the rows of its vertices first, then those of its edges; the last of these may end with
-    unknowns that nothing uses (`padding`), which solvers hold at zero. An array over the local rows (n_local,
-    3) has the unknown of an edge at ``edge_places`` of its flat form. All unknowns have the unit of a length:
-    an angle on an edge is stored times the rest length of the edge, so that its force is a moment per length
+    The rows that a rank owns are those of its vertices, then those of its edges. The last row of edges may
+    end with unused unknowns (`padding`), which solvers hold at zero. In an array of local rows (n_local, 3),
+    flattened, the unknowns of the edges are at ``edge_indices``. All unknowns have the unit of a length: an
+    angle on an edge is stored times the rest length of the edge, so that its force is a moment per length
     [N].
 
     Parameters
     ----------
     comm, bounds, ghosts
-        As for `Points`, of block rows.
+        As for `Points`; the points are block rows.
     unknowns : Unknowns
 
     Attributes
     ----------
     n_vertices, n_edges : int
-        That this rank owns; vertices are its rows 0 to n_vertices.
+        Numbers of owned vertices and edges; the vertices are rows 0 to n_vertices.
     n_vertices_global, n_edges_global : int
-    original, edges : (n_vertices,), (n_edges,) int64
-        Their positions in files: among the mesh's vertices, and among its edges that carry an unknown.
-    edge_places, padding : (n_edges,), (m,) int64
-        Of edge unknowns, and of unused ones, in the flat form of an array of owned rows.
+        The same over all ranks.
+    mesh_vertices, edges : (n_vertices,), (n_edges,) int64
+        ``vertices`` and ``edges`` of `Unknowns`: the order in files.
+    edge_indices, padding : (n_edges,), (m,) int64
+        Indices of the unknowns of edges, and of unused unknowns, in a flattened array of owned rows.
     """
 
     def __init__(self, comm: MPI.Comm, bounds: Ints, ghosts: Ints, unknowns: Unknowns) -> None:
@@ -177,17 +180,17 @@ class Layout(Points):
             int(unknowns.n_vertices.sum()),
             int(unknowns.n_edges.sum()),
         )
-        self.original, self.edges = unknowns.vertices, unknowns.edges
+        self.mesh_vertices, self.edges = unknowns.vertices, unknowns.edges
         first = 3 * self.n_vertices
         self.padding: Ints = np.arange(first + self.n_edges, 3 * self.n_owned)
 
     @property
-    def edge_places(self) -> Ints:
+    def edge_indices(self) -> Ints:
         return 3 * self.n_vertices + np.arange(self.n_edges)
 
     @property
     def n_unknowns(self) -> int:
-        """Unknowns of all ranks: three of each vertex, one of each edge that carries one."""
+        """Number of unknowns of all ranks, without padding."""
         return 3 * self.n_vertices_global + self.n_edges_global
 
     def with_ghosts(self, more: Ints) -> Layout:
@@ -195,48 +198,47 @@ class Layout(Points):
         return Layout(self.comm, self.bounds, np.concatenate([self.ghosts, more]), self.unknowns)
 
     def split(self, rows: Array) -> tuple[Array, Array]:
-        """What owned rows (n_owned, 3) hold of vertices (n_vertices, 3), and of edges (n_edges,)."""
-        return rows[: self.n_vertices], rows.ravel()[self.edge_places]
+        """Split owned rows (n_owned, 3) into those of vertices and the unknowns of edges (n_edges,)."""
+        return rows[: self.n_vertices], rows.ravel()[self.edge_indices]
 
-    def joined(self, vertices: Array, edges: Array | None) -> Array:
-        """Owned rows (n_owned, 3) of what is known of vertices and of edges."""
+    def join(self, vertices: Array, edges: Array | None) -> Array:
+        """Inverse of `split`: owned rows (n_owned, 3), with zeros for padding; None for no edges."""
         if edges is None or self.n_owned == self.n_vertices:
             return vertices
         rows = np.zeros((self.n_owned, 3))
         rows[: self.n_vertices] = vertices
-        rows.ravel()[self.edge_places] = edges
+        rows.ravel()[self.edge_indices] = edges
         return rows
 
-    def gathered(self, owned: Array) -> Array:
-        """Rows of the owned vertices (n_vertices or more, …) in the mesh's order (V, …), on every rank;
-        collective.
+    def gather(self, owned: Array) -> Array:
+        """Values of all vertices (V, …) in the order of the mesh, on every rank; collective.
+
+        ``owned`` (n, …) begins with the values of this rank's n_vertices vertices.
         """
-        pieces = self.comm.allgather((self.original, np.array(owned[: self.n_vertices])))
+        pieces = self.comm.allgather((self.mesh_vertices, np.array(owned[: self.n_vertices])))
         out = np.empty((self.n_vertices_global, *owned.shape[1:]))
-        for original, rows in pieces:
-            out[original] = rows
+        for vertices, rows in pieces:
+            out[vertices] = rows
         return out
 
-    def in_mesh(self) -> Ints:
-        """Position among the mesh's vertices of each local one, (n_local,), ghosts too; 0 of edges;
-        collective.
-        """
-        known = np.zeros((self.n_local, 3))
-        known[: self.n_vertices, 0] = self.original
-        self.update_ghosts(known)
-        return known[:, 0].astype(np.int64)
+    def mesh_vertex_of_local(self) -> Ints:
+        """Index in the mesh of the vertex of each local row (n_local,), 0 for rows of edges; collective."""
+        indices = np.zeros((self.n_local, 3))
+        indices[: self.n_vertices, 0] = self.mesh_vertices
+        self.update_ghosts(indices)
+        return indices[:, 0].astype(np.int64)
 
     def are_vertices(self, rows: Ints) -> Mask:
-        """Which of these rows, given by global numbers, are vertices."""
+        """Whether each of ``rows``, given by global numbers, belongs to a vertex and not to edges."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
         return rows - self.bounds[rank] < self.unknowns.n_vertices[rank]
 
     @property
     def vertex_bounds(self) -> Ints:
-        """First vertex (ranks + 1,) of each rank where vertices alone are numbered."""
+        """As ``bounds`` (ranks + 1,), where only vertices are numbered and not rows of edges."""
         return np.concatenate([[0], np.cumsum(self.unknowns.n_vertices)]).astype(np.int64)
 
     def vertex_numbers(self, rows: Ints) -> Ints:
-        """Numbers among vertices alone of vertices given by the global numbers of their rows."""
+        """Numbers, counting only vertices, of vertices given by the global numbers of their rows."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
         return rows - self.bounds[rank] + self.vertex_bounds[rank]

@@ -278,7 +278,7 @@ def refuse_crossings(
                 count = _counted(len(pairs), "pair", "of a triangle of the sheet and one of it", "cross")
                 refuse(key, count, named, remedy)
             continue
-        inside = overlaps_of(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles
+        inside = find_overlaps(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles
         if len(inside):
             where = "into it" if isinstance(obstacle, Solid) else "beyond it"
             named = (f"{a} {around(a)}" for a in inside[:NAMED].tolist())
@@ -287,7 +287,7 @@ def refuse_crossings(
             )
 
 
-def overlaps_of(
+def find_overlaps(
     obstacle: Solid | Container, positions: Array, triangles: Ints, time: float, *, is_box: bool
 ) -> Overlaps:
     """What of a sheet at positions (V, 3) [m] is at a time [s] where an obstacle does not let it.

@@ -31,7 +31,7 @@ from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.tensors import plane_components
 from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.dump import Change, changes, dump_scene
+from lyra_petsc.scene.dump import Change, dump_scene, scene_changes
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_memory
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -69,7 +69,7 @@ class Recorder:
         problem = simulation.problem
         self._fields: list[Field] = chosen(problem)
         points = problem.points
-        self._vertices = FileOrder(points.comm, points.original, points.n_vertices_global)
+        self._vertices = FileOrder(points.comm, points.mesh_vertices, points.n_vertices_global)
         self._edges: FileOrder | None = None
         if points.n_edges_global:
             self._edges = FileOrder(points.comm, points.edges, points.n_edges_global)
@@ -152,7 +152,7 @@ class Recorder:
         simulation, memory = self._simulation, checkpoint.scalars
         system, layout = simulation.problem.system, simulation.problem.points
         arrays = {
-            name: layout.joined(values, checkpoint.edges.get(name))
+            name: layout.join(values, checkpoint.edges.get(name))
             for name, values in checkpoint.arrays.items()
         }
         for number, start in enumerate(memory["late_starts"]):
@@ -194,7 +194,7 @@ class Recorder:
         """Note in which keys the scene differs from the one in the folder."""
         scene, notes = self._simulation.scene, self._simulation.notes
         try:
-            self.changes = on_root(self._comm, lambda: changes(before, scene))
+            self.changes = on_root(self._comm, lambda: scene_changes(before, scene))
         except InputError as error:
             notes.append(f"{error}; what has changed since the run was begun is not known")
             return

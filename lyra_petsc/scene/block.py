@@ -32,13 +32,13 @@ class Block(BaseModel):
     null_is_a_value: ClassVar[frozenset[str]] = frozenset()
 
     # keys that a scene may well try, and what to say of them
-    not_yet: ClassVar[dict[str, str]] = {}
+    unsupported: ClassVar[dict[str, str]] = {}
 
     # how keys depend on each other
     rules: ClassVar[tuple[Rule, ...]] = ()
 
-    # keys that `complete` fills in only in some cases
-    sometimes_filled: ClassVar[frozenset[str]] = frozenset()
+    # keys that `with_defaults` fills in only in some cases
+    conditional_defaults: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -56,14 +56,14 @@ class Block(BaseModel):
         for key in data:
             if key not in known:
                 word = key if isinstance(key, str) else shown(key)
-                if word in cls.not_yet:
-                    raise problem(cls.not_yet[word], word)
+                if word in cls.unsupported:
+                    raise problem(cls.unsupported[word], word)
                 raise problem(f"unknown key, {nearest(word, known)}", word)
         kept = {key: value for key, value in data.items() if value is not None or key in cls.null_is_a_value}
-        return cls.complete(kept)
+        return cls.with_defaults(kept)
 
     @classmethod
-    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Hook: defaults that depend on which other keys are given."""
         return data
 
@@ -85,7 +85,7 @@ class Block(BaseModel):
             key = field.alias or name
             content = {word: value for word, value in schema["properties"][key].items() if word != "title"}
             default = content.pop("default", None)
-            optional = not field.is_required() or name in cls.sometimes_filled
+            optional = not field.is_required() or name in cls.conditional_defaults
             if "anyOf" in content and {"type": "null"} in content["anyOf"]:
                 pass
             elif optional:  # an empty key counts as absent
@@ -96,7 +96,7 @@ class Block(BaseModel):
             if default not in (None, math.inf):
                 keys[key]["default"] = default
         schema.pop("title", None)
-        needed = [key for key in schema.get("required", ()) if key not in cls.sometimes_filled]
+        needed = [key for key in schema.get("required", ()) if key not in cls.conditional_defaults]
         schema |= {"required": needed, "description": summary(cls), "properties": keys}
         return schema | ({"allOf": [rule.condition for rule in cls.rules]} if cls.rules else {})
 

@@ -91,7 +91,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def changes(before: Path, scene: Scene) -> list[Change]:
+def scene_changes(before: Path, scene: Scene) -> list[Change]:
     """The keys in which ``scene`` differs from a scene as understood, in a file.
 
     Parameters

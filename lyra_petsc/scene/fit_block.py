@@ -205,7 +205,7 @@ class Fit(Block):
         What was measured.
     """
 
-    parameters: Annotated[dict[Name, Parameter], block_of("keys of the scene", least=1)]
+    parameters: Annotated[dict[Name, Parameter], block_of("keys of the scene", minimum=1)]
     measurements: Annotated[
-        list[Measurement], list_of(" of measurements", least=1), Field(json_schema_extra={"minItems": 1})
+        list[Measurement], list_of(" of measurements", minimum=1), Field(json_schema_extra={"minItems": 1})
     ]

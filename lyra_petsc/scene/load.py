@@ -9,7 +9,7 @@ from typing import Any
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.scene.messages import checked, dotted
+from lyra_petsc.scene.messages import dotted, validated
 from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
@@ -86,7 +86,7 @@ def _materials(data: Any) -> list[dict[str, Any]]:
     return [block for block in (blocks if isinstance(blocks, list) else [blocks]) if isinstance(block, dict)]
 
 
-def bent_as_stored(scene: Scene, stored: Path) -> Scene:
+def with_stored_bending_model(scene: Scene, stored: Path) -> Scene:
     """The scene of a resumed run: hinges where neither it nor the ``stored`` one names a bending model.
 
     As it is where the stored one cannot be read.
@@ -143,7 +143,7 @@ def _checked(
     meshes_needed: bool = True,
 ) -> Scene:
     with _of_finite_depth(source):
-        scene = checked(Scene, data, file=source, overridden=overridden, context={"directory": directory})
+        scene = validated(Scene, data, file=source, overridden=overridden, context={"directory": directory})
     if meshes_needed:
         for key, mesh in scene.mesh_files.items():
             _check_mesh_file(mesh, dotted(key, data), source)

@@ -61,7 +61,7 @@ def input_error(
     return InputError(message, file=file, key=key or None)
 
 
-def checked(
+def validated(
     kind: type[Model],
     data: Any,
     *,

@@ -20,8 +20,8 @@ from typing_extensions import Self
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.materials.library import ClothTable, entries, of_table
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.materials.library import ClothTable, library_entries, shell_of_table
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.text import parse_json, read_text
 from lyra_petsc.scene.values import (
     Count,
@@ -94,7 +94,7 @@ class Placement(Block):
 
 
 class OriginalMaterial(Block):
-    not_yet = dict.fromkeys(("yield_curv", "weakening"), "plastic creases are not there; leave the key out")
+    unsupported = dict.fromkeys(("yield_curv", "weakening"), "plasticity is not simulated; leave the key out")
 
     data: Text
     density_mult: Positive = 1.0
@@ -173,7 +173,7 @@ class OriginalScene(Block):
     wind: OriginalWind = Field(default_factory=OriginalWind)
 
     @classmethod
-    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Without a frame_time the step is that of the shipped scene, else one step a frame."""
         return {"frame_steps": 1 if "frame_time" in data else DEFAULT_FRAME_STEPS, **data}
 
@@ -240,7 +240,7 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
     if found is not None:
         table = _read_material(found)
     else:
-        cloths = {name: entry for name, entry in entries().items() if isinstance(entry, ClothTable)}
+        cloths = {name: entry for name, entry in library_entries().items() if isinstance(entry, ClothTable)}
         name = Path(data).stem
         if name not in cloths:
             raise InputError(
@@ -255,7 +255,7 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
             key="stretching[0]" if found else key,
         )
     at_0, at_45, at_90 = (max(k, 0.0) for k in table.bending)
-    shell, _ = of_table(ClothTable(table.density, c11, c12, c22, c33, (at_0, at_45, at_90)), data)
+    shell, _ = shell_of_table(ClothTable(table.density, c11, c12, c22, c33, (at_0, at_45, at_90)), data)
     return {
         "density": shell.density,
         "membrane": {"c11": shell.c11, "c22": shell.c22, "c12": shell.c12, "c33": shell.c33},
@@ -264,7 +264,7 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
 
 
 def _read_material(path: Path) -> ClothTable:
-    tables = checked(MaterialFile, parse_json(read_text(path), file=path), file=path)
+    tables = validated(MaterialFile, parse_json(read_text(path), file=path), file=path)
     c11, c12, c22, c33 = tables.stretching[0]
     at_0, at_45, at_90 = (row[0] for row in tables.bending)
     return ClothTable(tables.density, c11, c12, c22, c33, (at_0, at_45, at_90))
@@ -315,7 +315,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     InputError
         Unknown keys, values out of range, files that do not exist.
     """
-    scene = checked(OriginalScene, data, file=path)
+    scene = validated(OriginalScene, data, file=path)
     files = [_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)]
     vertices = cache(lambda cloth: read_vertices(files[cloth]))  # read when asked for
     several = len(scene.cloths) > 1

@@ -103,7 +103,7 @@ def absent(*keys: str) -> Condition:
     return {"properties": {key: {"type": "null"} for key in keys}}
 
 
-def some(*keys: str) -> Condition:
+def any_of(*keys: str) -> Condition:
     """Holds if any of ``keys`` has a value."""
     return {"anyOf": [given(key) for key in keys]}
 

@@ -30,9 +30,9 @@ from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
-from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured, names
+from lyra_petsc.scene.materials.library import is_isotropic, isotropic_names, material_names, measured_names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
-from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, holds, one_of, some, when
+from lyra_petsc.scene.rules import Rule, absent, any_of, exactly_one, given, holds, one_of, when
 from lyra_petsc.scene.values import (
     ANY_AXES,
     AXES,
@@ -307,12 +307,12 @@ class KesReport(Block):
             ("B", self.B, "2HB", self.width_of_bending, KES_CURVATURE),
             ("G", self.G, "2HG", self.width_of_shear, KES_ANGLE),
         ):
-            (least, most), unit = KES_RANGES[name]
+            (low, high), unit = KES_RANGES[name]
             for value in stiffness or ():
                 if not value > 0.0:
                     raise problem(f"must be > 0, not {shown(value)}", name)
-                if not least <= value <= most:
-                    raise problem(f"must be {least:g} to {most:g} {unit} as of fabrics, not {value:g}", name)
+                if not low <= value <= high:
+                    raise problem(f"must be {low:g} to {high:g} {unit} as of fabrics, not {value:g}", name)
             for value, half in zip(width or (), stiffness or (), strict=False):
                 if value > 2.0 * farthest * half:
                     raise problem(
@@ -368,7 +368,7 @@ def _several_ways(material: Material) -> str:
 
 def _needed(way: tuple[str, ...], key: str) -> Rule:
     """A key that has to be given beside any of the others."""
-    ways = some(*way) if key != "membrane" else {"allOf": [some(*way), {"not": _BY_CURVES}]}
+    ways = any_of(*way) if key != "membrane" else {"allOf": [any_of(*way), {"not": _BY_CURVES}]}
     return Rule(when(ways, given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
 
 
@@ -444,7 +444,7 @@ class Material(Block):
     """
 
     rules = (
-        Rule({"oneOf": [some(*way) for way, _ in _MATERIAL_WAYS]}, _several_ways),
+        Rule({"oneOf": [any_of(*way) for way, _ in _MATERIAL_WAYS]}, _several_ways),
         Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
         *(_needed(way, key) for way, needed in _MATERIAL_WAYS for key in needed),
         Rule(
@@ -463,9 +463,9 @@ class Material(Block):
             "bending_model",
         ),
         Rule(
-            when(given(law={"const": "measured"}), given(cloth={"enum": measured()})),
+            when(given(law={"const": "measured"}), given(cloth={"enum": measured_names()})),
             lambda m: (
-                f"measured is for cloths that were: {', '.join(measured())}"
+                f"measured is for cloths that were: {', '.join(measured_names())}"
                 f"{'' if m.cloth is None else f'; {m.cloth} was not, leave law out'}"
             ),
             "law",
@@ -473,7 +473,7 @@ class Material(Block):
         Rule(
             when(
                 given(law={"const": "neo-hookean"}),
-                {"anyOf": [given("young"), given(cloth={"enum": isotropic()})]},
+                {"anyOf": [given("young"), given(cloth={"enum": isotropic_names()})]},
             ),
             "neo-hookean is for isotropic sheets: give young, poisson, thickness and density, "
             "or leave law out",
@@ -508,10 +508,10 @@ class Material(Block):
             )
         ),
     )
-    sometimes_filled = frozenset({"bending_model"})
+    conditional_defaults = frozenset({"bending_model"})
 
     group: Name | None = None
-    cloth: Annotated[Name, JsonSchema({"enum": names()})] | None = None
+    cloth: Annotated[Name, JsonSchema({"enum": material_names()})] | None = None
     density: Positive | None = None
     membrane: MembraneStiffness | None = None
     bending: _AnyBending | None = None
@@ -532,7 +532,7 @@ class Material(Block):
     kes: KesReport | None = None
 
     @classmethod
-    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Numbers without ``bending`` mean a membrane: the zero is written out."""
         by_curves = isinstance(data.get("law"), (dict, LawCurves)) and not {"cloth", "young"} & data.keys()
         if "membrane" in data or by_curves:
@@ -548,8 +548,8 @@ class Material(Block):
     @field_validator("cloth")
     @classmethod
     def _in_a_library(cls, cloth: str | None) -> str | None:
-        if cloth is not None and cloth not in names():
-            raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, names())}")
+        if cloth is not None and cloth not in material_names():
+            raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, material_names())}")
         return cloth
 
 
@@ -561,14 +561,13 @@ _ALL_AXES = {
 }
 
 
-FASTEST = 1e8
+MAX_SPEED = 1e8
 """Largest speed [m/s] that anything may have; squares of larger ones are soon no numbers."""
 
+_SPEEDS = {"items": {"minimum": -MAX_SPEED, "maximum": MAX_SPEED}}
 _NOT_TOO_FAST = Rule(
-    when(
-        given("velocity"), {"properties": {"velocity": {"items": {"minimum": -FASTEST, "maximum": FASTEST}}}}
-    ),
-    f"must not be faster than {FASTEST:g} m/s",
+    when(given("velocity"), {"properties": {"velocity": _SPEEDS}}),
+    f"must not be faster than {MAX_SPEED:g} m/s",
     "velocity",
 )
 
@@ -593,7 +592,7 @@ class UniformWind(Block):
     drag: NonNegative = 0.0
 
 
-_VERTICES = {"type": "array", "items": INDEX.schema, "minItems": 1, "uniqueItems": True}
+_NODES = {"type": "array", "items": INDEX.schema, "minItems": 1, "uniqueItems": True}
 _BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
 
 
@@ -611,7 +610,7 @@ class VertexChoice(Block):
     """
 
     group: Name | None = None
-    nodes: Annotated[list[Index], list_of(" of vertex numbers", least=1), JsonSchema(_VERTICES)] | None = None
+    nodes: Annotated[list[Index], list_of(" of vertex numbers", minimum=1), JsonSchema(_NODES)] | None = None
     box: Annotated[tuple[Vec3, Vec3], JsonSchema(_BOX)] | None = None
 
     @field_validator("nodes")
@@ -932,7 +931,7 @@ class Obstacle(Block):
     rules = (
         exactly_one(*SHAPES),
         Rule(
-            when(given(inside={"const": True}), some("sphere", "capsule", "box")),
+            when(given(inside={"const": True}), any_of("sphere", "capsule", "box")),
             "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
             "inside",
         ),
@@ -1118,7 +1117,7 @@ class Time(Block):
             "spectral_radius",
         ),
     )
-    sometimes_filled = frozenset({"end", "step"})
+    conditional_defaults = frozenset({"end", "step"})
 
     analysis: Analysis = "dynamic"
     end: Positive
@@ -1143,7 +1142,7 @@ class Time(Block):
         return self.step == "auto"
 
     @classmethod
-    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+    def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Defaults that depend on the analysis and on the integrator."""
         if data.get("analysis") == "static":
             return {"end": 1.0, "step": LOAD_STEP, **data}

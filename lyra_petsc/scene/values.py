@@ -108,11 +108,11 @@ def _reads_as_number(text: str) -> bool:
     return True
 
 
-def list_of(what: str = "", *, least: int = 0) -> BeforeValidator:
+def list_of(what: str = "", *, minimum: int = 0) -> BeforeValidator:
     """Checks a list of at least so many entries; ``what`` follows the word list in the message."""
 
     def check(value: Any) -> list[Any]:
-        if not isinstance(value, (list, tuple)) or len(value) < least:
+        if not isinstance(value, (list, tuple)) or len(value) < minimum:
             block = isinstance(value, dict)
             hint = "; put '- ' before the entry" if block else f", not {shown(value)}"
             raise problem(f"must be a list{what}{hint}")
@@ -121,11 +121,11 @@ def list_of(what: str = "", *, least: int = 0) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def block_of(what: str, *, least: int = 0) -> BeforeValidator:
+def block_of(what: str, *, minimum: int = 0) -> BeforeValidator:
     """Checks a block of at least so many keys."""
 
     def check(value: Any) -> dict[Any, Any]:
-        if not isinstance(value, dict) or len(value) < least:
+        if not isinstance(value, dict) or len(value) < minimum:
             raise problem(f"must be a block of {what}, not {shown(value)}")
         return value
 

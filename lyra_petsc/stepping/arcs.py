@@ -79,7 +79,7 @@ class Arcs:
         x, ahead = equations.ahead(v, way)
         shape, spin, strain = self._turn(x, ahead)
         turn = np.linalg.norm(spin, axis=1)
-        farthest = float(equations.points.largest(float(turn.max(initial=0.0)))[0])
+        farthest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
         part = min(1.0, FARTHEST / farthest) if strains and farthest > 0.0 else 1.0
         ahead, way = part * ahead, part * way
         kept = np.eye(3) + (part * strain if strains else 0.0)
@@ -117,7 +117,7 @@ class Arcs:
     def _solve(self, forces: Array) -> Array:
         """Ways (n_owned, 3) [m] of the free coordinates by which forces (n_owned, 3) are balanced."""
         mask, free = self._equations.prescribed.mask, self._equations.prescribed.free
-        (other,) = self._equations.points.largest(float(not np.array_equal(mask, self._held)))
+        (other,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
         if other:
             self._factor()
         assert self._matrix is not None
@@ -135,7 +135,7 @@ class Arcs:
         layout, rows, mask = self._equations.points, BlockRows(self._pattern), self._equations.prescribed.mask
         self._held = mask.copy()
         size = np.einsum("eck,eck->e", self._slopes, self._slopes)
-        (largest,) = layout.largest(float((self._area * size).max(initial=0.0)))
+        (largest,) = layout.global_max(float((self._area * size).max(initial=0.0)))
         values, diagonal = rows.zeros(), np.full(layout.n_owned, LOOSE * largest)
         diagonal[layout.n_vertices :] = 1.0
         rows.set_diagonal(diagonal, values)

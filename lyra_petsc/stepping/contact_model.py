@@ -133,7 +133,7 @@ class ContactModel:
     def _apart(self, force: Array, expected: Array) -> float:
         """How far forces [N] of springs are from those expected, which do not pull; collective."""
         off = force - np.maximum(expected, 0.0)
-        return float(np.sqrt(self._equations.points.summed(float(np.vdot(self._counted * off, off)))[0]))
+        return float(np.sqrt(self._equations.points.global_sum(float(np.vdot(self._counted * off, off)))[0]))
 
     def _go(self, left: PETSc.Vec, z: PETSc.Vec, more: Array) -> None:
         """Let what is ``left`` [N] of the model be that after a step z, to which the present matrix belongs,

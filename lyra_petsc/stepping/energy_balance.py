@@ -134,7 +134,7 @@ class Ledger:
         for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)
-        budget, sums = self.budget, [float(value) for value in system.points.summed(*local)]
+        budget, sums = self.budget, [float(value) for value in system.points.global_sum(*local)]
         budget.membrane, budget.bending, budget.potential = sums[:3]
         budget.more, budget.kinetic = dict(zip(self._more, sums[3:-1], strict=True)), sums[-1]
         system.forget_directors()  # the next step has other frames
@@ -168,7 +168,7 @@ class Ledger:
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         local[1] += system.damped.heat if system.damped else 0.0
         del external  # energies need the room
-        work, heat = system.points.summed(*local)
+        work, heat = system.points.global_sum(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
         moving = self._moving

@@ -171,7 +171,7 @@ class EnergyGuard:
         pulled = self._of_targets(x0, x1)
         reach = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
         local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2, heat_beside)
-        sums = [float(value) for value in layout.summed(*local)]
+        sums = [float(value) for value in layout.global_sum(*local)]
         slower, faster, change, work, rise, from_targets, *springs, moving, stiff, heat_beside = sums
         slower, faster = before.kinetic - slower, after.kinetic - faster
         work += from_targets

@@ -299,7 +299,7 @@ class Equilibrium:
         system, n = self._system, len(start)
         step = factor - before
         moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
-        (largest,) = system.points.largest(float(np.abs(moved).max(initial=0.0)))
+        (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
         pull = self._pull
         if largest > 0.0 and system.discretisation.limits_motion:
             self._rate = None  # with contact guesses are others
@@ -494,7 +494,7 @@ class Equilibrium:
             n = system.points.n_vertices
             fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
             if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
-                mass = system.points.summed(float(system.mass.sum()))[0] / system.points.n_vertices_global
+                mass = system.points.global_sum(float(system.mass.sum()))[0] / system.points.n_vertices_global
                 fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
             self._careful = float(np.sqrt(self._spacing / fastest))

@@ -212,7 +212,7 @@ def _vertex(
 ) -> Vertex:
     def describe(row: int) -> Vertex:
         return Vertex(
-            number=int(points.original[row]),
+            number=int(points.mesh_vertices[row]),
             tag=0 if tags is None else int(tags[row]),
             position=_numbers(stuck.position[row]),
             before=_numbers(x[row]),
@@ -222,14 +222,14 @@ def _vertex(
             mass=float(mass[row]),
         )
 
-    return worst(points.comm, _size(residual), points.original, describe)
+    return worst(points.comm, _size(residual), points.mesh_vertices, describe)
 
 
 def _triangle(points: Layout, membrane: Membrane, stuck: FailedSolve, residual: Array) -> Triangle:
     n, owned = points.n_vertices, membrane.n_owned
     # with the ghosts: residual norms and mesh numbers, and positions
     known, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
-    known[:n, 0], known[:n, 1] = _size(residual), points.original
+    known[:n, 0], known[:n, 1] = _size(residual), points.mesh_vertices
     position[:n] = stuck.position
     points.update_ghosts(known)
     points.update_ghosts(position)

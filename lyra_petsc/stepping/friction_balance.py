@@ -84,7 +84,7 @@ class FrictionBalance:
         sums = self._system.active.friction_lag(self._system.x)
         if not sums:
             return 0.0, ""
-        each = self._system.points.summed(*np.concatenate(list(sums.values()))).reshape(-1, 3)
+        each = self._system.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)
         slides = [
             f"it slides on {name}" if name else "sheets slide on each other"
             for name, (_, friction, allowed) in zip(sums, each, strict=True)

@@ -178,6 +178,6 @@ class Globalisation:
         trial = np.empty(self._shape)
         equations = self._equations
         equations.residual(v, equations.stage.sigma * (v - equations.history), trial)
-        (square,) = equations.points.summed(float(np.vdot(trial, trial)))
+        (square,) = equations.points.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._at_norm)
         return here - noise if smaller else here + noise

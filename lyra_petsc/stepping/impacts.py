@@ -75,7 +75,7 @@ def surplus(system: StageEquations, before: float, x_before: Array, surplus_befo
         term.add_gradient(system.stage_positions, frozen[term], pull := np.zeros_like(system.x))
         work += float(np.vdot(pull[:n], moved))
         after += float(term.energies(system.x, frozen[term]).sum())
-    gain, stored = (float(value) for value in system.points.summed(after - before - work, after))
+    gain, stored = (float(value) for value in system.points.global_sum(after - before - work, after))
     left = max(surplus_before + gain, -stored)
     if not left > 0.0:
         return left
@@ -87,7 +87,7 @@ def surplus(system: StageEquations, before: float, x_before: Array, surplus_befo
     mass = system.mass[:, None]
     change = np.divide(impulse, mass, out=np.zeros_like(impulse), where=mass > 0.0)
     local = float(np.vdot(impulse, change)), float(np.vdot(impulse, system.v[:n]))
-    square, rate = (float(value) for value in system.points.summed(*local))
+    square, rate = (float(value) for value in system.points.global_sum(*local))
     if not square > 0.0:
         return left
     # ½ square s² + rate s = −left, or as near to that as can be
@@ -120,7 +120,7 @@ def damp_impacts(system: StageEquations) -> Damped:
     """
     layout, n, dt, felt = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
     every = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
-    if not any(layout.largest(sum(len(pairs.points) for pairs in every))):
+    if not any(layout.global_max(sum(len(pairs.points) for pairs in every))):
         held = np.zeros(len(system.prescribed.at))
         return Damped(felt, held, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3)))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
@@ -161,7 +161,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.by_stage:
         pairs, moments = term.moments(stage, frozen)
-    if not any(system.points.largest(float(np.abs(more).max(initial=0.0)), len(pairs))):
+    if not any(system.points.global_max(float(np.abs(more).max(initial=0.0)), len(pairs))):
         return damped
     impulse = np.zeros_like(x)
     size = np.linalg.norm(ways, axis=2)

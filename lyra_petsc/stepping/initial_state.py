@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.scene.schema import FASTEST, Initial, Scene
+from lyra_petsc.scene.schema import MAX_SPEED, Initial, Scene
 
 RESOLVED = 1e6
 """Mean edge over the round-off of the largest coordinate, at least."""
@@ -43,7 +43,7 @@ def start_velocities(
     Raises
     ------
     InputError
-        Beyond `FASTEST`.
+        Beyond `MAX_SPEED`.
     """
     if not any(initial.velocity) and not any(initial.angular_velocity):
         return {}
@@ -52,10 +52,10 @@ def start_velocities(
         spin = np.cross(np.asarray(initial.angular_velocity), mesh.positions - centre)
         velocity = np.asarray(initial.velocity) + spin
     fastest = float(np.abs(velocity).max())  # whose square may not be a number
-    if not fastest <= FASTEST:
-        key = "velocity" if np.abs(initial.velocity).max() > FASTEST else "angular_velocity"
+    if not fastest <= MAX_SPEED:
+        key = "velocity" if np.abs(initial.velocity).max() > MAX_SPEED else "angular_velocity"
         raise InputError(
-            f"lets vertices fly at {fastest:.3g} m/s; at most {FASTEST:g} m/s",
+            f"lets vertices fly at {fastest:.3g} m/s; at most {MAX_SPEED:g} m/s",
             file=file,
             key=f"initial.{key}",
         )

@@ -106,7 +106,7 @@ def _worst(system: StageEquations, x: Array, sizes: Callable[[Elastic], Array]) 
     sized = np.concatenate(found)
     if not points.comm.allreduce(float(sized.max(initial=0.0)), MPI.MAX) > 0.0:
         return None
-    numbers = points.in_mesh()
+    numbers = points.mesh_vertex_of_local()
     ends = np.cumsum([len(size) for size in found])
     first = [numbers[term.stencil[: len(size)]].min(axis=1) for term, size in zip(terms, found, strict=True)]
 

@@ -265,7 +265,7 @@ class Newton:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
         equations, force = self._equations, np.empty(self._shape)
         equations.residual(v, equations.stage.sigma * (v - equations.history), force)
-        (square,) = equations.points.summed(float(np.vdot(force, force)))
+        (square,) = equations.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
     def bend_guess(self, v: Array, guess: Array) -> None:

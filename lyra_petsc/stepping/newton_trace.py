@@ -116,7 +116,7 @@ class Trace:
         taken = None
         if number > 0 and self._last is not None:
             way = here - self._last
-            (square,) = self._system.points.summed(float(np.vdot(way, way)))
+            (square,) = self._system.points.global_sum(float(np.vdot(way, way)))
             moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0

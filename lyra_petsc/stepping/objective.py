@@ -75,7 +75,7 @@ class Objective:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))
         if not of.integrator.lagged_loads:
             parts += [float(wind.potentials(vs, of.active.frozen[wind]).sum()) for wind in of.active.viscous]
-        value, size, square = of.points.summed(sum(parts), sum(abs(part) for part in parts), square)
+        value, size, square = of.points.global_sum(sum(parts), sum(abs(part) for part in parts), square)
         return float(value), float(size) + float(np.sqrt(square))
 
     @cached_property

@@ -18,8 +18,8 @@ from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.linear.petsc_options import petsc_number
-from lyra_petsc.mesh.build import mesh_of
-from lyra_petsc.mesh.distribute import Part, Whole, distribute
+from lyra_petsc.mesh.build import build_scene_mesh
+from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.mesh.mesh import Mesh, Source
@@ -141,12 +141,12 @@ def build_problem(
     InputError
         On all ranks alike, for whatever in the scene or its meshes cannot be simulated.
     """
-    whole: Whole | None = None
+    whole: GlobalMesh | None = None
     mesh: Mesh | None = None
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = known or mesh_of(scene, phases.tell)
+        mesh = known or build_scene_mesh(scene, phases.tell)
         outline, whole = _whole(scene, mesh)
         whole.owner = owner
         return outline
@@ -183,7 +183,7 @@ def events(scene: Scene) -> list[float]:
     return [*(t for window in windows for t in window.events()), *jumps]
 
 
-def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
+def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
     """Everything there is to distribute (rank 0)."""
     rest = RestShape(scene, mesh)
     light = np.flatnonzero(~(rest.mass > 0.0))
@@ -247,7 +247,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
-    return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges, places=places)
+    return outline, GlobalMesh(mesh.n_vertices, mesh.triangles, elements, data, edges, positions=places)
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
@@ -266,7 +266,7 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
                 f"vertex {vertices[off.argmax()]} lies {off.max():.2g} m beside the plane {axis} = "
                 f"{np.median(along):.6g} m; choose only vertices in one plane, or hold axes instead"
             )
-        elif (np.isin(mesh.triangles[rest.bends_by("hinge")], vertices).sum(axis=1) > 1).any():
+        elif (np.isin(mesh.triangles[rest.bends_with("hinge")], vertices).sum(axis=1) > 1).any():
             problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
         if problem:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
@@ -294,7 +294,7 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
             problem = (
                 f"keeps the slope of an edge that slides in its sheet's plane, not along {names} out of it"
             )
-        elif (there & rest.bends_by("hinge")).any():
+        elif (there & rest.bends_with("hinge")).any():
             problem = "is not kept by hinges on edges that slide; give the material bending_model: midedge"
         elif any(keyframe.rotate is not None for keyframe in keyframes):
             problem = "keeps no slope of an edge that turns and slides"
@@ -334,7 +334,7 @@ def _set_up_contact(
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 
 
-def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:
+def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
     terms = {n: made(registered(n), part.elements.get(n), scene, on_vertices) for n in outline.terms}
@@ -432,7 +432,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float
     )
 
 
-def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:
+def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> ClampedEdges | None:
     """The edges that handles clamp, where they have unknowns."""
     clamping = {n: handle for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements}
     if not clamping:
@@ -445,7 +445,7 @@ def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> Clamp
         term,
         {n: part.elements[f"clamp {n}"] for n in clamping},
         {n: (motion_of(scene, n), Window.of(h), h.symmetry is not None) for n, h in clamping.items()},
-        layout.edge_places,
+        layout.edge_indices,
     )
 
 
@@ -473,7 +473,7 @@ def _spectral_radius(scene: Scene) -> float | None:
     return radius
 
 
-def _own(part: Part, name: str) -> Ints:
+def _own(part: LocalMesh, name: str) -> Ints:
     """Owned vertices of a set of single-vertex elements, local numbering."""
     elements = part.elements[name]
     return elements.stencil[: elements.n_owned, 0].astype(np.int64)

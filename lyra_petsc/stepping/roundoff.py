@@ -25,7 +25,7 @@ def roundoff_of_contact(system: StageEquations) -> float:
     pressed; collective.
     """
     points, (x, _) = system.points, system.evaluated
-    scale, size = np.zeros(points.n_local), points.largest(float(np.abs(x).max(initial=0.0)))[0]
+    scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
     for term in system.active.limiting:
         amount = term.stiffness(x, system.active.frozen[term]) * term.sizes(size)
         scale += np.bincount(term.stencil.ravel(), np.repeat(amount, term.stencil.shape[1]), points.n_local)

@@ -191,7 +191,7 @@ class Sensitivities:
     def _owner(self) -> NDArray[np.int64] | None:
         """Rank of each vertex (V,), on rank 0: partitioners do not cut a mesh twice alike."""
         points = self._system.points
-        pieces = points.comm.gather(points.original, root=0)
+        pieces = points.comm.gather(points.mesh_vertices, root=0)
         if pieces is None:
             return None
         owner = np.empty(points.n_vertices_global, dtype=np.int64)
@@ -457,7 +457,7 @@ class Sensitivities:
         """A time [s] in which sheets of this mass fall far."""
         system = self._system
         loads, mass = np.linalg.norm(system.applied.now), system.mass.sum()
-        force, total = system.points.summed(float(loads) ** 2, float(mass))
+        force, total = system.points.global_sum(float(loads) ** 2, float(mass))
         return math.sqrt(self.simulation.problem.outline.size * total / math.sqrt(force)) if force else 1.0
 
     # -- linear equations --------------------------------------------------------------------------
@@ -491,7 +491,7 @@ class Sensitivities:
             ksp.setInitialGuessNonzero(guess)
 
     def _dot(self, a: Array, b: Array) -> float:
-        return float(self._system.points.summed(float(np.vdot(a, b)))[0])
+        return float(self._system.points.global_sum(float(np.vdot(a, b)))[0])
 
     def _solved(
         self, solve: Callable[[Array], Array], change: Callable[[Array], Array], start: Array, step: float

@@ -137,7 +137,7 @@ class Examination:
         points = self._system.points
         # spread evenly over (-1/2, 1/2) by the number of the unknown: the same on any number of ranks
         start = np.zeros((points.n_owned, 3))
-        number = 3 * points.original[:, None] + np.arange(3)
+        number = 3 * points.mesh_vertices[:, None] + np.arange(3)
         start[: points.n_vertices] = (number + 1) * GOLDEN % 1.0 - 0.5
         found = self._inertia.lowest_mode(np.where(self._system.prescribed.free, start, 0.0))
         return None if found is None or not found[0] < 0.0 else found[1]
@@ -151,7 +151,7 @@ class Examination:
                 bent[term.stencil] = True
         n = system.points.n_vertices
         square = (mode[:n] ** 2).sum(axis=1)
-        on_bent, all_of_it = system.points.summed(float(square[bent[:n]].sum()), float(square.sum()))
+        on_bent, all_of_it = system.points.global_sum(float(square[bent[:n]].sum()), float(square.sum()))
         return bool(on_bent < BENDS * all_of_it)
 
     def way_down(self, mode: Array) -> Array | None:
@@ -195,7 +195,7 @@ class Examination:
         force = system.applied.now.copy()
         for load in system.active.following:
             force += system.applied.factor * self._change(load, x, len(way))
-        return float(system.points.summed(stored - float(np.vdot(force, way)))[0])
+        return float(system.points.global_sum(stored - float(np.vdot(force, way)))[0])
 
     def _change(self, load: Load, x: Array, n: int) -> Array:
         """Mean on the way to x (n_local, 3) of a load's change from here (n, 3) [N], exact for a pressure."""

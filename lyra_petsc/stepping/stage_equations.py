@@ -190,7 +190,7 @@ class StageEquations:
         """
         least = np.zeros((self.points.n_local, 3))
         for term in self.active.edged:
-            least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
+            least.reshape(-1)[term.edge_indices] = LEAST * term.edge_stiffness
         return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
     def begin(self, time: float) -> None:
@@ -385,7 +385,7 @@ class StageEquations:
         """Let handles hold what they do at the start; norm [N] of the moments on free edges; collective."""
         self.prescribed.begin_step(self.t0, self.t0, self.x)
         moments = np.where(self.prescribed.free, self._internal(self.x), 0.0)[self.points.n_vertices :]
-        return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
+        return float(np.sqrt(self.points.global_sum(float(np.vdot(moments, moments)))[0]))
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
 
@@ -615,7 +615,7 @@ class StageEquations:
 
     def _least_of(self, number: float) -> float:
         """The least of all ranks; collective."""
-        return -self.points.largest(-number)[0]
+        return -self.points.global_max(-number)[0]
 
     def ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
@@ -632,7 +632,7 @@ class StageEquations:
         """
         here = self.velocity_of_staying()
         goes = self.prescribed.velocity != here.take(self.prescribed.at)
-        if not any(self.points.largest(bool(self.active.pushing) or bool(goes.any()))):
+        if not any(self.points.global_max(bool(self.active.pushing) or bool(goes.any()))):
             return True
         rests, refused = self.integrator.starts_at_rest, None
         ways = [here] if rests else [here, self.v[: len(here)]]
@@ -783,7 +783,7 @@ class StageEquations:
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
-        return float(np.sqrt(self.points.summed(*self._squares).max(initial=0.0)))
+        return float(np.sqrt(self.points.global_sum(*self._squares).max(initial=0.0)))
 
     def block_summary(self) -> list[str]:
         """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
@@ -794,7 +794,7 @@ class StageEquations:
             return []
         acting = [np.count_nonzero(t.active_elements(self._xs, frozen[t])[: t.n_owned]) for t in near]
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
-        fixed, every, *numbers = self.points.summed(
+        fixed, every, *numbers = self.points.global_sum(
             *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
         ).astype(np.int64)
         pairs = [
@@ -814,7 +814,7 @@ class StageEquations:
         acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.near}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
-            self.touches = any(self.points.largest(number))
+            self.touches = any(self.points.global_max(number))
         return self.discretisation.update_pattern(acting)
 
     @property
@@ -823,7 +823,7 @@ class StageEquations:
         collective.
         """
         number = sum(term.n_friction_pairs for term in self.active.near)
-        return self.discretisation.has_near_elements and any(self.points.largest(number))
+        return self.discretisation.has_near_elements and any(self.points.global_max(number))
 
     @property
     def may_impact(self) -> bool:
@@ -832,7 +832,7 @@ class StageEquations:
         if not (limiting and self.discretisation.has_near_elements):
             return False
         way = self.stage.reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
-        return self.points.largest(float(way))[0] > IMPACT * min(term.skin for term in limiting)
+        return self.points.global_max(float(way))[0] > IMPACT * min(term.skin for term in limiting)
 
     def collides(self, far: float) -> bool:
         """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""
@@ -840,7 +840,7 @@ class StageEquations:
         if not self.discretisation.has_near_elements or not self.integrator.moves or self._at_end:
             return False
         x, ahead, frozen = self.x, self._expected(), self.active.frozen
-        return any(self.points.largest(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))
+        return any(self.points.global_max(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

@@ -30,8 +30,8 @@ def of_edges(system: StageEquations) -> dict[str, Array]:
     for term in system.active.elastic:
         for name, values in term.edge_state().items():
             rows = np.zeros(3 * layout.n_local)
-            rows[term.edge_places] = values
-            found[f"{term.name}.{name}"] = rows[layout.edge_places]
+            rows[term.edge_indices] = values
+            found[f"{term.name}.{name}"] = rows[layout.edge_indices]
     return found
 
 
@@ -45,7 +45,7 @@ def of_elements(system: StageEquations) -> dict[str, Array]:
             else:
                 vertices = layout.global_number[term.stencil[: term.n_owned]]
                 values = term.element_values()[: term.n_owned]
-            numbers = layout.in_mesh()[layout.local(vertices.ravel())].reshape(vertices.shape)
+            numbers = layout.mesh_vertex_of_local()[layout.local(vertices.ravel())].reshape(vertices.shape)
             found[term.name] = np.concatenate([numbers, values], axis=1)
     return found
 
@@ -94,9 +94,9 @@ def _restore_edges(system: StageEquations, term: Elastic, edges: Mapping[str, Ar
     layout, state = system.points, {}
     for name in term.registration.edge_state:
         rows = np.zeros((layout.n_local, 3))
-        rows.ravel()[layout.edge_places] = edges[f"{term.name}.{name}"]
+        rows.ravel()[layout.edge_indices] = edges[f"{term.name}.{name}"]
         layout.update_ghosts(rows)
-        state[name] = rows.ravel()[term.edge_places]
+        state[name] = rows.ravel()[term.edge_indices]
     term.restore_edges(state, system.x)
 
 

@@ -60,7 +60,7 @@ class WholeStiffness:
         for iteration in range(MOST_ITERATIONS):
             system.begin_step(before, factor)
             off, _ = system.out_of_balance()
-            force = float(np.sqrt(system.points.summed(float(np.vdot(off, off)))[0]))
+            force = float(np.sqrt(system.points.global_sum(float(np.vdot(off, off)))[0]))
             if iteration > 0 and self._balanced(force, last):
                 if not self._stands(factor):
                     break
@@ -95,7 +95,7 @@ class WholeStiffness:
         if mode is None or found.negative != 1 or self._system.active.viscous:
             return False
         way = self._way(mode, factor)
-        return way is not None and self._system.points.summed(float(np.vdot(mode, way)))[0] > 0.0
+        return way is not None and self._system.points.global_sum(float(np.vdot(mode, way)))[0] > 0.0
 
     def _way(self, force: Array, factor: float) -> Array | None:
         """The displacement (n_owned, 3) [m] to which a force (n_owned, 3) [N] leads by the exact Hessian and

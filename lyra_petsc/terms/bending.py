@@ -176,7 +176,7 @@ def edge_in_material(
     stiffness = np.zeros(len(triangle))
     for number, shell in enumerate(rest.shells):
         mine = rest.shell_of[triangle] == number
-        if not shell.bends_by(model):
+        if not shell.bends_with(model):
             continue
         if model == "hinge":
             stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)

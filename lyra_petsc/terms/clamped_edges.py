@@ -168,7 +168,7 @@ class ClampedEdges:
 
 def elements(rest: RestShape) -> dict[int, Elements]:
     """Of each handle that holds slopes the edges whose ends it holds, by its number (rank 0, whole mesh)."""
-    chosen = np.flatnonzero(rest.bends_by("midedge"))
+    chosen = np.flatnonzero(rest.bends_with("midedge"))
     triangles = rest.mesh.triangles[chosen]
     number, _ = edge_numbers(rest, triangles)
     sides = number.ravel()

@@ -25,7 +25,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_triangle
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.membrane_laws import law_of
 from lyra_petsc.terms.rest import RestShape
@@ -271,4 +271,4 @@ def elements(rest: RestShape) -> Elements:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Membrane:
     """The term on one rank."""
-    return Membrane(elements, [resolve(block, file=scene.source)[0] for block in scene.material])
+    return Membrane(elements, [resolve_material(block, file=scene.source)[0] for block in scene.material])

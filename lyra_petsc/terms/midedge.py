@@ -267,7 +267,7 @@ class MidEdge(Elastic):
         return areas(self._material)
 
     @property
-    def edge_places(self) -> Ints:
+    def edge_indices(self) -> Ints:
         return self.of_edges.places.astype(np.int64)
 
     def moment(self, force: Array, edges: Ints, x: Array, frozen: Frames) -> Array:
@@ -447,7 +447,7 @@ def elements(rest: RestShape) -> Elements:
     InputError
         Where the start shape is folded by 180° and the rest shape is not.
     """
-    chosen = np.flatnonzero(rest.bends_by("midedge"))
+    chosen = np.flatnonzero(rest.bends_with("midedge"))
     mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
     number, sign = edge_numbers(rest, triangles)
     edges, n_edges = rest.edges, len(rest.edges)

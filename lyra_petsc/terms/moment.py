@@ -96,7 +96,7 @@ def elements(rest: RestShape) -> Elements:
                 file=scene.source,
                 key=f"{key}.group",
             )
-        if not rest.bends_by("midedge")[faces[row]].all():
+        if not rest.bends_with("midedge")[faces[row]].all():
             raise InputError(
                 f"the material at group '{load.group}' has no moments on edges; give it "
                 "bending_model: midedge and a bending stiffness",

@@ -11,7 +11,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
-from lyra_petsc.scene.schema import FASTEST, Handle, Keyframe, Rotation, Scene
+from lyra_petsc.scene.schema import MAX_SPEED, Handle, Keyframe, Rotation, Scene
 
 HALF_TURN = 180.0
 """Angle [degrees] up to which the interpolation of quaternions goes the way that angles say."""
@@ -107,7 +107,7 @@ class Motion:
     ------
     InputError
         If the axes of two keyframes differ and one of their angles exceeds 180°, scales differ in sign, or
-        it goes faster than `FASTEST`.
+        it goes faster than `MAX_SPEED`.
     """
 
     def __init__(
@@ -138,10 +138,10 @@ class Motion:
                     key=key,
                 )
         speeds = np.abs(np.diff(self._values[:, :3], axis=0)) / np.diff(self._times)[:, None]
-        if not np.all(speeds <= FASTEST):
-            i = int(np.argmax(~(speeds <= FASTEST).all(axis=1)))
+        if not np.all(speeds <= MAX_SPEED):
+            i = int(np.argmax(~(speeds <= MAX_SPEED).all(axis=1)))
             raise InputError(
-                f"goes at {speeds[i].max():.3g} m/s from keyframe {i} to {i + 1}; at most {FASTEST:g} m/s",
+                f"goes at {speeds[i].max():.3g} m/s from keyframe {i} to {i + 1}; at most {MAX_SPEED:g} m/s",
                 file=file,
                 key=key,
             )

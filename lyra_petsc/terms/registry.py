@@ -96,11 +96,13 @@ class Registration:
 
 
 def _bends_by(model: str) -> Need:
-    return lambda scene, shells: any(shell.bends_by(model) for shell in shells)
+    return lambda scene, shells: any(shell.bends_with(model) for shell in shells)
 
 
 def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    return any(shell.bends_by("hinge") for shell in shells) and any(handle.clamp for handle in scene.handles)
+    return any(shell.bends_with("hinge") for shell in shells) and any(
+        handle.clamp for handle in scene.handles
+    )
 
 
 def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:

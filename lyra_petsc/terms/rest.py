@@ -12,7 +12,7 @@ from lyra_petsc.mesh.measures import rest_matrices
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.mesh.topology import Hinges, hinges, junctions, unique_edges
-from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.schema import Scene
 
 
@@ -46,7 +46,7 @@ class RestShape:
         self.shell_of = np.full(mesh.n_triangles, -1, dtype=np.int64)
         default = -1
         for number, block in enumerate(scene.material):
-            shell, notes = resolve(block, file=scene.source, key=f"material[{number}]")
+            shell, notes = resolve_material(block, file=scene.source, key=f"material[{number}]")
             self.shells.append(shell)
             self.notes += notes
             if block.group is None:
@@ -68,9 +68,9 @@ class RestShape:
 
     def _check_models(self) -> None:
         """Refuse neighbours that bend by different models."""
-        if len({shell.model for shell in self.shells if shell.bends_by(shell.model)}) < 2:
+        if len({shell.model for shell in self.shells if shell.bends_with(shell.model)}) < 2:
             return
-        models = np.where(self.bends_by("midedge"), 1, 0) - np.where(self.bends_by("hinge"), 1, 0)
+        models = np.where(self.bends_with("midedge"), 1, 0) - np.where(self.bends_with("hinge"), 1, 0)
         triangles = self.hinges.triangles
         mixed = np.flatnonzero(models[triangles[:, 0]] * models[triangles[:, 1]] < 0)
         if len(mixed):
@@ -88,9 +88,9 @@ class RestShape:
         values = np.array([getattr(shell, attribute) for shell in self.shells], dtype=np.float64)
         return values[self.shell_of]
 
-    def bends_by(self, model: str) -> NDArray[np.bool_]:
+    def bends_with(self, model: str) -> NDArray[np.bool_]:
         """Which triangles resist bending by this model, (F,)."""
-        return np.array([shell.bends_by(model) for shell in self.shells])[self.shell_of]
+        return np.array([shell.bends_with(model) for shell in self.shells])[self.shell_of]
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
@@ -113,7 +113,7 @@ class RestShape:
 
     def _check_junctions(self) -> None:
         """Refuse hinges where more than two triangles meet, of which no two make an angle."""
-        bends, found = self.bends_by("hinge"), junctions(self.mesh.triangles)
+        bends, found = self.bends_with("hinge"), junctions(self.mesh.triangles)
         wrong = [triangles for triangles in found if bends[triangles].any()]
         if wrong:
             words = [self._edge_words(triangles) for triangles in wrong[:5]]

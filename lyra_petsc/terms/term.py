@@ -135,7 +135,7 @@ class Term(ABC):
 
     def take(self, elements: Elements) -> None:
         """Work on these elements from here on."""
-        self.elements = elements.once("damping")
+        self.elements = elements.compress("damping")
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
         self.edges = None if elements.edges is None else np.ascontiguousarray(elements.edges, dtype=np.int32)
         self.n_elements = len(self.stencil)
@@ -527,7 +527,7 @@ class Elastic(Term):
         """Go on with a state."""
 
     @property
-    def edge_places(self) -> Ints:
+    def edge_indices(self) -> Ints:
         """Places (n,) of the edges that ``edge_state`` is of, in the flat form of arrays over local rows."""
         return np.empty(0, dtype=np.int64)
 

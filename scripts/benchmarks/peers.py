@@ -19,7 +19,7 @@ from processes import Limits, Spent, run
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
-from lyra_petsc.scene.materials.library import ClothTable, entries
+from lyra_petsc.scene.materials.library import ClothTable, library_entries
 from lyra_petsc.scene.schema import Scene
 
 OBJ_FILE = "square.obj"
@@ -51,7 +51,7 @@ def write_files(folder: Path, vertices: int) -> None:
         np.savetxt(file, mesh.positions, "v %.17g %.17g %.17g")
         np.savetxt(file, mesh.positions[:, :2], "vt %.17g %.17g")
         np.savetxt(file, np.repeat(mesh.triangles + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
-    table = entries()[CLOTH]
+    table = library_entries()[CLOTH]
     assert isinstance(table, ClothTable)
     material = {
         "density": table.density,

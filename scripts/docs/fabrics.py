@@ -15,13 +15,13 @@ from mpi4py import MPI
 from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, restore, save
 from lyra_petsc.experiments.fabric.specimens import fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import cases_of, run_case
-from lyra_petsc.scene.materials.library import measured
+from lyra_petsc.scene.materials.library import measured_names
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "fabrics.md"
 SHEETS = PAGE.with_suffix("")
 MADE = "<!-- made by scripts/docs/fabrics.py; change the program, not this page -->"
-CLOTHS = [*measured(), "aluminium", "paper"]
+CLOTHS = [*measured_names(), "aluminium", "paper"]
 
 SHAPES = ("cantilever", "loop")
 CURVES = ("tensile", "shear", "bending", *SHAPES)

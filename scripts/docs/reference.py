@@ -19,7 +19,7 @@ from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.linear.petsc_options import Value
 from lyra_petsc.linear.presets import DIRECT_UNTIL, PRESETS
 from lyra_petsc.scene.block import Block, attributes, summary
-from lyra_petsc.scene.materials.library import ClothTable, entries, names
+from lyra_petsc.scene.materials.library import ClothTable, library_entries, material_names
 from lyra_petsc.scene.schema import FIELDS, Scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -129,9 +129,9 @@ def scene_page() -> str:
         *(_block_section(block, where) for block, where in _blocks()),
         "## Names of `material.cloth`",
         "Cloths, most of them measured by Wang, O'Brien and Ramamoorthi (2011): "
-        + _listed(name for name in names() if isinstance(entries()[name], ClothTable))
+        + _listed(name for name in material_names() if isinstance(library_entries()[name], ClothTable))
         + ".\n\nEngineering materials: "
-        + _listed(name for name in names() if not isinstance(entries()[name], ClothTable))
+        + _listed(name for name in material_names() if not isinstance(library_entries()[name], ClothTable))
         + ".\n\nTheir numbers are in `lyra_petsc/scene/materials/`.",
         "## Names of `output.fields`",
         _listed(FIELDS) + ".",

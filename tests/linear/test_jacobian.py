@@ -48,7 +48,7 @@ def bent_state(simulation: Simulation) -> tuple[Array, Array]:
         x=(x + rng.uniform(-0.04, 0.04, (n, 3))) @ rotation([1, 1, 0], 0.3).T, v=rng.uniform(-1, 1, (n, 3))
     )
     simulation.system.begin_step(0.0, DT)
-    original = simulation.problem.points.original
+    original = simulation.problem.points.mesh_vertices
     iterate, direction = rng.uniform(-1, 1, (n, 3)), rng.uniform(-1, 1, (n, 3))
     return iterate[original], direction[original]
 

@@ -22,7 +22,7 @@ def couplings(mesh: dict[str, Any], comm: MPI.Comm, **more: Any) -> set[tuple[in
     with Simulation({"mesh": mesh} | more, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         mesh_number = np.empty(points.n_global, dtype=np.int64)
-        for start, original in comm.allgather((points.start, points.original)):
+        for start, original in comm.allgather((points.start, points.mesh_vertices)):
             mesh_number[start : start + len(original)] = original
         local = mesh_number[points.global_number]
         rows, columns = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import grid_sheet
-from lyra_petsc.mesh.distribute import Part, Whole, distribute, split_elements
+from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute, split_elements
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, vertex_graph
 from lyra_petsc.mesh.points import Numbering, Points
@@ -24,13 +24,13 @@ pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 SIZES = [(1, 1), (2, 1), (7, 5), (20, 20)]
 
 
-def whole_of(triangles: Ints, n_vertices: int) -> Whole:
+def whole_of(triangles: Ints, n_vertices: int) -> GlobalMesh:
     elements = {"triangles": Elements(triangles, {"number": np.arange(len(triangles), dtype=float)})}
     quads = hinges(triangles).vertices
     elements["hinges"] = Elements(quads, {"number": np.arange(len(quads), dtype=float)})
     elements["some"] = Elements(np.array([[0], [n_vertices - 1]]))
     elements["none"] = Elements(np.empty((0, 2), dtype=np.int64))
-    return Whole(n_vertices, triangles, elements, {"number": np.arange(n_vertices, dtype=float)})
+    return GlobalMesh(n_vertices, triangles, elements, {"number": np.arange(n_vertices, dtype=float)})
 
 
 def meshes() -> list[tuple[Ints, int]]:
@@ -51,34 +51,34 @@ def mesh(request: pytest.FixtureRequest) -> tuple[Ints, int]:
 
 
 @pytest.fixture
-def part(comm: MPI.Comm, mesh: tuple[Ints, int]) -> Part:
+def part(comm: MPI.Comm, mesh: tuple[Ints, int]) -> LocalMesh:
     return distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)
 
 
 def test_every_vertex_has_one_owner_and_contiguous_numbers(
-    comm: MPI.Comm, mesh: tuple[Ints, int], part: Part
+    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
 ) -> None:
     points = part.layout
-    originals = np.concatenate(comm.allgather(points.original))
+    originals = np.concatenate(comm.allgather(points.mesh_vertices))
     np.testing.assert_array_equal(np.sort(originals), np.arange(mesh[1]))
-    assert points.n_owned == len(points.original) == points.bounds[comm.rank + 1] - points.start
+    assert points.n_owned == len(points.mesh_vertices) == points.bounds[comm.rank + 1] - points.start
     assert points.bounds[0] == 0
     assert points.bounds[-1] == points.n_global == mesh[1]
     # where no elements couple edges all rows are vertices
     assert (points.n_vertices, points.n_vertices_global) == (points.n_owned, points.n_global)
     assert points.n_edges == points.n_edges_global == len(points.edges) == len(points.padding) == 0
-    np.testing.assert_array_equal(part.vertex_data["number"], points.original)
+    np.testing.assert_array_equal(part.vertex_data["number"], points.mesh_vertices)
 
 
 def test_a_rank_has_every_element_that_touches_what_it_owns(
-    comm: MPI.Comm, mesh: tuple[Ints, int], part: Part
+    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
 ) -> None:
     triangles, n_vertices = mesh
     whole = whole_of(triangles, n_vertices)
     mine = np.zeros(n_vertices, dtype=bool)
-    mine[part.layout.original] = True
+    mine[part.layout.mesh_vertices] = True
     numbers = np.empty(part.layout.n_global, dtype=np.int64)  # mesh index of each global number
-    for start, original in comm.allgather((part.layout.start, part.layout.original)):
+    for start, original in comm.allgather((part.layout.start, part.layout.mesh_vertices)):
         numbers[start : start + len(original)] = original
     for name, elements in part.elements.items():
         expected = np.flatnonzero(mine[whole.elements[name].stencil].any(axis=1))
@@ -90,14 +90,16 @@ def test_a_rank_has_every_element_that_touches_what_it_owns(
             np.testing.assert_array_equal(elements.data["number"], elements.index)
 
 
-def test_every_element_is_counted_on_one_rank(comm: MPI.Comm, mesh: tuple[Ints, int], part: Part) -> None:
+def test_every_element_is_counted_on_one_rank(
+    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
+) -> None:
     whole = whole_of(*mesh)
     for name, elements in part.elements.items():
         counted = np.concatenate(comm.allgather(elements.index[: elements.n_owned]))
         np.testing.assert_array_equal(np.sort(counted), np.arange(len(whole.elements[name].stencil)))
 
 
-def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Comm, part: Part) -> None:
+def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Comm, part: LocalMesh) -> None:
     points = part.layout
     touched = np.unique(np.concatenate([e.stencil.ravel() for e in part.elements.values()]))
     ghosts = touched[touched >= points.n_owned]
@@ -110,7 +112,7 @@ def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Co
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_owners_get_the_sum_of_what_ranks_have(comm: MPI.Comm, part: Part, kind: type) -> None:
+def test_owners_get_the_sum_of_what_ranks_have(comm: MPI.Comm, part: LocalMesh, kind: type) -> None:
     points = part.layout
     values = np.ones((points.n_local, 3), dtype=kind)
     values[:, 1] = comm.rank
@@ -134,18 +136,18 @@ def test_a_large_mesh_is_cut_evenly_with_few_ghosts(comm: MPI.Comm) -> None:
     assert len(part.layout.ghosts) <= (0 if comm.size == 1 else 4 * 41)
 
 
-def layers() -> Whole:
+def layers() -> GlobalMesh:
     """Four square sheets, 0.01 apart."""
     triangles, n = square(12, 12)
     flat = grid_sheet(Grid(width=1, height=1, nx=12, ny=12, pattern="alternating")).points
     whole = whole_of(np.concatenate([triangles + n * layer for layer in range(4)]), 4 * n)
-    whole.places = np.concatenate([flat + [0.0, 0.0, 0.01 * layer] for layer in range(4)])
+    whole.positions = np.concatenate([flat + [0.0, 0.0, 0.01 * layer] for layer in range(4)])
     return whole
 
 
 def test_sheets_that_lie_on_each_other_are_cut_through_all(comm: MPI.Comm) -> None:
     part = distribute(comm, layers() if comm.rank == 0 else None)
-    layer = part.layout.original // 169
+    layer = part.layout.mesh_vertices // 169
     share = np.bincount(layer, minlength=4) / 169.0
     assert np.abs(share - 1.0 / comm.size).max() < 13.0 / 169.0  # to a row of vertices
 
@@ -200,7 +202,7 @@ def test_split_counts_an_element_where_its_first_point_is_owned() -> None:
     assert split[1][0][0] == 1  # what a rank counts comes first
 
 
-def with_edges(triangles: Ints, n_vertices: int) -> Whole:
+def with_edges(triangles: Ints, n_vertices: int) -> GlobalMesh:
     """The mesh with an unknown on every other interior edge, coupled to the four vertices of its hinge."""
     quads = hinges(triangles).vertices[::2]
     edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
@@ -213,26 +215,26 @@ def with_edges(triangles: Ints, n_vertices: int) -> Whole:
 
 
 @pytest.fixture
-def mixed(comm: MPI.Comm, mesh: tuple[Ints, int]) -> Part:
+def mixed(comm: MPI.Comm, mesh: tuple[Ints, int]) -> LocalMesh:
     return distribute(comm, with_edges(*mesh) if comm.rank == 0 else None)
 
 
-def test_rows_of_vertices_and_of_edges(comm: MPI.Comm, mesh: tuple[Ints, int], mixed: Part) -> None:
+def test_rows_of_vertices_and_of_edges(comm: MPI.Comm, mesh: tuple[Ints, int], mixed: LocalMesh) -> None:
     layout, whole = mixed.layout, with_edges(*mesh)
     indices = whole.elements["angles"].edges
     assert indices is not None
     n_edges = len(np.unique(indices))
     assert (layout.n_vertices_global, layout.n_edges_global) == (mesh[1], n_edges)
     # every vertex, and every edge that carries an unknown, once
-    for own, count in ((layout.original, mesh[1]), (layout.edges, n_edges)):
+    for own, count in ((layout.mesh_vertices, mesh[1]), (layout.edges, n_edges)):
         np.testing.assert_array_equal(np.sort(np.concatenate(comm.allgather(own))), np.arange(count))
     assert layout.n_owned == layout.n_vertices + -(-layout.n_edges // 3)
     # a rank's rows are contiguous: its vertices, its edges, and what is left of the last row
     vertices = np.arange(3 * layout.n_vertices)
-    places = np.concatenate([vertices, layout.edge_places, layout.padding])
+    places = np.concatenate([vertices, layout.edge_indices, layout.padding])
     np.testing.assert_array_equal(places, np.arange(3 * layout.n_owned))
     assert len(layout.padding) < 3
-    np.testing.assert_array_equal(mixed.vertex_data["number"], layout.original)
+    np.testing.assert_array_equal(mixed.vertex_data["number"], layout.mesh_vertices)
     numbers = np.arange(layout.n_global)
     assert np.count_nonzero(layout.are_vertices(numbers)) == mesh[1]
     own = layout.start + np.arange(layout.n_owned)
@@ -245,7 +247,7 @@ def test_rows_of_vertices_and_of_edges(comm: MPI.Comm, mesh: tuple[Ints, int], m
 
 
 def test_elements_find_the_unknowns_of_their_edges(
-    comm: MPI.Comm, mesh: tuple[Ints, int], mixed: Part
+    comm: MPI.Comm, mesh: tuple[Ints, int], mixed: LocalMesh
 ) -> None:
     layout, whole = mixed.layout, with_edges(*mesh)
     indices = whole.elements["angles"].edges
@@ -253,8 +255,8 @@ def test_elements_find_the_unknowns_of_their_edges(
     assert whole.edges is not None
     carrying = np.unique(indices)
     # every row holds what it stands for: a vertex its number in the mesh, an edge its index
-    vertices = np.repeat(layout.original[:, None], 3, axis=1).astype(float)
-    owned = layout.joined(vertices, carrying[layout.edges].astype(float))
+    vertices = np.repeat(layout.mesh_vertices[:, None], 3, axis=1).astype(float)
+    owned = layout.join(vertices, carrying[layout.edges].astype(float))
     found = layout.split(owned)
     np.testing.assert_array_equal(found[0], vertices)
     np.testing.assert_array_equal(found[1], carrying[layout.edges])
@@ -262,7 +264,7 @@ def test_elements_find_the_unknowns_of_their_edges(
     values[: layout.n_owned] = owned
     layout.update_ghosts(values)
     mine = np.zeros(mesh[1], dtype=bool)
-    mine[layout.original] = True
+    mine[layout.mesh_vertices] = True
     my_edges = np.zeros(len(whole.edges), dtype=bool)
     my_edges[carrying[layout.edges]] = True
     for name, elements in mixed.elements.items():
@@ -279,7 +281,7 @@ def test_elements_find_the_unknowns_of_their_edges(
         np.testing.assert_array_equal(np.sort(counted), np.arange(len(of_mesh.stencil)))
 
 
-def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: Part) -> None:
+def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: LocalMesh) -> None:
     layout = part.layout
     others = np.setdiff1d(np.arange(layout.n_global), layout.global_number)[::2]
     more = layout.with_ghosts(others)
@@ -313,8 +315,8 @@ def test_a_constant_that_is_one_number_takes_no_memory() -> None:
     data = {"same": np.full(4, 0.3), "other": np.arange(4.0), "wide": np.ones((4, 2))}
     elements = Elements(stencil, data)
     for name in (*data, "missing"):
-        assert elements.once(name).data.keys() == data.keys()
-    assert elements.once("other") is elements.once("wide") is elements.once("missing") is elements
-    once = elements.once("same").data["same"]
+        assert elements.compress(name).data.keys() == data.keys()
+    assert elements.compress("other") is elements.compress("wide") is elements.compress("missing") is elements
+    once = elements.compress("same").data["same"]
     assert once.strides == (0,)
     np.testing.assert_array_equal(once, data["same"])

@@ -174,7 +174,7 @@ def test_it_is_said_what_gmsh_does_where_it_takes_long(script: Path, monkeypatch
     monkeypatch.setattr(geo_file, "LONGEST_SILENCE", 0.1)
     script.write_text(SQUARE)
     said: list[str] = []
-    geo_file.mesh_geo(script, 0.006, tell=said.append)
+    geo_file.mesh_geo(script, 0.006, report=said.append)
     assert said[0].startswith("script.geo: gmsh is ")
     assert any("gmsh is meshing, roughly 60,000 triangles, " in line for line in said)
 

@@ -14,7 +14,7 @@ from mesh_sources import mesh_of
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import geo_file as geo
 from lyra_petsc.mesh.geo_script import check_script
-from lyra_petsc.mesh.gmsh_fence import standing
+from lyra_petsc.mesh.gmsh_sandbox import supported_layers
 
 SQUARE = """
 Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
@@ -225,7 +225,7 @@ def test_a_trusted_script_may_say_what_it_likes_within_what_the_kernel_lets_it(t
     script.write_text(f'{SQUARE}a = Str("x");\nPrintf("note") > "mark";\nSystemCall "touch called";\n')
     with pytest.raises(InputError, match="writes files"):
         mesh_of(script)
-    sheet = geo.mesh_geo(script, 0.3, trusted=True) if "seccomp" not in standing() else None
+    sheet = geo.mesh_geo(script, 0.3, trusted=True) if "seccomp" not in supported_layers() else None
     if sheet is None:
         with suppress(InputError):  # gmsh complains of what it cannot write
             geo.mesh_geo(script, 0.3, trusted=True)
@@ -238,9 +238,9 @@ def test_a_trusted_script_may_say_what_it_likes_within_what_the_kernel_lets_it(t
 
 ATTEMPTS = """
 import os, resource, socket, subprocess, sys, threading
-from lyra_petsc.mesh.gmsh_fence import raise_fence
+from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
 written = open("before", "w")
-stands = raise_fence([os.getcwd(), "/usr", sys.prefix])
+stands = enter_sandbox([os.getcwd(), "/usr", sys.prefix])
 def outcome(work):
     try:
         return work()
@@ -267,7 +267,7 @@ written.write("still open")
 """
 
 
-@pytest.mark.skipif("seccomp" not in standing(), reason="the kernel has no seccomp for us")
+@pytest.mark.skipif("seccomp" not in supported_layers(), reason="the kernel has no seccomp for us")
 def test_the_kernel_holds_back_what_gmsh_does_not_need(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     told = subprocess.run(

@@ -10,8 +10,8 @@ from mesh_sources import Transform, grid_mesh, obj_mesh, rest_areas, turn
 
 from lyra_petsc.mesh.measures import (
     bounding_diagonal,
-    lay_out,
     mean_edge_length,
+    plane_coordinates,
     rest_matrices,
 )
 
@@ -64,7 +64,7 @@ def test_clockwise_sheet_keeps_its_material_axes(tmp_path: Path) -> None:
 def test_layout_of_a_turned_sheet_keeps_its_metric(degrees: float) -> None:
     flat = grid_mesh(nx=3, ny=2)
     mesh = grid_mesh(Transform(rotate=turn((0.3, -1, 0.2), degrees)), nx=3, ny=2)
-    uv = lay_out(mesh.positions, mesh.triangles)
+    uv = plane_coordinates(mesh.positions, mesh.triangles)
     lengths = [np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) for c in (uv, flat.triangle_uv)]
     assert np.allclose(*lengths)
     # continuous over a flat sheet: each vertex has one place
@@ -75,9 +75,9 @@ def test_layout_of_a_turned_sheet_keeps_its_metric(degrees: float) -> None:
 
 def test_layout_axes() -> None:
     triangle = np.array([[0, 1, 2]])
-    upright = lay_out(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), triangle)
+    upright = plane_coordinates(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), triangle)
     assert upright[0].tolist() == [[0, 0], [1, 0], [0, 1]]
-    across = lay_out(np.array([[5.0, 0, 0], [5, 2, 0], [5, 0, 3]]), triangle)
+    across = plane_coordinates(np.array([[5.0, 0, 0], [5, 2, 0], [5, 0, 3]]), triangle)
     assert across[0].tolist() == [[0, 0], [2, 0], [0, 3]]
-    sloping = lay_out(np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, 0]]), triangle)
+    sloping = plane_coordinates(np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, 0]]), triangle)
     assert np.allclose(sloping[0], [[0, 0], [np.sqrt(2), 0], [0, 1]])

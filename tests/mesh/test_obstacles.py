@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.obstacles import Container, Solid, obstacles_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import scene_of
@@ -67,7 +67,7 @@ def scene(obstacle: dict[str, Any], **more: Any) -> Scene:
 
 def built(comm: MPI.Comm, obstacle: dict[str, Any], **more: Any) -> Solid | Container:
     whole = scene(obstacle, **more)
-    mesh = on_root(comm, lambda: mesh_of(whole), share=False)
+    mesh = on_root(comm, lambda: build_scene_mesh(whole), share=False)
     (one,) = obstacles_of(comm, whole, mesh, Motion)
     return one
 

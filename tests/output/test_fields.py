@@ -32,7 +32,7 @@ def test_curvature_of_a_cylinder(sign: float) -> None:
         angle = flat[:, 0] / radius
         bent = np.column_stack([radius * np.sin(angle), flat[:, 1], sign * radius * (1.0 - np.cos(angle))])
         simulation.set_state(x=bent)
-        original = simulation.problem.points.original
+        original = simulation.problem.points.mesh_vertices
         inside = (np.abs(flat[original, :2] - 0.5) < 0.45).all(axis=1)
         curvature = value(simulation, "curvature")[inside]
     # curling towards the normal (+z) counts as positive
@@ -59,7 +59,7 @@ def test_energy_densities_add_up() -> None:
         total = value(simulation, "membrane_energy") @ area
         assert total == pytest.approx(simulation.energy("membrane"))
         vertex_area = simulation.mass / 0.2
-        bending = value(simulation, "bending_energy") @ vertex_area[simulation.problem.points.original]
+        bending = value(simulation, "bending_energy") @ vertex_area[simulation.problem.points.mesh_vertices]
         assert bending == pytest.approx(simulation.energy("bending"))
 
 

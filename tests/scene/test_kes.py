@@ -9,7 +9,7 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import scene_of
-from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve_material
 from lyra_petsc.scene.text import parse_yaml
 
 pytestmark = pytest.mark.quick
@@ -22,7 +22,7 @@ REPORT = {"B": 0.1, "2HB": 0.05, "G": 0.6, "2HG": 1.5}
 
 
 def shell_of(**keys: Any) -> ShellMaterial:
-    return resolve(scene_of(SCENE | {"material": keys}).material[0])[0]
+    return resolve_material(scene_of(SCENE | {"material": keys}).material[0])[0]
 
 
 @pytest.mark.parametrize("model", ["hinge", "midedge"])

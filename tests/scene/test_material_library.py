@@ -12,10 +12,10 @@ from lyra_petsc.scene.materials.library import (
     PROJECTION_FLOOR,
     ClothTable,
     ShellMaterial,
-    entries,
-    names,
-    of_table,
-    resolve,
+    library_entries,
+    material_names,
+    resolve_material,
+    shell_of_table,
 )
 from lyra_petsc.scene.schema import Material
 
@@ -27,18 +27,18 @@ WANG_2011 = {
 
 
 def shell(**keys: object) -> ShellMaterial:
-    return resolve(Material.model_validate(keys))[0]
+    return resolve_material(Material.model_validate(keys))[0]
 
 
 def test_the_twelve_and_the_original_are_there() -> None:
-    assert set(names()) >= WANG_2011 | {"isotropic"}
-    assert sum(isinstance(entry, ClothTable) for entry in entries().values()) == 13
-    assert len(names()) == len(set(names()))
+    assert set(material_names()) >= WANG_2011 | {"isotropic"}
+    assert sum(isinstance(entry, ClothTable) for entry in library_entries().values()) == 13
+    assert len(material_names()) == len(set(material_names()))
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", material_names())
 def test_every_material_can_be_simulated(name: str) -> None:
-    material, notes = resolve(Material(cloth=name))
+    material, notes = resolve_material(Material(cloth=name))
     assert material.density > 0
     assert material.c33 > 0
     c = np.array([[material.c11, material.c12], [material.c12, material.c22]])
@@ -70,7 +70,7 @@ def test_isotropic_of_the_original() -> None:
 
 
 def test_indefinite_cloth_is_projected() -> None:
-    material, (note,) = resolve(Material(cloth="navy-sparkle-sweat"))
+    material, (note,) = resolve_material(Material(cloth="navy-sparkle-sweat"))
     measured = 2 * np.array([[12.486332, -19.875324], [-19.875324, 3.272434]])
     values, vectors = np.linalg.eigh(measured)
     assert values[0] < 0
@@ -84,7 +84,7 @@ def test_indefinite_cloth_is_projected() -> None:
 
 def test_projection_leaves_definite_tables_alone() -> None:
     table = ClothTable(0.1, 3.0, -1.0, 2.0, 1.0, (4.0, 8.0, 12.0))
-    material, notes = of_table(table, "x")
+    material, notes = shell_of_table(table, "x")
     assert (material.c11, material.c12, material.c22, material.c33) == (6.0, -2.0, 4.0, 1.0)
     assert material.bending == (1.0, 2.0, 3.0)
     assert notes == []

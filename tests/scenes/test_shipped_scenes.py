@@ -156,7 +156,7 @@ def test_twisted_strip_has_turned_by_half_in_the_middle() -> None:
     settings = ("mesh.grid.nx=50", "mesh.grid.ny=6", "time.step=0.02", "output.every=2")
     with simulated("twist", *settings) as simulation:
         problem, forces = simulation.problem, simulation.ledger.handle_forces(2)
-        x = problem.system.x[np.argsort(problem.points.original)].reshape(7, 51, 3)
+        x = problem.system.x[np.argsort(problem.points.mesh_vertices)].reshape(7, 51, 3)
     assert np.linalg.norm(x[3, 25, 1:]) < 0.015
     assert x[6, 25, 1] < -0.02 < 0.02 < x[0, 25, 1]
     np.testing.assert_allclose(forces[0], -forces[1], atol=0.02 * abs(forces[0][0]))

@@ -31,7 +31,7 @@ from tables import (
 
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.scene.materials.library import resolve
+from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -214,7 +214,7 @@ def test_files_for_peers_are_the_scene(tmp_path):
     np.testing.assert_array_equal(meshes[0].positions, meshes[1].positions)
     np.testing.assert_array_equal(meshes[0].triangles, meshes[1].triangles)
     np.testing.assert_array_equal(meshes[0].triangle_uv, meshes[1].triangle_uv)
-    (shell, _), (expected, _) = resolve(theirs.material[0]), resolve(ours.material[0])
+    (shell, _), (expected, _) = resolve_material(theirs.material[0]), resolve_material(ours.material[0])
     for name in ("density", "c11", "c22", "c33", "bending"):
         assert getattr(shell, name) == pytest.approx(getattr(expected, name)), name
     assert shell.c12 == 0.0  # as the original has it

@@ -31,7 +31,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
     way = np.zeros_like(system.history)
     way[:n] = angle * np.cross(AXIS, system.x[:n])
     for term in system.active.edged:
-        places = term.edge_places
+        places = term.edge_indices
         own = places < way.size
         way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.tangent @ AXIS))[own]
     return system.velocity_of_staying(), way / system.stage.reach

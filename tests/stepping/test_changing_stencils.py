@@ -66,7 +66,7 @@ def momentum(simulation: SteppedScene) -> Array:
     """(3,) [kg m/s]."""
     system = simulation.problem.system
     n = system.points.n_owned
-    return np.asarray(system.points.summed(*(system.mass @ system.v[:n])))
+    return np.asarray(system.points.global_sum(*(system.mass @ system.v[:n])))
 
 
 def flown(
@@ -96,7 +96,7 @@ def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
         term.add_gradient(system.x, None, force)
         own = force[: system.points.n_owned]
         largest = comm.allreduce(float(np.abs(own).max(initial=0.0)), MPI.MAX)
-        total = np.asarray(system.points.summed(*own.sum(axis=0)))
+        total = np.asarray(system.points.global_sum(*own.sum(axis=0)))
         assert np.abs(total).max() <= 1e-13 * max(largest, 1e-3)
         assert np.abs(momentum(simulation) - before).max() < 1e-9
 
@@ -186,7 +186,7 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
         force = np.zeros((system.points.n_local, 3))
         term_of(simulation).add_gradient(system.x, None, force)
         upper = system.x[: system.points.n_owned, 2] > 0.01
-        (carried,) = system.points.summed(float(-force[: system.points.n_owned][upper, 2].sum()))
+        (carried,) = system.points.global_sum(float(-force[: system.points.n_owned][upper, 2].sum()))
         assert carried == pytest.approx(3.0, rel=1e-6)
 
 
@@ -260,7 +260,7 @@ def test_derivatives(comm: MPI.Comm) -> None:
     rng = np.random.default_rng(2)
     random = rng.standard_normal((layout.n_vertices_global, 3))
     way = np.zeros((layout.n_local, 3))
-    way[: layout.n_owned] = random[layout.original]
+    way[: layout.n_owned] = random[layout.mesh_vertices]
     layout.update_ghosts(way)
     x, n, h = system.x.copy(), layout.n_owned, 1e-6
 

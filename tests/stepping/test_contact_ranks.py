@@ -198,7 +198,7 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
         simulation = SteppedScene(ranks, scene_of(content))
         system, points = simulation.problem.system, simulation.problem.points
         n, v = points.n_owned, system.v[: points.n_owned].copy()
-        v[:, 2] = np.where(points.original < 13 * 13, 10.0, -10.0)
+        v[:, 2] = np.where(points.mesh_vertices < 13 * 13, 10.0, -10.0)
         system.state.set(system.x[:n], v)
         simulation.stepper.start(0.0, 0)
         simulation.ledger = Ledger(system)
@@ -216,7 +216,7 @@ def test_only_what_is_near_and_fast_collides(comm: MPI.Comm) -> None:
     """Towards the floor, and towards each other."""
     with Simulation(falling(0.02), comm) as simulation:
         system, n = simulation.problem.system, simulation.problem.points.n_owned
-        lower = (simulation.problem.points.original < 4)[:, None]
+        lower = (simulation.problem.points.mesh_vertices < 4)[:, None]
 
         def collides(first: float, second: float) -> bool:
             system.state.set(system.x[:n], np.where(lower, first, second) * [0.0, 0.0, 1.0])

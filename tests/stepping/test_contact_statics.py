@@ -13,7 +13,7 @@ from physics import gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.start_crossings import overlaps_of
+from lyra_petsc.mesh.start_crossings import find_overlaps
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier
@@ -61,7 +61,7 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
         found = len(self_crossings(x, triangles))
         for one in term.obstacles.each:  # type: ignore[attr-defined]
             is_box = "box" in scene["obstacles"][one.name]
-            found += sum(map(len, overlaps_of(one, x, triangles, 1.0, is_box=is_box)))
+            found += sum(map(len, find_overlaps(one, x, triangles, 1.0, is_box=is_box)))
         return found
 
     assert on_root(comm, crossings) == 0
@@ -189,7 +189,7 @@ def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
     # the forces with the friction that the normal forces in the equilibrium allow
     system, end = simulation.problem.system, simulation.time
     system.begin_step(end, end + 1e-9)
-    left = system.points.summed(float(np.sum(system.out_of_balance()[0] ** 2)))[0] ** 0.5
+    left = system.points.global_sum(float(np.sum(system.out_of_balance()[0] ** 2)))[0] ** 0.5
     simulation.destroy()
     assert left < 1e-3 * weight
     assert torque < -1e-3 * weight

@@ -69,7 +69,7 @@ def pushed(vertex: int, value: float) -> Spoil:
     """Put a force that nothing balances on one vertex of the mesh."""
 
     def spoil(simulation: SteppedScene, out: Array) -> None:
-        out[simulation.problem.points.original == vertex] = value
+        out[simulation.problem.points.mesh_vertices == vertex] = value
 
     return spoil
 

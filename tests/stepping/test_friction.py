@@ -53,9 +53,9 @@ def on_slope(
     start = system.x[:n].copy()
     while not simulation.finished:
         simulation.step()
-    mass = system.points.summed(float(system.mass.sum()))[0]
+    mass = system.points.global_sum(float(system.mass.sum()))[0]
     way, speed = (
-        float(system.points.summed(float(system.mass @ (values @ DOWN)))[0]) / mass
+        float(system.points.global_sum(float(system.mass @ (values @ DOWN)))[0]) / mass
         for values in (system.x[:n] - start, system.v[:n])
     )
     force = simulation.ledger.obstacle_forces(1)[0]
@@ -120,11 +120,11 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     }
     simulation = SteppedScene(comm, scene_of(content))
     system, ways = simulation.problem.system, []
-    weight = system.points.summed(float(system.mass.sum()))[0]
+    weight = system.points.global_sum(float(system.mass.sum()))[0]
     for time in (2.8, 3.3):
         while simulation.time < time - 0.005:
             simulation.step()
-        middle = system.points.summed(*(float(system.mass @ x) for x in system.x[: len(system.mass)].T))
+        middle = system.points.global_sum(*(float(system.mass @ x) for x in system.x[: len(system.mass)].T))
         ways.append(math.hypot(middle[0], middle[2]) / weight)
     simulation.destroy()
     assert ways[0] < 0.01
@@ -298,7 +298,7 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     friction, end, begin = 0.8 * math.tan(SLOPE), 0.5, 0.2
     simulation = SteppedScene(comm, scene_of(on_a_sheet(friction, integrator, end)))
     system, layout = simulation.problem.system, simulation.problem.points
-    upper = np.where(layout.original >= 25 * 7, system.mass[: layout.n_vertices], 0.0)
+    upper = np.where(layout.mesh_vertices >= 25 * 7, system.mass[: layout.n_vertices], 0.0)
     mass = comm.allreduce(float(upper.sum()))
     speeds, times = [], []
     while not simulation.finished:
@@ -325,7 +325,7 @@ def test_sheets_that_rub_keep_their_angular_momentum(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(content))
     system, layout = simulation.problem.system, simulation.problem.points
     n = layout.n_vertices
-    below = (layout.original < low)[:, None]
+    below = (layout.mesh_vertices < low)[:, None]
     spin = np.cross(np.where(below, [0.0, 0.0, 8.0], [0.0, 0.0, -8.0]), system.x[:n] - 0.5 * side)
     system.v[:n] = np.where(below, [0.4, 0.0, 2.0], [0.0, 0.0, -2.0]) + spin
     layout.update_ghosts(system.v)

@@ -44,7 +44,7 @@ def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float,
         taken = simulation.step()
         impulse -= taken.dt * float(simulation.ledger.obstacle_forces(1)[0, 2])
     own = float(system.mass.sum()), float(system.mass @ system.v[:n, 2])
-    mass, momentum = (float(value) for value in system.points.summed(*own))
+    mass, momentum = (float(value) for value in system.points.global_sum(*own))
     budget = simulation.budget
     simulation.destroy()
     floor = SPEED if floor_moves else 0.0

@@ -129,7 +129,7 @@ def test_handles_are_where_their_motion_says(integrator: str, comm: MPI.Comm) ->
         simulation.run(0.05, 5)
         held = simulation.system.held
         points = simulation.problem.points
-        goal = start[points.original].copy()
+        goal = start[points.mesh_vertices].copy()
         simulation.system.prescribed.targets(simulation.time, simulation.time, simulation.time, goal)
         for number in held.active(simulation.time, simulation.time):
             rows = held.vertices(number)

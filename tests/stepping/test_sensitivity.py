@@ -157,7 +157,7 @@ def end(scene: Scene) -> Array:
     with finished(MPI.COMM_WORLD, scene) as simulation:
         points = simulation.problem.points
         x: Array = simulation.problem.system.x[: points.n_vertices].copy()
-        order = np.argsort(points.original)
+        order = np.argsort(points.mesh_vertices)
     return x[order]
 
 
@@ -169,7 +169,7 @@ def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
     while not simulation.finished:
         beside.step()
     points = simulation.problem.points
-    order = np.argsort(points.original)
+    order = np.argsort(points.mesh_vertices)
     found = {
         number.key: number.value * tangent.x[: points.n_vertices][order]
         for number, tangent in zip(chosen, beside.tangents, strict=True)
@@ -241,7 +241,7 @@ def test_any_number_of_ranks() -> None:
         beside.step()
     points = simulation.problem.points
     squares = [np.sum(tangent.x[: points.n_vertices] ** 2) for tangent in beside.tangents]
-    norms = np.sqrt(points.summed(*map(float, squares)))
+    norms = np.sqrt(points.global_sum(*map(float, squares)))
     beside.destroy()
     simulation.destroy()
     # of one rank
@@ -259,7 +259,7 @@ def test_number_at_its_least() -> None:
     while not simulation.finished:
         beside.step()
     points = simulation.problem.points
-    slope = beside.tangents[0].x[: points.n_vertices][np.argsort(points.original)]
+    slope = beside.tangents[0].x[: points.n_vertices][np.argsort(points.mesh_vertices)]
     beside.destroy()
     simulation.destroy()
 

@@ -44,7 +44,7 @@ def test_positions_are_as_near_as_asked(
     while not asked.finished:
         for values, state in zip(state_of(exact), state_of(asked), strict=True):
             points = exact.problem.points
-            values[: points.n_owned] = gathered(asked.problem.points, state)[points.original]
+            values[: points.n_owned] = gathered(asked.problem.points, state)[points.mesh_vertices]
             points.update_ghosts(values)
         report, beside = asked.step(), exact.step()
         iterations.append((report.newton_iterations, beside.newton_iterations))

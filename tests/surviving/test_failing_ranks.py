@@ -47,7 +47,7 @@ sys.exit(run_command_line(sys.argv))
 """
 
 PLACES = {
-    "meshing": ("stepping.problem", "mesh_of", 0),
+    "meshing": ("stepping.problem", "build_scene_mesh", 0),
     "distributing": ("stepping.problem", "distribute", 0),
     "assembly": ("linear.discretisation", "BlockPattern", 0),
     "residual": ("stepping.stage_equations", "StageEquations.residual", 25),

@@ -19,7 +19,7 @@ from pathlib import Path
 import lyra_petsc.stepping.problem as problem
 from lyra_petsc.cli.app import run_command_line
 
-build = problem.mesh_of
+build = problem.build_scene_mesh
 
 def slow(*arguments, **keywords):
     Path("in-set-up").touch()
@@ -27,7 +27,7 @@ def slow(*arguments, **keywords):
         time.sleep(0.01)
     return build(*arguments, **keywords)
 
-problem.mesh_of = slow
+problem.build_scene_mesh = slow
 sys.exit(run_command_line(sys.argv))
 """
 

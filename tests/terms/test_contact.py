@@ -53,7 +53,7 @@ class Watched:
         self.system = self.simulation.problem.system
         layout = self.system.points
         pieces = comm.allgather(layout.global_number[term.surface])
-        originals = np.concatenate(comm.allgather(layout.original))
+        originals = np.concatenate(comm.allgather(layout.mesh_vertices))
         every = np.unique(np.sort(originals[np.concatenate(pieces)], axis=1), axis=0)
         self.triangles = every.astype(np.int64)
         self.look()
@@ -123,12 +123,12 @@ class Watched:
         self.term.add_gradient(x, system.active.frozen[self.term], force)
         own = -force[: system.points.n_owned]
         largest = self.comm.allreduce(float(np.abs(own).max(initial=0.0)), MPI.MAX)
-        return np.asarray(system.points.summed(*own.sum(axis=0))), largest
+        return np.asarray(system.points.global_sum(*own.sum(axis=0))), largest
 
     @property
     def momentum(self) -> Array:
         n = self.system.points.n_owned
-        return np.asarray(self.system.points.summed(*(self.system.mass @ self.system.v[:n])))
+        return np.asarray(self.system.points.global_sum(*(self.system.mass @ self.system.v[:n])))
 
 
 def toward_each_other(speed: float) -> Callable[[Array], Array]:

@@ -115,9 +115,9 @@ def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> No
         expected = comm.allreduce(float(bracket - lost))
         assert simulation.budget.total - before == pytest.approx(expected, abs=1e-10)
         # a moment on no edge, and none of them has moved by chance
-        of_edges = gradient[:n].ravel()[system.points.edge_places]
+        of_edges = gradient[:n].ravel()[system.points.edge_indices]
         assert comm.allreduce(float(np.abs(of_edges).max(initial=0.0)), MPI.MAX) < 1e-8
-        angles = system.x[:n].ravel()[system.points.edge_places]
+        angles = system.x[:n].ravel()[system.points.edge_indices]
         assert comm.allreduce(float(np.abs(angles).max(initial=0.0)), MPI.MAX) > 1e-5
     simulation.destroy()
 
@@ -132,10 +132,10 @@ def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
 
     def local(seed: int, size: float) -> Array:
         random = np.random.default_rng(seed)
-        on_vertices = size * random.uniform(-1, 1, (layout.n_vertices_global, 3))[layout.original]
+        on_vertices = size * random.uniform(-1, 1, (layout.n_vertices_global, 3))[layout.mesh_vertices]
         on_edges = size * random.uniform(-1, 1, layout.n_edges_global)[layout.edges]
         out = np.zeros((layout.n_local, 3))
-        out[: layout.n_owned] = layout.joined(on_vertices, on_edges)
+        out[: layout.n_owned] = layout.join(on_vertices, on_edges)
         layout.update_ghosts(out)
         return out
 
@@ -188,7 +188,7 @@ def test_a_run_goes_on_with_other_ranks(
 def test_without_it_there_are_no_unknowns_but_the_vertices(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SCENE))
     layout = simulation.problem.points
-    assert layout.n_owned == layout.n_vertices == len(layout.original)
+    assert layout.n_owned == layout.n_vertices == len(layout.mesh_vertices)
     assert len(layout.padding) == len(layout.edges) == layout.n_edges_global == 0
     assert simulation.stepper.velocity.getSize() == 3 * layout.n_vertices_global
     simulation.destroy()

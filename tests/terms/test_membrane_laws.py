@@ -19,8 +19,8 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
-from lyra_petsc.scene.materials.library import ShellMaterial, measured, resolve
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.materials.library import ShellMaterial, measured_names, resolve_material
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import LAWS, law_of
 from lyra_petsc.terms.membrane_laws.measured import fit_errors
@@ -38,7 +38,7 @@ CURVES = {
 }
 MATERIALS: list[dict[str, Any]] = [
     {"cloth": "gray-interlock"},
-    *({"cloth": name, "law": "measured", "stretching_scale": 1.7} for name in measured()),
+    *({"cloth": name, "law": "measured", "stretching_scale": 1.7} for name in measured_names()),
     *(SHEET | {"poisson": nu, "law": "neo-hookean"} for nu in (-0.3, 0.0, 0.3, 0.5)),
     {"cloth": "rubber-sheet-1mm", "law": "neo-hookean"},
     {"cloth": "gray-interlock", "law": CURVES, "stretching_scale": 1.7},
@@ -68,7 +68,7 @@ class Law:
 
 
 def shell_of(keys: dict[str, Any]) -> ShellMaterial:
-    return resolve(Material.model_validate(keys))[0]
+    return resolve_material(Material.model_validate(keys))[0]
 
 
 def test_every_law_is_tested() -> None:
@@ -160,7 +160,7 @@ def test_curves_are_met_at_their_points() -> None:
 def test_strains_that_may_be_percent_are_noted() -> None:
     for strain, told in ((1.0, []), (5.0, ["strains up to 5; were they in percent"])):
         law = CURVES | {"shear": [[0.1, 2.0], [strain, 20.0]]}
-        notes = resolve(checked(Material, {"density": 0.2, "law": law}, file=None))[1]
+        notes = resolve_material(validated(Material, {"density": 0.2, "law": law}, file=None))[1]
         assert [words in note for words, note in zip(told, notes, strict=True)] == [True] * len(told)
 
 
@@ -176,7 +176,7 @@ def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
     stored.write_text(dump_scene(loaded))
     (tmp_path / "curves" / "warp.csv").unlink()
     assert load_scene(stored) == loaded
-    assert resolve(loaded.material[0])[0].curves[0] == ((0.0, 0.0), (0.01, 2.0), (0.03, 10.0))
+    assert resolve_material(loaded.material[0])[0].curves[0] == ((0.0, 0.0), (0.01, 2.0), (0.03, 10.0))
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_curves_that_are_none_are_refused(text: str | None, words: str, tmp_path
 
 def test_fitted_cloths_are_nearer_to_their_tables() -> None:
     errors = fit_errors()
-    assert set(errors) == set(measured())
+    assert set(errors) == set(measured_names())
     for fitted, of_stvk in errors.values():
         assert fitted < of_stvk
     # interlock stretched along the warp by 1/6, by its row of the tables

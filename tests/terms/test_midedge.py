@@ -136,8 +136,8 @@ def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
     }
     with Simulation(content, MPI.COMM_SELF) as simulation:
         term, x = midedge_of(simulation), simulation.system.x.copy()
-        turn = np.radians(degrees) * np.resize([1.0, -1.0, 1.0, 1.0], len(term.edge_places))
-        places, length = term.edge_places, term.of_edges.length
+        turn = np.radians(degrees) * np.resize([1.0, -1.0, 1.0, 1.0], len(term.edge_indices))
+        places, length = term.edge_indices, term.of_edges.length
         x.ravel()[places] = directors_along_normals(term, x) + length * turn
         analytic = gradient(term, x, term.frames)
         numeric = differences(lambda z: term.energies(z, term.frames).sum(), x, 1e-4)
@@ -210,7 +210,7 @@ def test_frames_follow_edges_that_turn_far() -> None:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         x = simulation.system.x.copy()
         x.ravel()[term.of_edges.places] = 0.1 * np.random.default_rng(1).standard_normal(
-            len(term.edge_places)
+            len(term.edge_indices)
         )
         x[:n] = x[:n] @ rotation([0.0, 1.0, 0.0], 2.0).T
         none = np.zeros(x.shape, dtype=bool)
@@ -255,7 +255,7 @@ def test_directors_follow_to_first_order(tmp_path: Path, monkeypatch: pytest.Mon
         random = np.random.default_rng(2)
         x = simulation.system.x.copy()
         x[:n] = (x[:n] + random.uniform(-0.1, 0.1, (n, 3))) @ rotation([1.0, 2.0, 0.5], 0.4).T
-        x.ravel()[term.edge_places] = directors_along_normals(term, x)
+        x.ravel()[term.edge_indices] = directors_along_normals(term, x)
         way, size, apart = random.uniform(-1.0, 1.0, x.shape), 1.0, []
         for _ in range(3):
             size *= 0.01
@@ -605,7 +605,7 @@ def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) ->
             assert np.abs(gradient(term, x, term.frames)).max() < 1e-12
             if number == 0 and degrees != (0, 10):
                 assert np.abs(term.curvatures(x, term.frames)).max() < 1e-12
-            x.ravel()[term.edge_places] = term.anew(x)
+            x.ravel()[term.edge_indices] = term.anew(x)
             assert term.energies(x, term.frames).max() < 1e-24
             tip = np.flatnonzero(np.isclose(x, [1.0, 0.5, 0.0]).all(axis=1))[0]
             stiffness.append(hessian(term, x, term.frames)[tip, 2, tip, 2])

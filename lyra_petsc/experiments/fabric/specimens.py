@@ -10,8 +10,8 @@ from typing import Any
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
-from lyra_petsc.scene.materials.library import ShellMaterial, measured, names, resolve
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.materials.library import ShellMaterial, material_names, measured_names, resolve_material
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.scene.text import parse_yaml
 
@@ -40,7 +40,7 @@ class Fabric:
 
     def shell(self, degrees: float = 0.0) -> ShellMaterial:
         """Its constants, those of directions 1 and 2 exchanged at 90°."""
-        shell = resolve(checked(Material, self.block, file=self.name))[0]
+        shell = resolve_material(validated(Material, self.block, file=self.name))[0]
         return shell if degrees == 0.0 else _exchanged(shell)
 
     def rigidity(self, degrees: float) -> float:
@@ -83,10 +83,10 @@ def fabric_of(material: str, settings: Sequence[str] = ()) -> Fabric:
         Unknown name, a scene that cannot be used.
     """
     path = Path(material)
-    if material in names():
+    if material in material_names():
         data = {
             "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}},
-            "material": {"cloth": material} | ({"law": "measured"} if material in measured() else {}),
+            "material": {"cloth": material} | ({"law": "measured"} if material in measured_names() else {}),
             "time": {"end": 1.0, "step": 1.0},
         }
         scene = scene_of(data)
@@ -96,7 +96,7 @@ def fabric_of(material: str, settings: Sequence[str] = ()) -> Fabric:
         scene = load_scene(path, settings)
     else:
         raise InputError(
-            f"no cloth of the library and no scene file, {nearest(material, names())}", key=material
+            f"no cloth of the library and no scene file, {nearest(material, material_names())}", key=material
         )
     block = dict(parse_yaml(dump_scene(scene), file=path)["material"][0])
     for key in ("group", "rest_curvature"):

@@ -30,7 +30,7 @@ from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose, prese
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.overrides import plain
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import shown
@@ -376,7 +376,7 @@ def gradient(
 def _quantity(quantity: Any) -> Quantity:
     asked = {"probe": quantity} if isinstance(quantity, str) else quantity
     try:
-        return checked(Quantity, asked, file=None, context={"directory": Path.cwd()})
+        return validated(Quantity, asked, file=None, context={"directory": Path.cwd()})
     except InputError as error:
         key = ".".join(part for part in ("quantity", error.key) if part)
         raise InputError(error.message, key=key) from None

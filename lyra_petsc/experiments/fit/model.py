@@ -17,10 +17,10 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import simulated
 from lyra_petsc.experiments.case import Watch
 from lyra_petsc.experiments.fit.readings import SAME_TIME, HandleForce, Reading, instants
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.materials.library import resolve
+from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.terms.registry import active
@@ -95,12 +95,12 @@ class Model:
         self.shape: Array | None = None
         self.runs = 0
         # what terms keep from step to step beside the state, and stencils that change, have no tangents
-        shells = [resolve(block, file=scene.source)[0] for block in scene.material]
+        shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
         entries = active(scene, shells)
         self._remembers = any(entry.neighbours or entry.element_vertices for entry in entries)
 
         def make() -> None:
-            self.mesh = mesh_of(scene)
+            self.mesh = build_scene_mesh(scene)
             count = self.mesh.n_vertices
             for reading in self.readings:
                 wrong = [number for number in reading.vertices if not 0 <= number < count]
@@ -179,7 +179,7 @@ class Model:
                 raise InputError(
                     f"is at {left[0].time:g}, where the run has ended before", key=left[0].readings[0].key
                 )
-            shape = simulation.problem.points.gathered(simulation.problem.system.x)
+            shape = simulation.problem.points.gather(simulation.problem.system.x)
             self.shape = shape if self.comm.rank == 0 else None
             if beside is not None:
                 beside.destroy()

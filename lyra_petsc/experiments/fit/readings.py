@@ -82,7 +82,7 @@ class Places(Reading):
     wanted: list[tuple[str | int, tuple[int, ...]]] = field(default_factory=list)
 
     def _rows(self, problem: Problem) -> list[Ints]:
-        original = problem.points.original
+        original = problem.points.mesh_vertices
         order = np.argsort(original)
         found = []
         for what, _ in self.wanted:

@@ -289,7 +289,7 @@ class Accountant:
         turned = energy_then - self._energy
         mass, size_of_g = system.mass[:, None], float(np.linalg.norm(self._simulation.scene.gravity or 0.0))
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
-         free_way, way, energy_noise, forces, powers, heights) = system.points.summed(
+         free_way, way, energy_noise, forces, powers, heights) = system.points.global_sum(
             0.5 * float(np.sum(mass * v0[:n] ** 2)),
             0.5 * float(np.sum(mass * v1[:n] ** 2)),
             energy_now - energy_then,
@@ -340,7 +340,7 @@ class Accountant:
         system, simulation = self._system, self._simulation
         free = ~system.prescribed.mask[: system.points.n_owned]
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
-        squares = system.points.summed(*(float(np.sum(part**2, where=free)) for part in everything))
+        squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
         floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
         n = len(free)
@@ -427,8 +427,8 @@ class Accountant:
         turned = np.cross(arms, damped[: len(arms)]).sum(axis=0)
         for term, frozen in self._shell.items():
             if isinstance(term, MidEdge):
-                own = np.flatnonzero(term.edge_places < 3 * n)
-                turned += term.moment(damped.ravel()[term.edge_places[own]], own, system.x, frozen)
+                own = np.flatnonzero(term.edge_indices < 3 * n)
+                turned += term.moment(damped.ravel()[term.edge_indices[own]], own, system.x, frozen)
         sums = comm.allreduce(np.concatenate([gap[: len(arms)].sum(axis=0), turned]))
         longest = float(comm.allreduce(float(np.square(arms).sum())))
         noise = EPSILON * forces * dt
@@ -463,7 +463,7 @@ class StageAccountant(Accountant):
         if not any(_in_space(term) for term in self._shell):
             # they push from outside, and cannot be told from the sheet's own forces here
             gap = gap - parts["internal"] - parts.get("damping", 0.0)
-        change, noise, forces, way, *gaps = system.points.summed(
+        change, noise, forces, way, *gaps = system.points.global_sum(
             energy(self._shell, x1) - energy({**self._shell, **self._turned}, x0),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),

@@ -22,8 +22,8 @@ from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Case, Verdict
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.scene.materials.library import resolve
-from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.materials.library import resolve_material
+from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.overrides import apply_overrides
 from lyra_petsc.scene.schema import Material, Scene
 from lyra_petsc.scene.text import parse_yaml
@@ -199,7 +199,7 @@ def setting_of(
     if scene is None:
         data: dict[str, Any] = sheet(CELLS[level])
         overridden = apply_overrides(data, settings)
-        base = checked(Scene, data, file=None, overridden=overridden)
+        base = validated(Scene, data, file=None, overridden=overridden)
     else:
         base = load_scene(scene, settings)
     if base.time.static:
@@ -267,7 +267,7 @@ def anisotropic(content: Content, ratio: float) -> Content:
     """Let c11/c22 be ``ratio``, their geometric mean and the shear stiffness staying, c12 = 0."""
     changed = []
     for block in materials(content):
-        shell, _ = resolve(Material.model_validate(block))
+        shell, _ = resolve_material(Material.model_validate(block))
         mean = (shell.c11 * shell.c22) ** 0.5
         membrane = {"c11": mean * ratio**0.5, "c22": mean / ratio**0.5, "c12": 0.0, "c33": shell.c33}
         kept = {key: block[key] for key in KEPT if key in block}

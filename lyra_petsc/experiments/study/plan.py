@@ -16,7 +16,7 @@ from pathlib import Path
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.experiments.case import Case, load_record
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.scene.load import load_scene
@@ -615,7 +615,7 @@ def _timed(plan: Plan, combination: Combination) -> Combination:
 def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
     """Without ``--vary``: integrators and halved steps (or tolerances); for an equilibrium, meshes."""
     if base.time.static:
-        size = mean_edge_length(mesh_of(base))
+        size = mean_edge_length(build_scene_mesh(base))
         grid = base.mesh[0].grid
         h = float(f"{(grid.width / grid.nx if grid is not None else base.mesh[0].size) or size:.3g}")
         mesh_overrides(base, h)

@@ -45,7 +45,7 @@ from lyra_petsc.experiments.study.plan import (
     overrides,
     scene_of,
 )
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
@@ -164,7 +164,7 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
         raise InputError(error.message, file=error.file, key=key) from None
     axis = plan.axis("mesh")
     for chosen in [[(axis, value)] for value in axis.values] if axis is not None else [[]]:
-        mesh = mesh_of(plan.request.with_changes(overrides(plan.base, chosen)))
+        mesh = build_scene_mesh(plan.request.with_changes(overrides(plan.base, chosen)))
         built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
         if not built.same_as(stored):
             raise InputError(

@@ -196,7 +196,7 @@ def small_motions(trial: Trial) -> SmallMotions:
     matrix.destroy()
     free = ~system.held.mask(trial.simulation.time, trial.simulation.time, n).ravel()
     free[points.padding] = False
-    owned = mine, np.repeat(system.mass, 3), free, points.original
+    owned = mine, np.repeat(system.mass, 3), free, points.mesh_vertices
     stiffness, mass, are_free, original = zip(*points.comm.allgather(owned), strict=True)
     vertices = np.empty((points.n_vertices_global, 3), dtype=np.int64)
     for first, numbers in zip(points.bounds, original, strict=False):

@@ -39,10 +39,10 @@ PROJECTION_FLOOR = 0.01
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
 
-LEAST_FRICTION = 1e-3
+MIN_FRICTION = 1e-3
 """Of warp or weft over that of the other, where that has some."""
 
-LEAST_TWIST = 0.2
+MIN_TWIST = 0.2
 """Least 2 d33 of a measured cloth over √(d11 d22)."""
 
 
@@ -109,7 +109,7 @@ class ShellMaterial:
         d11, d12, d22, d33 = self.plate
         return (d11, d12, 0.0), (d12, d22, 0.0), (0.0, 0.0, d33)
 
-    def bends_by(self, model: str) -> bool:
+    def bends_with(self, model: str) -> bool:
         """Whether it resists bending, by this model."""
         return self.model == model and max(*self.bending, self.plate[0]) > 0.0
 
@@ -145,7 +145,7 @@ def _read(library: str) -> dict[str, Any]:
 
 
 @cache
-def entries() -> dict[str, ClothTable | ShellMaterial]:
+def library_entries() -> dict[str, ClothTable | ShellMaterial]:
     """Every material of every library, by name."""
     found: dict[str, ClothTable | ShellMaterial] = {}
     for library in TABLE_LIBRARIES:
@@ -158,31 +158,31 @@ def entries() -> dict[str, ClothTable | ShellMaterial]:
     for library in ISOTROPIC_LIBRARIES:
         for name, row in _read(library)["isotropic"].items():
             areal = row["density"] * row["thickness"]
-            found[name] = of_isotropic(row["young"], row["poisson"], row["thickness"], areal)
+            found[name] = isotropic_shell(row["young"], row["poisson"], row["thickness"], areal)
     return found
 
 
-def names() -> list[str]:
+def material_names() -> list[str]:
     """The names a scene's ``cloth`` may take, sorted."""
-    return sorted(entries())
+    return sorted(library_entries())
 
 
-def measured() -> list[str]:
+def measured_names() -> list[str]:
     """The names of fabrics whose stiffness was measured at several strains, sorted."""
-    return [name for name in names() if getattr(entries()[name], "measured", False)]
+    return [name for name in material_names() if getattr(library_entries()[name], "measured", False)]
 
 
-def isotropic() -> list[str]:
+def isotropic_names() -> list[str]:
     """The names of engineering materials, sorted."""
-    return [name for name in names() if is_isotropic(name)]
+    return [name for name in material_names() if is_isotropic(name)]
 
 
 def is_isotropic(name: object) -> bool:
     """Whether an engineering material of the library has this name."""
-    return isinstance(name, str) and isinstance(entries().get(name), ShellMaterial)
+    return isinstance(name, str) and isinstance(library_entries().get(name), ShellMaterial)
 
 
-def resolve(
+def resolve_material(
     material: Material, *, file: object | None = None, key: str = "material"
 ) -> tuple[ShellMaterial, list[str]]:
     """Constants of one material block, all conventions and factors applied.
@@ -207,9 +207,9 @@ def resolve(
     notes: list[str] = []
     name = key
     if material.cloth is not None:
-        entry = entries()[material.cloth]
+        entry = library_entries()[material.cloth]
         if isinstance(entry, ClothTable):
-            shell, notes = of_table(entry, material.cloth)
+            shell, notes = shell_of_table(entry, material.cloth)
         else:
             shell = entry
         name = material.cloth
@@ -222,7 +222,7 @@ def resolve(
         else:
             assert material.poisson is not None
             assert material.thickness is not None
-            shell = of_isotropic(material.young, material.poisson, material.thickness, material.density)
+            shell = isotropic_shell(material.young, material.poisson, material.thickness, material.density)
     if material.bending_model == "midedge":
         shell, more = _with_plate(shell, name)
         notes += more
@@ -234,7 +234,7 @@ def resolve(
         if strain > 1.0:
             notes.append(f"{key}.law: strains up to {strain:g}; were they in percent, give fractions")
     shell = _scaled(_with_friction(shell, material), material)
-    if max(shell.friction_moment) > 0.0 and not shell.bends_by(shell.model):
+    if max(shell.friction_moment) > 0.0 and not shell.bends_with(shell.model):
         raise InputError(
             "friction acts beside a bending stiffness; give bending, too",
             file=file,
@@ -249,7 +249,7 @@ def resolve(
     return shell, notes
 
 
-def of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
+def shell_of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
     """Constants of a measured cloth, and notes; see the module's conventions.
 
     A negative c12 is kept where the stiffness is positive definite. Where it is not, the
@@ -269,7 +269,7 @@ def of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
     return ShellMaterial(table.density, c11, c12, c22, table.c33, (at_0, at_45, at_90)), notes
 
 
-def of_isotropic(young: float, poisson: float, thickness: float, density: float) -> ShellMaterial:
+def isotropic_shell(young: float, poisson: float, thickness: float, density: float) -> ShellMaterial:
     """Constants of an isotropic sheet in plane stress; young [Pa], thickness [m], areal density [kg/m²]."""
     stretch = young * thickness / (1 - poisson**2)
     shear = young * thickness / (2 * (1 + poisson))
@@ -285,14 +285,14 @@ def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[st
     if shell.plate[0] > 0.0 or max(shell.bending) <= 0.0:
         return shell, []
     twist = at_45 - 0.25 * (at_0 + at_90)
-    least = 0.5 * LEAST_TWIST * math.sqrt(at_0 * at_90)
+    minimum = 0.5 * MIN_TWIST * math.sqrt(at_0 * at_90)
     notes = []
-    if twist < least:
+    if twist < minimum:
         notes.append(
             f"{name}: B at 0°, 45°, 90° = {at_0:.4g}, {at_45:.4g}, {at_90:.4g} N·m make d33 = {twist:.4g} "
-            f"N·m; raised to {least:.4g} N·m"
+            f"N·m; raised to {minimum:.4g} N·m"
         )
-        twist = least
+        twist = minimum
     return replace(shell, plate=(at_0, 0.0, at_90, twist)), notes
 
 
@@ -319,7 +319,7 @@ def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
         if kes.width_of_shear is not None:
             force = 0.25 * sum(kes.width_of_shear) * GF_PER_CM
     if (moment[0] > 0.0) != (moment[1] > 0.0):
-        moment = max(moment[0], LEAST_FRICTION * moment[1]), max(moment[1], LEAST_FRICTION * moment[0])
+        moment = max(moment[0], MIN_FRICTION * moment[1]), max(moment[1], MIN_FRICTION * moment[0])
     return replace(shell, friction_moment=moment, friction_force=force)
 
 

@@ -71,7 +71,7 @@ def test_edges_without_mass_balance_by_themselves(comm: MPI.Comm) -> None:
         values = problem.discretisation.rows.zeros()
         add_exact_hessian(problem.system, values)
         matrix = expanded(problem.pattern, values, n).reshape(3 * n, 3 * n)
-        heights, edges = 3 * np.arange(layout.n_vertices) + 2, layout.edge_places
+        heights, edges = 3 * np.arange(layout.n_vertices) + 2, layout.edge_indices
         across = matrix[np.ix_(heights, edges)]
         condensed = matrix[np.ix_(heights, heights)] - across @ np.linalg.solve(
             matrix[np.ix_(edges, edges)], across.T

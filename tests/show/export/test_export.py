@@ -120,11 +120,11 @@ def test_what_has_no_obstacles_does_not_import_them(tmp_path):
     """Neither to set a scene up nor to export its run; with some they are."""
     code = """
 import sys
-from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.show.export import export_run
 from lyra_petsc.output.read_run import StoredRun
 import lyra_petsc.show.render.draw
-mesh_of(StoredRun(sys.argv[1]).scene)
+build_scene_mesh(StoredRun(sys.argv[1]).scene)
 export_run(sys.argv[1], "obj")
 print("lyra_petsc.mesh.obstacles" in sys.modules)
 """

@@ -30,7 +30,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 )
 from lyra_petsc.experiments.verification.verification_case import FLOOR, grid
 from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.start_crossings import overlaps_of
+from lyra_petsc.mesh.start_crossings import find_overlaps
 from lyra_petsc.parallel import on_root
 
 MOST = 12
@@ -195,7 +195,7 @@ def _crossings(trial: Trial) -> int:
         found = len(self_crossings(x, triangles))
         for one in term.obstacles.each:
             box = (simulation.scene.obstacles or {})[one.name].box is not None
-            found += sum(map(len, overlaps_of(one, x, triangles, simulation.time, is_box=box)))
+            found += sum(map(len, find_overlaps(one, x, triangles, simulation.time, is_box=box)))
         return found
 
     return on_root(simulation.comm, count)

@@ -56,7 +56,7 @@ def hinges_of(trial: Trial) -> Hinges:
     n = term.n_owned
     slopes = _slopes(problem.system.x[term.stencil[:n], :2])
     slopes *= np.sqrt(2.0 * term.elements.data["k"][:n, None])
-    mine = (term.elements.index[:n], problem.points.in_mesh()[term.stencil[:n]], slopes)
+    mine = (term.elements.index[:n], problem.points.mesh_vertex_of_local()[term.stencil[:n]], slopes)
     index, stencil, slopes = map(np.concatenate, zip(*problem.points.comm.allgather(mine), strict=True))
     order = np.argsort(index)
     return Hinges(stencil[order], slopes[order])

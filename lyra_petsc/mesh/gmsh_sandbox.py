@@ -83,7 +83,7 @@ class _Beneath(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def raise_fence(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
+def enter_sandbox(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
     """Drop all rights that gmsh does not need, for all threads of this process, irrevocably.
 
     Parameters
@@ -105,7 +105,7 @@ def raise_fence(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
     return stands + (["Landlock"] if _landlock(libc, ["/"] if readable is None else readable) else [])
 
 
-def in_words(stands: Sequence[str], *, trusted: bool = False) -> str:
+def describe_sandbox(stands: Sequence[str], *, trusted: bool = False) -> str:
     """How gmsh is sandboxed, in words for the user."""
     first = (
         "scripts are trusted, whatever they say" if trusted else "scripts are read by a list of statements"
@@ -115,9 +115,9 @@ def in_words(stands: Sequence[str], *, trusted: bool = False) -> str:
 
 
 @cache
-def standing() -> list[str]:
+def supported_layers() -> list[str]:
     """Which parts of the sandbox this system supports, tried in a process like gmsh's."""
-    code = "import json, lyra_petsc.mesh.gmsh_fence as fence; print(json.dumps(fence.raise_fence(None)))"
+    code = "import json, lyra_petsc.mesh.gmsh_sandbox as s; print(json.dumps(s.enter_sandbox(None)))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
     try:
         done = subprocess.run(
