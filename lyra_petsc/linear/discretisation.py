@@ -178,9 +178,7 @@ class Discretisation:
         If one term must search, all terms that search are returned, before the others.
         """
         stale = self.layout.global_max(*(term.stale for term in self._changing))
-        leaves = not (
-            self._is_covered(here, self._radius) and (to is here or self._is_covered(to, self._radius))
-        )
+        leaves = not all(self._is_covered(at, self._radius) for at in ([here] if to is here else [to, here]))
         if self._global_elements and not leaves and not any(stale):
             return []
         searches = leaves and bool(self._searching)

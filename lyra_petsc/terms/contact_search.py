@@ -122,11 +122,10 @@ class SheetSearch:
         reaches = reach, reach if edges is None else edges
         if len(self._first) == 1:
             return np.empty((0, 7), dtype=np.int64)
-        low, high, low_then, high_then = self.boxes(x, way) if boxes is None else boxes
-        # what all of them go together brings none nearer
-        drift = (low_then + high_then - low - high).mean(axis=0) * 0.5
-        swept = np.minimum(low, low_then - drift), np.maximum(high, high_then - drift)
-        met = np.concatenate([self._alone, near_in_order(*swept, reach)])
+        n = len(self._first) - 1
+        swept, goes = np.empty((2, n, 3)), np.empty((n, 3))
+        _sweep(self.boxes(x, way) if boxes is None else boxes, swept, goes)
+        met = np.concatenate([self._alone, near_in_order(swept[0], swept[1], reach)])
         lasting = self._margins.spend(x, way, self._vertices[: self._n_own])
         met, row, known = self._margins.among(met, lasting, *reaches)
         if not len(met):
@@ -139,19 +138,17 @@ class SheetSearch:
         if not len(met):
             return np.empty((0, 7), dtype=np.int64)
         more = np.where(row >= 0, SPARE * reach, 0.0)
-        n = len(self._first) - 1
-        mean, whole = np.empty((n, 3)), np.empty((n, 7))
-        asked = np.zeros(n, dtype=np.bool_)
-        asked[met] = True
-        _means(way, self.triangles.corners, self.triangles.first, asked, mean)
+        asked = np.zeros((2, n), dtype=np.bool_)
+        for column in (0, 1):
+            asked[column, met[known[:, column] < reaches[column]]] = True
         given = []
-        for of in (self.vertices, self.edges, self.triangles):
-            around = np.empty((7, len(of.corners)))
-            _around(x, way, of.corners, of.first, asked, mean, around, whole)  # last of triangles, all of it
-            given.append((of.corners, of.first, around))
+        for of, column in ((self.vertices, 0), (self.edges, 1), (self.triangles, 0)):
+            around, whole = np.empty((7, len(of.corners))), np.empty((n, 7))
+            _around(x, way, of.corners, of.first, asked[column], goes, around, whole)
+            given.append((of.corners, of.first, around, whole))
         while True:
             out, apart = np.empty((self._room, 7), dtype=np.int64), known.copy()
-            between = met, known, more, apart, mean, whole
+            between = met, known, more, apart, goes
             several = 3 * patches.SIZE, self._rings, most
             found = _pairs(x, way, *between, *given, numbers, *reaches, *several, out)
             if found > most:
@@ -190,22 +187,25 @@ def _boxes(x, way, vertices, first, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _means(way, corners, first, asked, out):  # type: ignore[no-untyped-def]
-    """The mean way (P, 3) [m] of each patch asked for (P,)."""
-    for p in np.flatnonzero(asked):
-        out[p] = 0.0
-        for at in range(first[p], first[p + 1]):
-            for i in corners[at]:
-                for k in range(3):
-                    out[p, k] += way[i, k]
-        n = first[p + 1] - first[p]
-        for k in range(3):
-            out[p, k] /= max(n, 1) * corners.shape[1]
+def _sweep(boxes, swept, goes):  # type: ignore[no-untyped-def]
+    """Boxes around patches all along their ways but for what all of them go together, which brings none
+    nearer, from `SheetSearch.boxes`: low and high corners into swept (2, P, 3) [m]; how far the middles of
+    their boxes go into goes (P, 3) [m].
+    """
+    low, high, low_then, high_then = boxes
+    for k in range(3):
+        drift = 0.0
+        for p in range(len(goes)):
+            goes[p, k] = 0.5 * (low_then[p, k] + high_then[p, k] - low[p, k] - high[p, k])
+            drift += goes[p, k] / len(goes)
+        for p in range(len(goes)):
+            swept[0, p, k] = min(low[p, k], low_then[p, k] - drift)
+            swept[1, p, k] = max(high[p, k], high_then[p, k] - drift)
 
 
 @kernel()
-def _around(x, way, corners, first, asked, mean, out, whole):  # type: ignore[no-untyped-def]
-    """Low and high corners [m] of simplices, and how far [m] they go at most beside the mean of their patch,
+def _around(x, way, corners, first, asked, goes, out, whole):  # type: ignore[no-untyped-def]
+    """Low and high corners [m] of simplices, and how far [m] they go at most beside their patch (P, 3),
     into out (7, n); the same of all of a patch into whole (P, 7). Of patches asked for (P,).
     """
     for p in np.flatnonzero(asked):
@@ -218,7 +218,7 @@ def _around(x, way, corners, first, asked, mean, out, whole):  # type: ignore[no
                 square = 0.0
                 for k in range(3):
                     out[k, at], out[3 + k, at] = min(out[k, at], x[i, k]), max(out[3 + k, at], x[i, k])
-                    square += (way[i, k] - mean[p, k]) ** 2
+                    square += (way[i, k] - goes[p, k]) ** 2
                 farthest = max(farthest, square)
             out[6, at] = math.sqrt(farthest)
             for k in range(3):
@@ -250,7 +250,7 @@ def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def
 
 @kernel()
 def _pairs(  # type: ignore[no-untyped-def]
-    x, way, met, known, more, apart, mean, whole,
+    x, way, met, known, more, apart, goes,
     vertices, edges, triangles, numbers, reach, edges_reach, size_of_patch, rings, most, out,
 ):  # fmt: skip
     """Rows of the near simplices of pairs of patches, as many as fit; how many there are, or more than
@@ -258,8 +258,8 @@ def _pairs(  # type: ignore[no-untyped-def]
 
     No patch has more than ``size_of_patch`` vertices, edges or triangles. Vertices and triangles, and edges,
     of a pair of patches that are ``known`` (n, 2) [m] to be apart are looked at where that is less than their
-    reach; ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``mean``
-    and ``whole`` as of `_means` and `_around`.
+    reach; ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``goes``
+    is that of `_sweep`, and of vertices, edges and triangles there is what `_around` gives.
     """
     found = 0
     left, p, w = np.empty(size_of_patch), np.empty((4, 3)), np.empty((4, 3))
@@ -280,11 +280,11 @@ def _pairs(  # type: ignore[no-untyped-def]
             ample = within + more[n]
             if part != 1:
                 apart[n, column] = ample
-            mine, first, around = edges if part == 2 else vertices
-            theirs, begin, others = edges if part == 2 else triangles
+            mine, first, around, _ = edges if part == 2 else vertices
+            theirs, begin, others, whole = edges if part == 2 else triangles
             square = 0.0
             for k in range(3):
-                square += (mean[i, k] - mean[j, k]) ** 2
+                square += (goes[i, k] - goes[j, k]) ** 2
             together = ample + math.sqrt(square)
             for a in range(first[i], first[i + 1]):
                 start = a + 1 if part == 2 and i == j else begin[j]
