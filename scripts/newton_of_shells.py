@@ -118,7 +118,7 @@ SHELLS: dict[str, tuple[Callable[[Bench, int], dict[str, Any]], tuple[int, ...]]
 
 
 def main(arguments: list[str]) -> None:
-    bench, step = Bench(MPI.COMM_WORLD, exact=False), 1.0 / LOAD_STEPS
+    bench, step = Bench(MPI.COMM_WORLD, direct=False), 1.0 / LOAD_STEPS
     print("| shell | cells | Newton | linear | CPU [s] | way [m] |\n| --- | --- | --- | --- | --- | --- |")
     for argument in arguments or SHELLS:
         name, _, sizes = argument.partition(":")

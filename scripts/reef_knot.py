@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.experiments.meshes import evenly
+from lyra_petsc.experiments.meshes import resample_polyline
 
 FILE = Path(__file__).resolve().parent.parent / "meshes" / "reef-knot.obj"
 UNIT = 0.05  # m, of the points below
@@ -33,12 +33,12 @@ def mirrored(half: list[list[float]]) -> Array:
 
 def smooth(points: Array) -> tuple[Array, float]:
     """A curve near a polygon's corners, at about the distance of an edge, and that distance [m]."""
-    fine = evenly(points * UNIT, 400)
+    fine = resample_polyline(points * UNIT, 400)
     for _ in range(250):
         fine[1:-1] += 0.25 * (fine[2:] - 2.0 * fine[1:-1] + fine[:-2])
     length = float(np.linalg.norm(np.diff(fine, axis=0), axis=1).sum())
     n = round(length / EDGE)
-    return evenly(fine, n + 1), length / n
+    return resample_polyline(fine, n + 1), length / n
 
 
 def across(curve: Array) -> Array:

@@ -20,8 +20,8 @@ from lyra_petsc.cli.progress import duration
 from lyra_petsc.cli.run import tell_unused
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.experiments.case import Case, Launcher, Outcome, passed_of
-from lyra_petsc.experiments.results import CaseObserver, Results, View, aligned
+from lyra_petsc.experiments.case import OUTCOME_FILE, Case, Launcher, Outcome, count_passed, save_record
+from lyra_petsc.experiments.results import CaseObserver, Results, View, align_columns
 from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
 
@@ -116,18 +116,18 @@ class Terminal(CaseObserver[Any, Any]):
         """A case has ended."""
         if self._speaks and sys.stderr.isatty():
             print("\x1b[2K", file=sys.stderr, end="\r", flush=True)
-        for line in self._view.lines(outcome):
+        for line in self._view.terminal_lines(outcome):
             self.print(*line)
 
     def close(self, results: Results[Any], note: str) -> None:
         """The end: a table, what passed, where results are, what is missing, options that nothing used."""
-        outcomes, table = results.outcomes, self._view.summary(results.outcomes)
+        outcomes, table = results.outcomes, self._view.summary_table(results.outcomes)
         if self._view.heading():  # the lines of the cases are a table, too
             self.print()
-        for line in aligned(table, len(table[0]) - 1):
+        for line in align_columns(table, len(table[0]) - 1):
             self.print(line)
         total = duration(sum(outcome.seconds for outcome in outcomes))
-        self.print(f"{passed_of(outcomes)}, {total} in all")
+        self.print(f"{count_passed(outcomes)}, {total} in all")
         if results.folder is not None:
             self.print(f"results: {results.folder}")
         if note:
@@ -223,7 +223,7 @@ def stress(
 
     if job is not None:
         outcome = run(cases[0])
-        on_root(comm, lambda: stress_runner.save(outcome, job))
+        on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.saved()))
         return 0 if outcome.passed else FAILED
     words = [*asked, *words_of({"--only": ",".join(names), "--ranks": ranks})]
     again, view = command(comm, "stress", words), Stress(setting, len(cases))
@@ -275,7 +275,7 @@ def fabric(
 
     if job is not None:
         outcome = run(next(case for case in cases if case.name == only))
-        on_root(comm, lambda: fabric_report.save(outcome, job))
+        on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.record))
         return 0 if outcome.passed else FAILED
     first = Path("fabric") / f"{Path(named).stem}-{test}"
     folder = out or on_root(comm, lambda: first if force else free_name(first))

@@ -1,20 +1,22 @@
-"""Experiments: scenes with something to vary, an answer to compare with, and a verdict.
+"""Experiments: a scene, the settings that are varied, a reference to compare with, and a verdict.
 
-In: a verb's request (which cases, which scene, which settings). Out: a folder with tables, a file for
-programs and a page, and an exit code that says whether all is as expected.
+In: the request of a verb of the command line (cases, scene, settings). Out: a folder with a table, a JSON
+file and a page, and an exit code that says whether all results are as expected.
 
-A `case.Case` is one experiment; a verb adds its scene, what is varied and what is expected. `bench` runs its
-simulations, a verb's runner turns them into a `case.Outcome` with a `case.Verdict` for each claim, and
-`results.Results` runs case after case, on the communicator at hand or through a `case.Launcher` in an mpirun
-each, and writes what a verb's `results.View` tells. `case.Registry` finds cases by name and imports their
-modules only then; `case.save_record` keeps results beyond a process. Five verbs are views of this:
+A `case.Case` is one experiment. Each verb adds the scene, the varied settings and the expected result.
+`bench` runs the simulations of a case; the runner of the verb turns them into a `case.Outcome` with one
+`case.Verdict` per claim. `results.Results` runs the cases one after another, on the present communicator or
+through a `case.Launcher` with one mpirun each, and writes the tables and the page that the `results.View` of
+the verb defines. `case.Registry` finds cases by name and imports their modules on demand; `case.save_record`
+stores results as JSON. Five verbs are views of this framework:
 
-- `verification`: exact and published answers; varied is the resolution, expected a value and an order.
-- `stress`: stiff and extreme scenes; expected are the balances of energy, force and momentum of every step.
-- `study`: a scene of the user; varied are its settings, expected is a reference (of `exact_motions`, of a
-  finer run), and instead of a verdict it tells which setting gives an accuracy in the least time.
-- `fabric`: standard tests of textiles on a material; expected are the numbers that the material has.
-- `fit`: parameters of a scene estimated from measurements by least squares, with their intervals.
+- `verification`: comparison with exact and published solutions; varied: the resolution; expected: a value and
+  an order of convergence.
+- `stress`: stiff and extreme scenes; expected: the balances of energy, force and momentum of every step.
+- `study`: a scene of the user; varied: its settings; reference: an exact solution (`exact_motions`) or a
+  finer run. It has no verdict, but names the setting that reaches an accuracy in the least run time.
+- `fabric`: standard textile tests of a material; expected: the known constants of the material.
+- `fit`: parameters of a scene, estimated from measurements by least squares, with confidence intervals.
 
-A further verb brings its cases, a runner, a `View`, and a function in `cli.experiments`.
+A further verb needs cases, a runner, a `View`, and a function in `cli.experiments`.
 """

@@ -1,4 +1,4 @@
-"""Runs the simulations of a case and counts steps; where answers are exact, with a direct solver."""
+"""Test bench: makes the meshes of a case, runs its simulations and counts steps."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.midedge import MidEdge
 
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
-"""Default where a case's scene has no tolerance: Newton being quadratic, it ends at round-off."""
+"""Default for scenes of cases: as Newton's method converges quadratically, it ends at round-off."""
 
 
 @contextmanager
-def simulated(
-    comm: MPI.Comm, scene: Scene, phases: Phases | None = None, **known: Any
+def open_simulation(
+    comm: MPI.Comm, scene: Scene, phases: Phases | None = None, **arguments: Any
 ) -> Iterator[SteppedScene]:
-    """A simulation that is freed at the end of the block, with the PETSc options it set; collective.
+    """A simulation; at the end of the block it and the PETSc options that it set are removed; collective.
 
-    ``known`` are further arguments of `SteppedScene`.
+    ``arguments`` are passed to `SteppedScene`.
     """
     before = set(PETSc.Options().getAll())
     simulation, alone = None, False
     try:
-        simulation = SteppedScene(comm, scene, phases, **known)
+        simulation = SteppedScene(comm, scene, phases, **arguments)
         yield simulation
     except BaseException as error:
-        # this rank may be alone with its error, and freeing would wait for the others
-        together = isinstance(error, LyraError) and getattr(error, "collective", True)
-        alone = comm.size > 1 and not together
+        # an error on this rank only: destroying the simulation, which is collective, would deadlock
+        collective = isinstance(error, LyraError) and getattr(error, "collective", True)
+        alone = comm.size > 1 and not collective
         raise
     finally:
         if simulation is not None and not alone:
@@ -52,13 +52,13 @@ def simulated(
             database.delValue(name)
 
 
-def problem_of(comm: MPI.Comm, error: LyraError) -> str:
-    """Why a case ended early, in one line; collective.
+def failure_message(comm: MPI.Comm, error: LyraError) -> str:
+    """The error that ended a case early, in one line; collective.
 
     Raises
     ------
     SolverError
-        The error itself, if not every rank has met one: the others could not go on together with this one.
+        The error itself if it did not occur on every rank: the ranks could not continue together.
     """
     if isinstance(error, SolverError) and not error.collective and not all_here(comm):
         raise error
@@ -66,7 +66,7 @@ def problem_of(comm: MPI.Comm, error: LyraError) -> str:
 
 
 class Trial:
-    """One simulation of a case, with its state in mesh order on every rank.
+    """One simulation of a case, with access to its state in mesh order on every rank.
 
     Attributes
     ----------
@@ -81,27 +81,31 @@ class Trial:
         self.start = self.x
 
     def step(self) -> StepReport:
-        """One accepted step; collective."""
+        """Take one accepted step; collective."""
         self._bench.watch()
         report = self.simulation.step()
         self._bench.steps += 1
         return report
 
     def run(self) -> Trial:
-        """Steps to the end of the scene; collective."""
+        """Step to the end of the scene; collective."""
         while not self.simulation.finished:
             self.step()
         return self
 
-    def through(self, times: Sequence[float]) -> Iterator[SteppedScene]:
-        """Steps to each of these times [s], ascending, at which steps end; collective."""
+    def run_to(self, time: float) -> Trial:
+        """Step to a time [s], or beyond it if no step ends there; collective."""
+        while self.simulation.time < time - 1e-9:
+            self.step()
+        return self
+
+    def run_through(self, times: Sequence[float]) -> Iterator[SteppedScene]:
+        """The simulation at each of these ascending times [s], at which steps end; collective."""
         for end in times:
-            while self.simulation.time < end - 1e-9:
-                self.step()
-            yield self.simulation
+            yield self.run_to(end).simulation
 
     def gather(self, owned: Array) -> Array:
-        """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
+        """Gather rows of owned vertices (n_vertices, …) in mesh order (V, …) on every rank; collective."""
         return self.simulation.problem.points.gather(owned)
 
     @property
@@ -133,41 +137,41 @@ class Trial:
                 problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
                 problem.system.active.refreeze({term: term.frames})
-        self.simulation.ledger.measure()  # from which steps reckon what they did to energy
+        self.simulation.ledger.measure()  # the next step compares its energies with these
 
-    def total(self, owned: Array) -> float:
+    def sum_over_ranks(self, owned: Array) -> float:
         """Sum over all ranks of this rank's values; collective."""
         return float(self._bench.comm.allreduce(float(np.sum(owned))))
 
 
-def direct_options(comm: MPI.Comm) -> dict[str, Any]:
+def direct_solver_options(comm: MPI.Comm) -> dict[str, Any]:
     """PETSc options of a direct solver.
 
-    On several ranks each factors the whole matrix: cases are small, so that this is faster than a
-    parallel factorisation, and it needs no other package.
+    On several ranks each rank factors the whole matrix: the cases are small, so that this is faster than a
+    parallel factorisation, and it needs no further package.
     """
     return {"pc_type": "lu"} if comm.size == 1 else {"pc_type": "redundant", "redundant_pc_type": "lu"}
 
 
 class Bench:
-    """Runs the simulations of a case; a context manager that removes what it wrote.
+    """Test bench of a case: makes meshes and runs simulations; a context manager that removes its files.
 
     Parameters
     ----------
     comm : MPI.Comm
     watch : callable, optional
         Called before every step on all ranks; may raise to end the work.
-    exact : bool
-        Fill a direct solver and tight tolerances in; without, scenes run as a user's do.
+    direct : bool
+        Default to a direct linear solver and tight tolerances; otherwise scenes run as a user's do.
     trust_mesh : bool
-        Give gmsh the scenes' scripts whatever they say.
+        Pass the scenes' scripts to gmsh unchecked.
 
     Attributes
     ----------
     steps : int
         Accepted steps so far.
     latest : (int, float)
-        Accepted steps and wall seconds of the latest simulation, set-up included.
+        Accepted steps and wall time [s] of the latest simulation, set-up included.
     """
 
     def __init__(
@@ -175,11 +179,11 @@ class Bench:
         comm: MPI.Comm,
         watch: Callable[[], None] | None = None,
         *,
-        exact: bool = True,
+        direct: bool = True,
         trust_mesh: bool = False,
     ) -> None:
         self.comm = comm
-        self._exact, self._trust_mesh = exact, trust_mesh
+        self._direct, self._trust_mesh = direct, trust_mesh
         self.watch = watch or (lambda: None)
         self.steps = 0
         self.latest = (0, 0.0)
@@ -196,7 +200,7 @@ class Bench:
     def mesh(self, vertices: Array, triangles: Ints, rest: Array | None = None) -> dict[str, Any]:
         """The mesh block of a scene for a surface (V, 3) [m] of triangles (F, 3); collective.
 
-        ``rest`` (V, 2) [m] is its flat rest shape; without, the surface is its own.
+        ``rest`` (V, 2) [m] is its flat rest shape; without it the surface is its own rest shape.
         """
 
         def write() -> str:
@@ -207,15 +211,17 @@ class Bench:
             else:
                 lines += [f"vt {u!r} {v!r}" for u, v in rest.tolist()]
                 lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in corners]
-            return self._written(".obj", "\n".join(lines) + "\n")
+            return self._write_file(".obj", "\n".join(lines) + "\n")
 
         return {"file": on_root(self.comm, write)}
 
-    def grouped(self, vertices: Array, triangles: Ints, curves: Mapping[str, Ints]) -> dict[str, Any]:
+    def mesh_with_groups(
+        self, vertices: Array, triangles: Ints, curves: Mapping[str, Ints]
+    ) -> dict[str, Any]:
         """The mesh block of a scene for a surface with curve groups, name → edges (n, 2); collective."""
 
         def write() -> str:
-            # gmsh's format 2.2; physical groups by number: curves from 2 on
+            # gmsh's format 2.2; physical group 1 is the sheet, curves are numbered from 2
             elements = [f"2 2 1 1 {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
             for number, edges in enumerate(curves.values(), 2):
                 elements += [f"1 2 {number} {number} {a} {b}" for a, b in (edges + 1).tolist()]
@@ -224,18 +230,18 @@ class Bench:
             lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat"]
             lines += ["$PhysicalNames", f"{len(names)}", *names, "$EndPhysicalNames"]
             lines += ["$Nodes", f"{len(nodes)}", *nodes, "$EndNodes"]
-            numbered = [f"{k} {words}" for k, words in enumerate(elements, 1)]
+            numbered = [f"{k} {element}" for k, element in enumerate(elements, 1)]
             lines += ["$Elements", f"{len(numbered)}", *numbered, "$EndElements", ""]
-            return self._written(".msh", "\n".join(lines))
+            return self._write_file(".msh", "\n".join(lines))
 
         return {"file": on_root(self.comm, write)}
 
-    def script(self, text: str) -> dict[str, Any]:
-        """The mesh block of a scene whose mesh gmsh makes from a script; collective."""
-        return {"file": on_root(self.comm, lambda: self._written(".geo", text))}
+    def gmsh_mesh(self, text: str) -> dict[str, Any]:
+        """The mesh block of a scene whose mesh gmsh generates from a script; collective."""
+        return {"file": on_root(self.comm, lambda: self._write_file(".geo", text))}
 
-    def _written(self, suffix: str, text: str) -> str:
-        """Path of a new file with this text, on rank 0."""
+    def _write_file(self, suffix: str, text: str) -> str:
+        """Write a new temporary file on rank 0 and return its path."""
         if self._folder is None:
             self._folder = TemporaryDirectory(prefix="lyra-cases-")
         self._files += 1
@@ -245,19 +251,19 @@ class Bench:
 
     @contextmanager
     def simulation(self, content: Mapping[str, Any], *, land: Sequence[float] = ()) -> Iterator[Trial]:
-        """Set a scene up; freed, with the options it set, when the block ends; collective.
+        """Set up the simulation of a scene; destroyed at the end of the block; collective.
 
-        ``content`` is a scene as in a file; at times ``land`` steps end. Defaults that are filled in: no
-        output times, and on an exact bench a direct linear solver and tight tolerances.
+        ``content`` is a scene as in a file; steps end at the times ``land`` [s]. By default there are no
+        output times and, if ``direct``, the linear solver is direct and tolerances are tight.
         """
         filled: dict[str, Any] = {"output": {"every": None}} | dict(content)
-        if self._exact:
+        if self._direct:
             filled = {"solver": TIGHT} | filled
-            filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
+            filled["petsc"] = direct_solver_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
         scene = validated(Scene, filled, file="scene of the case")
         if self._trust_mesh:
             scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps
-        with simulated(self.comm, scene, land=land) as simulation:
+        with open_simulation(self.comm, scene, land=land) as simulation:
             yield Trial(self, simulation)
         self.latest = (self.steps - steps, time.perf_counter() - began)

@@ -1,8 +1,8 @@
-"""What every experiment is made of: a case, what came of it and the verdicts on that.
+"""Parts of every experiment: the case, its outcome and the verdicts.
 
-Beside these, what all experiments share: a registry of cases, whose modules are imported when they are
-asked for; dataclasses as JSON files, which outlive a process; and the launcher of ``--ranks P``, which
-runs each case in an mpirun of its own with the same PETSc options.
+Also shared by all experiments: the registry of cases, which imports their modules on demand; dataclasses
+stored as JSON files; and the launcher for ``--ranks P``, which runs each case in an mpirun of its own with
+the same PETSc options.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a claim holds, and why or why not, in words."""
+    """Whether a claim holds, with the numbers that decided it."""
 
     passed: bool
-    words: str
+    message: str
 
     @property
     def line(self) -> str:
-        """``passed: `` or ``FAILED: `` and the words."""
-        return f"{'passed' if self.passed else 'FAILED'}: {self.words}"
+        """``passed: `` or ``FAILED: ``, then the message."""
+        return f"{'passed' if self.passed else 'FAILED'}: {self.message}"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment; the verbs add the scene, what is varied and what is expected.
+    """One experiment; each verb adds the scene, the varied settings and the expected result.
 
     Attributes
     ----------
     name : str
         Lower case with hyphens; unique among the cases of a verb.
     title : str
-        What is done or compared, in one line.
+        One line that says what is done or compared.
     """
 
     name: str
@@ -62,17 +62,17 @@ C = TypeVar("C", bound=Case)
 
 @dataclass
 class Outcome(Generic[C]):
-    """What came of a case.
+    """The result of a case.
 
     Attributes
     ----------
     case : Case
     verdicts : dict of name → Verdict
-        Empty where the case was left out.
+        Empty if the case was left out.
     seconds : float
         Wall time of the whole case [s].
     left_out : str
-        Why the case makes no sense here; empty if it was run.
+        Why the case does not apply to the scene; empty if it was run.
     """
 
     case: C
@@ -82,16 +82,16 @@ class Outcome(Generic[C]):
 
     @property
     def passed(self) -> bool:
-        """Whether every verdict is good, or the case was left out; without verdicts it has not passed."""
+        """Whether the case was left out, or has verdicts and all of them passed."""
         return bool(self.left_out) or (bool(self.verdicts) and not self.failures)
 
     @property
     def failures(self) -> dict[str, Verdict]:
-        """The verdicts that are not good."""
+        """The verdicts that did not pass."""
         return {name: verdict for name, verdict in self.verdicts.items() if not verdict.passed}
 
 
-def passed_of(outcomes: Sequence[Outcome[C]]) -> str:
+def count_passed(outcomes: Sequence[Outcome[C]]) -> str:
     """``3 of 4 cases passed``; cases that were left out do not count."""
     run = [outcome for outcome in outcomes if not outcome.left_out]
     return f"{sum(outcome.passed for outcome in run)} of {len(run)} cases passed"
@@ -99,33 +99,36 @@ def passed_of(outcomes: Sequence[Outcome[C]]) -> str:
 
 T = TypeVar("T")
 
+OUTCOME_FILE = "outcome.json"
+"""File in the folder of ``--job`` by which a launched process returns the record of its case."""
+
 StoredArray = Annotated[NDArray[Any], PlainValidator(np.asarray)]
 """An array in a record."""
 
 
 def save_record(path: Path, record: DataclassInstance) -> None:
-    """Write a record; the file is the old or the new one, never half. Call on one rank."""
+    """Write a dataclass as JSON, replacing the file in one operation. Call on one rank."""
 
-    def of_numpy(value: NDArray[Any]) -> Any:
+    def array_to_list(value: NDArray[Any]) -> Any:
         return value.tolist()
 
-    text = json.dumps(asdict(record), indent=2, ensure_ascii=False, default=of_numpy)
+    text = json.dumps(asdict(record), indent=2, ensure_ascii=False, default=array_to_list)
     replace_text(path, text + "\n")
 
 
 def load_record(path: Path, kind: type[T]) -> T:
-    """The record in a file; what it holds beside the fields is passed over.
+    """Read a dataclass from a JSON file; unknown entries are ignored.
 
     Raises
     ------
     OSError, ValueError
-        If it cannot be read, or holds no such record.
+        If the file cannot be read, or does not hold such a record.
     """
     return TypeAdapter(kind).validate_json(path.read_bytes())
 
 
 def read_record(path: Path, kind: type[T]) -> T | None:
-    """The record in a file; None if there is none, or it is damaged."""
+    """Read a dataclass from a JSON file; None if the file is missing or damaged."""
     try:
         return load_record(path, kind)
     except (OSError, ValueError):
@@ -134,85 +137,82 @@ def read_record(path: Path, kind: type[T]) -> T | None:
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Names on the command line, in their order, and the modules that define what they stand for.
+    """Case names of the command line, in listing order, and the modules that define the cases.
 
     Attributes
     ----------
     package : str
-        In which the modules are.
+        The package that holds the modules.
     modules : mapping of name → module
         Entry ``some-name`` is the variable ``some_name`` of its module.
-    what : str
-        What an entry is, for the message about an unknown name.
     """
 
     package: str
     modules: Mapping[str, str]
-    what: str = "unknown case"
 
-    def load(self, name: str, *, key: str | None = None) -> T:
+    def load(self, name: str) -> T:
         """The entry of that name.
 
         Raises
         ------
         InputError
-            For a name that is not listed, with the nearest that is; ``key`` is the option that gave it.
+            For an unknown name; the message suggests the nearest known one.
         """
         if name not in self.modules:
-            raise InputError(f"{self.what}, {nearest(name, self.modules)}", key=key or name)
+            raise InputError(f"unknown case, {nearest(name, self.modules)}", key=name)
         module = import_module(f"{self.package}.{self.modules[name]}")
         return cast(T, getattr(module, name.replace("-", "_")))
 
     def all(self) -> list[T]:
-        """Every entry, in the order of the names."""
+        """Every entry, in listing order."""
         return [self.load(name) for name in self.modules]
 
 
-def in_modules(*modules: tuple[str, str]) -> dict[str, str]:
-    """Names and their modules, of modules and the names that each defines, in the order of both."""
+def module_by_name(*modules: tuple[str, str]) -> dict[str, str]:
+    """`Registry.modules` from pairs of a module and the names that it defines, separated by blanks."""
     return {name: module for module, names in modules for name in names.split()}
 
 
 Watch = Callable[[], None]
-"""Called before every step, or again and again while a process runs; may raise to end the work."""
+"""Called before every step, or repeatedly while another process runs; may raise to end the work."""
 
 
 @dataclass(frozen=True)
 class Launcher:
-    """Starts the program on several ranks.
+    """Starts this program on several ranks.
 
     Attributes
     ----------
     command : sequence of str
-        From `lyra_petsc.api.mpirun.find_launcher`.
+        The mpirun command of `lyra_petsc.api.mpirun.find_launcher`.
     verb : str
-    petsc : sequence of str
-        PETSc's options of the command line.
+    petsc_options : sequence of str
+        PETSc options of the command line.
     """
 
     command: Sequence[str]
     verb: str
-    petsc: Sequence[str]
+    petsc_options: Sequence[str]
 
-    def __call__(self, words: Sequence[str], watch: Watch, keep_open: Sequence[int] = ()) -> tuple[int, str]:
-        """Run the verb with these words; exit code and last words on stderr, see `run_launched`."""
+    def __call__(
+        self, arguments: Sequence[str], watch: Watch, keep_open: Sequence[int] = ()
+    ) -> tuple[int, str]:
+        """Run the verb; returns the exit code and the last message on stderr, see `run_launched`."""
         program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
-        code, heard = run_launched([*program, *words, *self.petsc], watch, keep_open)
-        return code, last_words(heard, code)
+        code, stderr = run_launched([*program, *arguments, *self.petsc_options], watch, keep_open)
+        return code, last_words(stderr, code)
 
-    def restored(
-        self, words: Sequence[str], watch: Watch, restore: Callable[[Path], T | None]
-    ) -> tuple[T | None, str]:
-        """What a case leaves in the folder of ``--job``, read by ``restore``, and the program's last words.
+    def run_case(self, arguments: Sequence[str], watch: Watch, kind: type[T]) -> tuple[T | None, str]:
+        """Run one case with ``--job``; returns its record, None if it left none, and the last message.
 
         Raises
         ------
         InputError
-            If the program refuses what it is asked for.
+            If the launched program rejects its arguments.
         """
         with TemporaryDirectory(prefix=f"lyra-{self.verb}-") as folder:
-            code, told = self([*words, "--job", folder], watch)
-            found = restore(Path(folder))
-        if found is None and code == InputError.exit_code:
-            raise InputError(told)
-        return found, told
+            code, message = self([*arguments, "--job", folder], watch)
+            record = read_record(Path(folder) / OUTCOME_FILE, kind)
+        if record is None and code == InputError.exit_code:
+            raise InputError(message)
+        return record, message

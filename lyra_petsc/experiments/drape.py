@@ -1,4 +1,4 @@
-"""Cusick's drape test: a cloth of 30 cm on a disc of 18 cm, and its shadow.
+"""Cusick's drape test: a cloth of 30 cm diameter on a disc of 18 cm, and its shadow.
 
 G. E. Cusick, The measurement of fabric drape, Journal of the Textile Institute 59 (1968) 253-260; BS 5058.
 """
@@ -17,32 +17,32 @@ from lyra_petsc.experiments.fabric.specimens import G
 Picture = Mask
 
 CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
-"""Radii and gap [m]"""
+"""Radii of cloth and disc, and contact gap [m]"""
 
 STARTS, NOISE = 5, 2e-4
-"""How many, and the standard deviation [m] of their heights"""
+"""Number of start shapes, and standard deviation [m] of their random heights"""
 
 STEP, STEPS = 0.04, 40
-"""Δt [s], and how many: backward Euler damps what moves."""
+"""Δt [s] and number of steps; backward Euler with these long steps damps the motion."""
 
 SPEED = 0.01
-"""Of the fastest vertex [m/s], at which a cloth rests before"""
+"""Speed [m/s] of the fastest vertex below which the cloth counts as at rest and the simulation ends early"""
 
-LEAST_FOLD = 1e-3
-"""Amplitude [m] of a rim below which it has no folds"""
+MINIMUM_FOLD = 1e-3
+"""Amplitude [m] of the rim below which it has no folds"""
 
 MARGIN = 1.05
-"""Half the side of a shadow's picture over the radius of the cloth"""
+"""Half the side of the picture of a shadow, over the radius of the cloth"""
 
 
-def disc_of(angle: Array) -> tuple[Array, Ints]:
-    """The disc with a rim at these angles: vertices (n, 3) [m] and triangles (m, 3)."""
+def disc_mesh(angle: Array) -> tuple[Array, Ints]:
+    """A fan of triangles with rim vertices at these angles [rad]: vertices (n, 3) [m], triangles (m, 3)."""
     rim = DISC * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
     fan = np.array([[k, k + 1, len(rim)] for k in range(len(rim) - 1)])
     return np.vstack([rim, np.zeros((1, 3))]), fan
 
 
-def draped(
+def drape_cloth(
     bench: Bench,
     start: Array,
     faces: Ints,
@@ -53,7 +53,7 @@ def draped(
     gap: float = DRAPE_GAP,
     speed: float = SPEED,
 ) -> Array:
-    """Positions (V, 3) [m] of a cloth that rests on the disc; collective.
+    """Simulate a cloth that comes to rest on the disc; returns its positions (V, 3) [m]; collective.
 
     Parameters
     ----------
@@ -63,15 +63,15 @@ def draped(
     rest : (V, 2)
         Material coordinates [m].
     material : dict
-        As in a scene.
+        Material block of a scene.
     seed : int
-        Of the noise of the start.
+        Seed of the noise that is added to the start.
     gap : float
-        Of the contact [m]; below the shortest edge.
+        Contact gap [m]; must be below the shortest edge.
     speed : float
-        Of the fastest vertex [m/s], at which the cloth counts as at rest.
+        Speed [m/s] of the fastest vertex below which the cloth counts as at rest.
     """
-    disc = {"mesh": bench.mesh(*disc_of(np.radians(np.linspace(0.0, 360.0, 49))))}
+    disc = {"mesh": bench.mesh(*disc_mesh(np.radians(np.linspace(0.0, 360.0, 49))))}
     content = {
         "mesh": bench.mesh(start + [0.0, 0.0, 0.95 * gap], faces, rest=rest),
         "material": material,
@@ -80,54 +80,53 @@ def draped(
         "initial": {"noise": NOISE, "seed": seed},
         "contact": {"gap": gap, "friction": 0.3, "self": False},
         "obstacles": {"disc": disc},
-        # stiff sheets are slow to fold, but shorter steps cost more
+        # many iterations, as stiff sheets fold slowly; shorter steps would cost more
         "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
     }
     with bench.simulation(content) as trial:
         while not trial.simulation.finished:
             trial.step()
-            # by time, not by steps: those of stiff sheets are cut into many
+            # a bound on time, not on steps: steps of stiff sheets may be cut into many
             if trial.simulation.time > 0.5 * STEP * STEPS and np.abs(trial.v).max() < speed:
                 break
         return trial.x
 
 
 def shadow(x: Array, faces: Ints, pixels: int) -> Picture:
-    """Pixels (pixels, pixels), rows along y, below the disc or the triangles of vertices x (V, 3) [m]."""
-    middles = MARGIN * CLOTH * ((2.0 * np.arange(pixels) + 1.0) / pixels - 1.0)
-    dark = np.hypot(middles, middles[:, None]) < DISC
+    """Pixels (pixels, pixels), rows along y, covered by the disc or by triangles of vertices x (V, 3) [m]."""
+    centres = MARGIN * CLOTH * ((2.0 * np.arange(pixels) + 1.0) / pixels - 1.0)
+    dark = np.hypot(centres, centres[:, None]) < DISC
     for corners in x[faces][:, :, :2]:
         first, last = (
-            np.searchsorted(middles, corners.min(axis=0)),
-            np.searchsorted(middles, corners.max(axis=0)),
+            np.searchsorted(centres, bound) for bound in (corners.min(axis=0), corners.max(axis=0))
         )
         columns, rows = slice(first[0], last[0]), slice(first[1], last[1])
-        at = np.stack(np.meshgrid(middles[columns], middles[rows]), axis=-1)
-        sides, beside = np.roll(corners, -1, axis=0) - corners, at[..., None, :] - corners
-        turn = sides[:, 0] * beside[..., 1] - sides[:, 1] * beside[..., 0]
-        dark[rows, columns] |= (turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1)
+        points = np.stack(np.meshgrid(centres[columns], centres[rows]), axis=-1)
+        sides, offsets = np.roll(corners, -1, axis=0) - corners, points[..., None, :] - corners
+        cross = sides[:, 0] * offsets[..., 1] - sides[:, 1] * offsets[..., 0]
+        dark[rows, columns] |= (cross >= 0.0).all(axis=-1) | (cross <= 0.0).all(axis=-1)
     return dark
 
 
 def drape_coefficient(dark: Picture) -> float:
-    """Share of the ring beside the disc that lies in the shadow."""
+    """Fraction of the ring between the rims of disc and flat cloth that lies in the shadow."""
     area = float(dark.mean()) * (2.0 * MARGIN * CLOTH) ** 2
     return (area - math.pi * DISC**2) / (math.pi * (CLOTH**2 - DISC**2))
 
 
-def folds(dark: Picture) -> int:
-    """How often the rim of a shadow goes outwards beyond its mean, small ripples left out."""
+def count_folds(dark: Picture) -> int:
+    """Number of folds: how often the radius of the shadow's rim rises above its mean, ignoring ripples."""
     half, last = MARGIN * CLOTH, len(dark) - 1
     angle, radius = np.radians(np.arange(0.0, 360.0, 2.0)), np.linspace(0.9 * DISC, half, 150)
-    places = [
+    column, row = (
         np.clip((np.outer(f(angle), radius) / half + 1.0) * 0.5 * len(dark), 0, last).astype(int)
         for f in (np.cos, np.sin)
-    ]
-    rim = (dark[places[1], places[0]] * radius).max(axis=1)
+    )
+    rim = (dark[row, column] * radius).max(axis=1)
     waves = np.fft.rfft(rim - rim.mean())
-    waves[13:] = 0.0  # shorter than 30°
+    waves[13:] = 0.0  # waves shorter than 30°
     smooth = np.fft.irfft(waves, len(rim))
-    least = max(LEAST_FOLD, 0.1 * float(np.abs(smooth).max()))
-    states = np.where(smooth > least, 1, np.where(smooth < -least, -1, 0))
-    seen = states[states != 0]
-    return int(np.sum((seen == 1) & (np.roll(seen, 1) == -1)))
+    threshold = max(MINIMUM_FOLD, 0.1 * float(np.abs(smooth).max()))
+    signs = np.where(smooth > threshold, 1, np.where(smooth < -threshold, -1, 0))
+    signs = signs[signs != 0]
+    return int(np.sum((signs == 1) & (np.roll(signs, 1) == -1)))

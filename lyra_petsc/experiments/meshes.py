@@ -1,4 +1,4 @@
-"""Meshes that no grid gives: vertices (V, 3) in metres and triangles (F, 3)."""
+"""Meshes that the grids of scenes cannot describe: vertices (V, 3) in metres and triangles (F, 3)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from lyra_petsc.arrays import Array, Ints, Mask
 def rectangle(
     nx: int, ny: int, width: float, height: float, *, alternating: bool = True
 ) -> tuple[Array, Ints]:
-    """A rectangle of nx × ny cells in the xy plane, numbered as a grid; alternating or diagonal."""
+    """A rectangle of nx × ny cells in the xy plane, numbered as a grid; diagonals alternate or are equal."""
     i, j = (k.ravel() for k in np.meshgrid(np.arange(nx + 1), np.arange(ny + 1)))
     vertices = np.column_stack([i * (width / nx), j * (height / ny), 0.0 * i])
     column, row = (k.ravel() for k in np.meshgrid(np.arange(nx), np.arange(ny)))
-    return vertices, _halved(nx, column, row, alternating & ((column + row) % 2 == 1))
+    return vertices, _split_cells(nx, column, row, alternating & ((column + row) % 2 == 1))
 
 
 def irregular_rectangle(nx: int, ny: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
-    """A rectangle of nx × ny cells in the xy plane: vertices displaced, diagonals at random.
+    """A rectangle of nx × ny cells in the xy plane with randomly displaced vertices and random diagonals.
 
-    Vertices move by up to 0.2 of a cell in each direction, those of a side along it; corners stay. From 0.25
-    on triangles could turn over.
+    Vertices are displaced by up to 0.2 cells in each direction, vertices of a side only along the side;
+    corners stay. From 0.25 cells on triangles could be inverted.
     """
     random = np.random.default_rng(seed)
     vertices, _ = rectangle(nx, ny, width, height)
@@ -34,7 +34,7 @@ def irregular_rectangle(nx: int, ny: int, width: float, height: float, seed: int
     shift[(j == 0) | (j == ny), 1] = 0.0
     vertices[:, :2] += shift
     column, row = (k.ravel() for k in np.meshgrid(np.arange(nx), np.arange(ny)))
-    return vertices, _halved(nx, column, row, random.integers(0, 2, nx * ny) == 1)
+    return vertices, _split_cells(nx, column, row, random.integers(0, 2, nx * ny) == 1)
 
 
 def walls(
@@ -45,9 +45,9 @@ def walls(
     *,
     alternating: bool = True,
 ) -> tuple[Array, Ints]:
-    """Plane walls of n × rows cells, from (x, z) to (x, z) each and from y = 0 to ``depth``.
+    """Plane walls of n × rows cells, each between two points (x, z) and from y = 0 to ``depth`` [m].
 
-    Where two or more of them meet they share vertices and edges.
+    Where two or more walls meet they share vertices and edges.
     """
     flat, faces = rectangle(n, rows, 1.0, depth, alternating=alternating)
     each = []
@@ -64,7 +64,7 @@ def walls(
 SIDES = ("left", "right", "bottom", "top")
 
 
-def sides(nx: int, ny: int) -> dict[str, Ints]:
+def side_edges(nx: int, ny: int) -> dict[str, Ints]:
     """The edges (n, 2) on each side of a rectangle of nx × ny cells that is numbered as a grid."""
     across, up = np.arange(nx + 1), np.arange(ny + 1) * (nx + 1)
     chains = (up, up + nx, across, across + ny * (nx + 1))
@@ -74,10 +74,10 @@ def sides(nx: int, ny: int) -> dict[str, Ints]:
 def rectangle_script(
     width: float, height: float, size: float | Sequence[float], inside: Sequence[float] = ()
 ) -> str:
-    """For gmsh: a rectangle in the xy plane with edges of about ``size`` [m], its sides named as a grid's.
+    """Script for gmsh: a rectangle in the xy plane with edges of about ``size`` [m] and the groups of a grid.
 
-    ``size`` may be one for each corner, from (0, 0) on against the clock; ``inside`` (x, y) [m] is where a
-    vertex must be.
+    ``size`` may have one value per corner, counter-clockwise from (0, 0); ``inside`` (x, y) [m] is the
+    place of an additional vertex.
     """
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
     points = corners + ([(inside[0], inside[1])] if inside else [])
@@ -93,24 +93,26 @@ def rectangle_script(
     return "\n".join(['SetFactory("Built-in");', *lines, 'Physical Surface("sheet") = {1};', ""])
 
 
-def _halved(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
-    """Two triangles of every cell, cut from its low left to its high right corner or the other way."""
+def _split_cells(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
+    """Two triangles of every cell, split along the diagonal from its lower left corner, or the other one."""
     a = row * (nx + 1) + column
     b, c, d = a + 1, a + nx + 2, a + nx + 1
-    other = flipped[:, None]
-    first = np.where(other, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
-    second = np.where(other, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
+    flip = flipped[:, None]
+    first = np.where(flip, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
+    second = np.where(flip, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
     return np.concatenate([first, second])
 
 
-def evenly(points: Array, n: int) -> Array:
-    """n points (n, 3) at equal distances along a polygon (m, 3)."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    return np.column_stack([np.interp(np.linspace(0.0, way[-1], n), way, points[:, k]) for k in range(3)])
+def resample_polyline(points: Array, n: int) -> Array:
+    """n points (n, 3) at equal arc lengths along a polyline (m, 3)."""
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return np.column_stack(
+        [np.interp(np.linspace(0.0, length[-1], n), length, points[:, k]) for k in range(3)]
+    )
 
 
-def rounded(flat: Array) -> Array:
-    """Points (n, 3) of the square |x|, |y| ≤ 1, moved smoothly onto the disc of radius 1."""
+def square_to_disc(flat: Array) -> Array:
+    """Map points (n, 3) of the square |x|, |y| ≤ 1 smoothly to the disc of radius 1."""
     x, y = flat[:, 0], flat[:, 1]
     return np.column_stack([x * np.sqrt(1.0 - 0.5 * y**2), y * np.sqrt(1.0 - 0.5 * x**2), 0.0 * x])
 
@@ -118,22 +120,22 @@ def rounded(flat: Array) -> Array:
 def quarter_disc(n: int, radius: float) -> tuple[Array, Ints]:
     """The quarter x, y ≥ 0 of a disc about the origin: a square of n × n cells, mapped smoothly.
 
-    Diagonals alternate, as they also do where the quarter is mirrored: cut otherwise, the centre would
-    carry more or less than its neighbours do, and its deflection err by h² log h.
+    Diagonals alternate, also across the mirror lines of the quarter: with another pattern the centre would
+    carry more or less load than its neighbours, and its deflection would have an error of h² log h.
 
     Vertex j (n + 1) + i as in a grid: i = 0 and j = 0 are the straight sides, i = n and j = n the rim.
     """
     flat, faces = rectangle(n, n, 1.0, 1.0)
-    return radius * rounded(flat), faces
+    return radius * square_to_disc(flat), faces
 
 
-def rings(n: int) -> tuple[Array, Ints]:
-    """The disc of radius 1 about the origin: a centre and n rings of 6, 12, … 6 n vertices at equal angles.
+def ring_disc(n: int) -> tuple[Array, Ints]:
+    """The disc of radius 1 about the origin: its centre and n rings of 6, 12, … 6 n vertices at equal angles.
 
     All triangles are nearly equilateral.
     """
     vertices, faces = [np.zeros((1, 3))], []
-    first = [0, *(1 + 3 * k * (k + 1) for k in range(n))]  # vertex of each ring
+    first = [0, *(1 + 3 * k * (k + 1) for k in range(n))]  # first vertex of each ring
     for k in range(1, n + 1):
         angle = np.arange(6 * k) * (math.pi / (3 * k))
         vertices.append(np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) * (k / n))

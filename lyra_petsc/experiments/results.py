@@ -1,4 +1,4 @@
-"""Runs the cases of a verb one after another and writes its folder: VERB.csv, VERB.json, report.*."""
+"""Runs the cases of a verb one after another and writes VERB.csv, VERB.json and report.* in its folder."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import csv
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.experiments.case import Case, Outcome, Verdict, passed_of
+from lyra_petsc.experiments.case import Case, Outcome, Verdict, count_passed
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
@@ -24,47 +23,48 @@ C = TypeVar("C", bound=Case)
 
 
 Line = tuple[str, str]
-"""A line of the terminal and its style, as of rich; empty: none."""
+"""A line of the terminal and its style for rich; empty: no style."""
 
 
-def aligned(rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
-    """The lines of a table: so many columns of words, set to the left, then columns of numbers."""
+def align_columns(rows: Sequence[Sequence[str]], text_columns: int = 1) -> list[str]:
+    """The lines of a table; the first ``text_columns`` are aligned left, the others right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
         cells = zip(row, widths, strict=True)
-        lines.append("  ".join(f"{text:{'<>'[i >= words]}{width}}" for i, (text, width) in enumerate(cells)))
-    return [line.rstrip() for line in lines]
+        padded = (f"{text:{'<>'[i >= text_columns]}{width}}" for i, (text, width) in enumerate(cells))
+        lines.append("  ".join(padded).rstrip())
+    return lines
 
 
 def write_csv(path: Path, lines: Iterable[Iterable[Any]]) -> None:
-    """Write a table; the file is the old or the new one, never half. Call on one rank."""
+    """Write a table, replacing the file in one operation. Call on one rank."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
     replace_text(path, text.getvalue())
 
 
 def verdict_line(verdict: Verdict, name: str = "") -> Line:
-    """A verdict below its case; those that are not good stand out."""
+    """The line of a verdict below its case; failures are emphasised."""
     return f"  {name}{verdict.line}", "" if verdict.passed else "bold red"
 
 
 class View(ABC, Generic[O]):
-    """How a verb tells of its cases: in a table, in a file for programs, and on a page.
+    """How a verb reports its cases: on the terminal, as CSV and JSON, and on a page.
 
     Attributes
     ----------
     verb : str
     title : str
-        Of the page.
+        Title of the page.
     pictures : str
-        What the page lacks without the packages that draw.
+        What the page lacks if the plotting packages are not installed, for the note about it.
     columns : sequence of str
-        Of the CSV.
+        Columns of the CSV file.
     entry : str
-        What a case is called in the table at the end.
+        Heading of the case names in the table at the end.
     ready : bool
-        Whether there is something to write.
+        Whether there are results to write.
     """
 
     verb: ClassVar[str]
@@ -75,66 +75,70 @@ class View(ABC, Generic[O]):
     ready: bool = True
 
     def heading(self) -> str:
-        """What the terminal shows before the first case; empty: nothing."""
+        """Line of the terminal before the first case; empty for none."""
         return ""
 
-    def lines(self, outcome: O) -> Iterable[Line]:
-        """What the terminal shows when a case has ended."""
+    def terminal_lines(self, outcome: O) -> Iterable[Line]:
+        """Lines of the terminal when a case has ended."""
         return ()
 
-    def summary(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
-        """The table that the terminal shows at the end, its headings first."""
+    def summary_table(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
+        """Table of the terminal at the end, headings first."""
         table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
         return [(self.entry, "verdict", "run time [s]"), *table]
 
-    def ended(self, outcomes: Sequence[O]) -> None:
-        """Another case has ended: what no later use has of the outcomes so far may be freed."""
+    def case_ended(self, outcomes: Sequence[O]) -> None:
+        """Called when another case has ended; may free data of the outcomes that are no longer needed."""
 
     @abstractmethod
-    def rows(self, outcome: O) -> Iterable[Mapping[str, Any]]:
-        """Its lines of the CSV, by the columns."""
+    def csv_rows(self, outcome: O) -> Iterable[Mapping[str, Any]]:
+        """Rows of the CSV file for a case, by column."""
 
-    def cell(self, value: Any) -> Any:
-        """A value of the CSV as a text or a number: empty for what is not a number."""
+    def csv_cell(self, value: Any) -> Any:
+        """A value as written to the CSV file; NaN becomes empty."""
         return "" if value != value else value
 
-    def told(self, outcome: O) -> dict[str, Any]:
-        """What the JSON file holds of a case beside its name, title and verdicts."""
+    def case_content(self, outcome: O) -> dict[str, Any]:
+        """Entries of a case in the JSON file beside its name, title and verdicts."""
         return {}
 
-    def facts(self, outcomes: Sequence[O]) -> dict[str, Any]:
-        """What the JSON file holds beside the cases, the verdict on all, ranks and versions."""
+    def summary_content(self, outcomes: Sequence[O]) -> dict[str, Any]:
+        """Entries of the JSON file beside the cases, the overall verdict, ranks and versions."""
         return {}
 
     def content(self, outcomes: Sequence[O], ranks: int, command: Sequence[str]) -> dict[str, Any]:
-        """The JSON file."""
-        run = _run(outcomes)
-        return self.facts(outcomes) | {
+        """The content of the JSON file."""
+        run = _without_left_out(outcomes)
+        return self.summary_content(outcomes) | {
             "passed": all(outcome.passed for outcome in run),
             "ranks": ranks,
             "versions": versions(),
             "cases": [
-                {"name": outcome.case.name, "title": outcome.case.title, **self.told(outcome)}
-                | {"verdicts": {name: asdict(verdict) for name, verdict in outcome.verdicts.items()}}
+                {"name": outcome.case.name, "title": outcome.case.title, **self.case_content(outcome)}
+                | {
+                    "verdicts": {
+                        k: {"passed": v.passed, "words": v.message} for k, v in outcome.verdicts.items()
+                    }
+                }
                 for outcome in run
             ],
         }
 
     @abstractmethod
-    def page(self, report: Report, outcomes: Sequence[O], summary: str, *, drawn: bool) -> None:
-        """Fill the page; ``summary`` says how many cases passed, ``drawn`` whether there can be pictures."""
+    def fill(self, report: Report, outcomes: Sequence[O], summary: str, *, plots: bool) -> None:
+        """Fill the page; ``summary`` says how many cases passed, ``plots`` whether plots can be drawn."""
 
-    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
-        """Add what made the page, and write it; what is missing for its pictures, in words. On one rank."""
+    def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+        """Add command and versions and write the page, on one rank; returns a note on missing packages."""
         return close(report, folder, versions(), command, pictures=self.pictures)
 
 
-def _run(outcomes: Sequence[O]) -> list[O]:
+def _without_left_out(outcomes: Sequence[O]) -> list[O]:
     return [outcome for outcome in outcomes if not outcome.left_out]
 
 
 class CaseObserver(Generic[C, O]):
-    """Receives the cases as they run."""
+    """Is notified of the cases as they run; to be overridden."""
 
     def begin(self, case: C) -> None:
         """A case begins."""
@@ -144,7 +148,7 @@ class CaseObserver(Generic[C, O]):
 
 
 class Results(Generic[O]):
-    """The folder of a verb and what came of the cases so far; every method is collective.
+    """The folder of a verb and the outcomes so far; every method is collective.
 
     Parameters
     ----------
@@ -153,11 +157,11 @@ class Results(Generic[O]):
         None: nothing is written.
     view : View
     ranks : int
-        On which each case is run.
+        Number of ranks of each case.
     command : sequence of str
-        That repeats it.
+        The command line that repeats the verb, for the page.
     force : bool
-        The folder may exist.
+        Accept an existing folder.
 
     Attributes
     ----------
@@ -184,63 +188,65 @@ class Results(Generic[O]):
         self._ranks, self._command = ranks, command
         self.outcomes: list[O] = []
         if folder is not None:
-            on_root(comm, lambda: _create(folder, force=force))
+            on_root(comm, lambda: _create_folder(folder, force=force))
 
-    def run(self, cases: Iterable[C], run: Callable[[C], O], show: CaseObserver[C, O] | None = None) -> str:
-        """Run the cases; what the page lacks and how to get it, empty if nothing.
+    def run(
+        self, cases: Iterable[C], run: Callable[[C], O], observer: CaseObserver[C, O] | None = None
+    ) -> str:
+        """Run the cases; returns a note on packages that the page lacks, empty if none.
 
         Raises
         ------
         Interrupted
-            From ``run``; what had been done is in the folder.
+            From ``run``; the outcomes so far are in the folder.
         OutputError
-            On every rank, if something could not be written.
+            On every rank, if a file could not be written.
         """
-        show = show or CaseObserver()
+        observer = observer or CaseObserver()
         try:
             for case in cases:
-                show.begin(case)
+                observer.begin(case)
                 self.outcomes.append(run(case))
-                show.end(self.outcomes[-1])
-                self.view.ended(self.outcomes)
+                observer.end(self.outcomes[-1])
+                self.view.case_ended(self.outcomes)
                 self.write()
             self.write()
         except Interrupted:
-            self.finish()
+            self.write_page()
             raise
-        return self.finish()
+        return self.write_page()
 
     def write(self) -> None:
-        """Write the tables of what came of the cases so far."""
+        """Write the CSV and JSON files of the outcomes so far."""
         view = self.view
         if self.folder is None or not view.ready:
             return
         path, outcomes = self.folder / f"{view.verb}.csv", self.outcomes
 
-        def table() -> None:
-            rows = [row for outcome in _run(outcomes) for row in view.rows(outcome)]
-            cells = ([view.cell(row.get(name)) for name in view.columns] for row in rows)
+        def write_table() -> None:
+            rows = [row for outcome in _without_left_out(outcomes) for row in view.csv_rows(outcome)]
+            cells = ([view.csv_cell(row.get(name)) for name in view.columns] for row in rows)
             write_csv(path, [view.columns, *cells])
 
-        on_root(self._comm, table)
+        on_root(self._comm, write_table)
         content = view.content(outcomes, self._ranks, self._command)
         write_summary(path.with_suffix(".json"), content, self._comm)
 
-    def finish(self) -> str:
-        """Write the page; what is missing for its pictures, in words."""
-        return on_root(self._comm, self._page)
+    def write_page(self) -> str:
+        """Write the page; returns a note on packages that it lacks, empty if none."""
+        return on_root(self._comm, self._write_page)
 
-    def _page(self) -> str:
+    def _write_page(self) -> str:
         if self.folder is None or not self.view.ready:
             return ""
         report = Report(self.view.title)
-        on = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
-        summary = f"{passed_of(self.outcomes)} on {on}."
-        self.view.page(report, self.outcomes, summary, drawn=not lacking())
-        return self.view.close(report, self.folder, self._command)
+        ranks = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
+        summary = f"{count_passed(self.outcomes)} on {ranks}."
+        self.view.fill(report, self.outcomes, summary, plots=not lacking())
+        return self.view.close_page(report, self.folder, self._command)
 
 
-def _create(folder: Path, *, force: bool) -> None:
+def _create_folder(folder: Path, *, force: bool) -> None:
     if folder.exists() and not (force and folder.is_dir()):
         raise InputError("exists; choose another folder, or give --force", key=f"--out {folder}")
     try:

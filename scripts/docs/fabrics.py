@@ -12,7 +12,8 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, restore, save
+from lyra_petsc.experiments.case import OUTCOME_FILE, read_record, save_record
+from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record
 from lyra_petsc.experiments.fabric.specimens import fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import cases_of, run_case
 from lyra_petsc.scene.materials.library import measured_names
@@ -43,16 +44,16 @@ COLUMNS = {
 
 def records(folder: Path, cloth: str, test: str) -> list[Record]:
     """What came of a test of a cloth, of warp and weft where they have one each."""
-    found = [restore(folder / cloth / case.name, case) for case in cases_of(test)]
-    return [outcome.record for outcome in found if outcome is not None]
+    found = [read_record(folder / cloth / case.name / OUTCOME_FILE, Record) for case in cases_of(test)]
+    return [record for record in found if record is not None]
 
 
 def measure(folder: Path, cloth: str, case: FabricCase) -> None:
     """Run a test that has not been run."""
-    out = folder / cloth / case.name
-    if restore(out, case) is None:
-        out.mkdir(parents=True, exist_ok=True)
-        save(run_case(MPI.COMM_SELF, case, fabric_of(cloth), lambda: None), out)
+    file = folder / cloth / case.name / OUTCOME_FILE
+    if read_record(file, Record) is None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_record(file, run_case(MPI.COMM_SELF, case, fabric_of(cloth), lambda: None).record)
         print(cloth, case.name, flush=True)
 
 

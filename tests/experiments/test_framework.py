@@ -14,8 +14,16 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.experiments.case import Case, Outcome, Registry, Verdict, load_record, passed_of, save_record
-from lyra_petsc.experiments.results import Line, Results, View, aligned
+from lyra_petsc.experiments.case import (
+    Case,
+    Outcome,
+    Registry,
+    Verdict,
+    count_passed,
+    load_record,
+    save_record,
+)
+from lyra_petsc.experiments.results import Line, Results, View, align_columns
 from lyra_petsc.experiments.stress.cases import FAMILIES
 from lyra_petsc.experiments.verification.cases import CASES
 from lyra_petsc.show.report.document import Report
@@ -34,7 +42,7 @@ def test_what_has_passed() -> None:
     assert outcome("a", GOOD, BAD).failures == {"1": BAD}
     assert not outcome("a").passed  # nothing was judged
     assert outcome("a", left_out="needs a handle").passed
-    assert passed_of([outcome("a", GOOD), outcome("b", BAD), outcome("c", left_out="no")]) == (
+    assert count_passed([outcome("a", GOOD), outcome("b", BAD), outcome("c", left_out="no")]) == (
         "1 of 2 cases passed"
     )
 
@@ -76,25 +84,25 @@ def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
 class Told(View[Outcome[Case]]):
     verb, title, pictures, columns = "try", "A try", "pictures", ("case", "value")
 
-    def rows(self, outcome: Outcome[Case]) -> Iterable[Mapping[str, Any]]:
+    def csv_rows(self, outcome: Outcome[Case]) -> Iterable[Mapping[str, Any]]:
         yield {"case": outcome.case.name, "value": math.nan, "more": 1}
 
-    def lines(self, outcome: Outcome[Case]) -> Iterable[Line]:
+    def terminal_lines(self, outcome: Outcome[Case]) -> Iterable[Line]:
         return [(outcome.case.name, "bold")]
 
-    def summary(self, outcomes: Sequence[Outcome[Case]]) -> list[Sequence[str]]:
+    def summary_table(self, outcomes: Sequence[Outcome[Case]]) -> list[Sequence[str]]:
         return [(outcome.case.name,) for outcome in outcomes]
 
-    def told(self, outcome: Outcome[Case]) -> dict[str, Any]:
+    def case_content(self, outcome: Outcome[Case]) -> dict[str, Any]:
         return {"seconds": outcome.seconds}
 
-    def page(self, report: Report, outcomes: Sequence[Outcome[Case]], summary: str, *, drawn: bool) -> None:
+    def fill(self, report: Report, outcomes: Sequence[Outcome[Case]], summary: str, *, plots: bool) -> None:
         report.paragraph(summary)
 
 
 def test_a_table_for_the_terminal() -> None:
-    assert aligned([("case", "n"), ("a", "10")]) == ["case   n", "a     10"]
-    assert aligned([("case", "n"), ("a", "10")], words=2) == ["case  n", "a     10"]
+    assert align_columns([("case", "n"), ("a", "10")]) == ["case   n", "a     10"]
+    assert align_columns([("case", "n"), ("a", "10")], text_columns=2) == ["case  n", "a     10"]
 
 
 class Silent:

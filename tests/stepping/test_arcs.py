@@ -97,7 +97,7 @@ def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
     ],
 )
 def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> None:
-    bench, step = Bench(MPI.COMM_SELF, exact=False), 1.0 / 15.0
+    bench, step = Bench(MPI.COMM_SELF, direct=False), 1.0 / 15.0
     content = shell(bench)[0] | {
         "gravity": [0, 0, 0],
         "time": {"analysis": "static", "step": step},
@@ -112,7 +112,7 @@ def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> N
 
 
 def test_a_leap_that_runs_out_of_iterations_is_gone_on_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench, starts = Bench(MPI.COMM_SELF, exact=False), list[np.ndarray]()
+    bench, starts = Bench(MPI.COMM_SELF, direct=False), list[np.ndarray]()
     content = open_cylinder_scene(bench, 8, "alternating")[0] | {
         "gravity": [0, 0, 0],
         "time": {"analysis": "static", "step": 0.1},

@@ -67,7 +67,7 @@ def ring(comm: MPI.Comm, part: float, start: float = OVAL) -> tuple[float, int]:
     M. Lévy, Journal de mathématiques pures et appliquées 10 (1884); S. P. Timoshenko, J. M. Gere, Theory of
     Elastic Stability, 2nd ed. 1961, § 7.3.
     """
-    bench = Bench(comm, exact=False)
+    bench = Bench(comm, direct=False)
     flat, faces = rectangle(16, 2, 1.0, 1.0, alternating=True)
     angle = 0.5 * math.pi * flat[:, 0]
     radius = RADIUS + start * np.cos(2.0 * angle)
@@ -133,7 +133,7 @@ def curled(comm: MPI.Comm, load: float, step: float) -> tuple[Array, int, str]:
         loads=[{"pressure": load * young * thickness**3 / 12.0}],
     )
     newton = 0
-    with Bench(comm, exact=False).simulation(content) as trial:
+    with Bench(comm, direct=False).simulation(content) as trial:
         while not trial.simulation.finished:
             newton += trial.step().newton_iterations
         tip = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)

@@ -881,7 +881,7 @@ def rolled(comm: MPI.Comm, n: int, pattern: str, **more: Any) -> tuple[Array, Ar
 )
 def test_fifteen_load_steps_in_eighty_iterations(shell: Callable[[Bench], dict[str, Any]], most: int) -> None:
     """Published shells, which their loads turn by a right angle and far more."""
-    with Bench(MPI.COMM_SELF, exact=False) as bench:
+    with Bench(MPI.COMM_SELF, direct=False) as bench:
         scene = shell(bench) | {
             "gravity": [0, 0, 0],
             "time": {"analysis": "static", "step": 1.0 / 15.0},

@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
+from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.results import Line, View, verdict_line, write_csv
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure
-
-OUTCOME_FILE = "outcome.json"
 
 
 @dataclass(frozen=True)
@@ -96,17 +94,6 @@ def outcome_of(case: FabricCase, record: Record) -> FabricOutcome:
     return FabricOutcome(case, verdicts, record.seconds, record=record)
 
 
-def save(outcome: FabricOutcome, folder: Path) -> None:
-    """Write the record of an outcome. On one rank."""
-    save_record(folder / OUTCOME_FILE, outcome.record)
-
-
-def restore(folder: Path, case: FabricCase) -> FabricOutcome | None:
-    """The outcome in a folder; None if there is none."""
-    record = read_record(folder / OUTCOME_FILE, Record)
-    return None if record is None else outcome_of(case, record)
-
-
 def _value(number: Number) -> str:
     spread = "" if math.isnan(number.scatter) else f" ± {short(number.scatter, 2)}"
     return f"{short(number.value, 4)}{spread}"
@@ -130,7 +117,7 @@ class Fabric(View[FabricOutcome]):
         self.title = f"Textile tests: {material}"
         self._outcomes: Sequence[FabricOutcome] = ()
 
-    def lines(self, outcome: FabricOutcome) -> Iterable[Line]:
+    def terminal_lines(self, outcome: FabricOutcome) -> Iterable[Line]:
         yield f"{outcome.case.name}: {outcome.case.title}", "bold"
         for number in outcome.record.numbers:
             yield f"  {number.quantity} = {_value(number)} {number.unit}", ""
@@ -138,21 +125,21 @@ class Fabric(View[FabricOutcome]):
             if name != "measured" or not verdict.passed:
                 yield verdict_line(verdict, f"{name}: ")
 
-    def rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
+    def csv_rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
         common = {"test": outcome.case.name, "passed": outcome.passed, "problem": outcome.record.stopped}
         for number in outcome.record.numbers:
             yield common | vars(number)
         if not outcome.record.numbers:
             yield common
 
-    def told(self, outcome: FabricOutcome) -> dict[str, Any]:
+    def case_content(self, outcome: FabricOutcome) -> dict[str, Any]:
         return {
             "numbers": [vars(number) for number in outcome.record.numbers],
             "passed": outcome.passed,
             "wall_seconds": outcome.seconds,
         }
 
-    def page(self, report: Report, outcomes: Sequence[FabricOutcome], summary: str, *, drawn: bool) -> None:
+    def fill(self, report: Report, outcomes: Sequence[FabricOutcome], summary: str, *, plots: bool) -> None:
         self._outcomes = outcomes
         report.paragraph(
             f"{summary} Specimens bend by directors on edges (bending_model: midedge) whatever the scene "
@@ -169,18 +156,18 @@ class Fabric(View[FabricOutcome]):
             report.paragraph(f"{outcome.case.title}. Run time {seconds(outcome.seconds)}.")
             for name, verdict in outcome.verdicts.items():
                 report.paragraph(f"{name}: {verdict.line}.")
-            if drawn:
+            if plots:
                 for drawing in pictures(outcome):
                     report.figure(drawing)
 
-    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+    def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         for outcome in self._outcomes:
             curves = outcome.record.curves
             for number, curve in enumerate(curves, 1):
                 name = outcome.case.name + (f"-{number}" if len(curves) > 1 else "")
                 lines = [(curve.x_label, curve.y_label), *zip(curve.x, curve.y, strict=True)]
                 write_csv(folder / f"{name}.csv", lines)
-        return super().close(report, folder, command)
+        return super().close_page(report, folder, command)
 
 
 def pictures(outcome: FabricOutcome) -> list[Drawing]:

@@ -21,15 +21,15 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError, nearest
-from lyra_petsc.experiments.bench import Bench, problem_of
+from lyra_petsc.experiments.bench import Bench, failure_message
 from lyra_petsc.experiments.case import Launcher, Watch
 from lyra_petsc.experiments.drape import (
     CLOTH,
     MARGIN,
     STARTS,
+    count_folds,
+    drape_cloth,
     drape_coefficient,
-    draped,
-    folds,
     shadow,
 )
 from lyra_petsc.experiments.fabric.fabric_report import (
@@ -39,10 +39,9 @@ from lyra_petsc.experiments.fabric.fabric_report import (
     Number,
     Record,
     outcome_of,
-    restore,
 )
 from lyra_petsc.experiments.fabric.specimens import Fabric, G
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rounded
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, square_to_disc
 from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import GF_PER_CM, ShellMaterial
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
@@ -79,7 +78,7 @@ def _through(
     """The simulation of a scene at each of these values but the first, also where it takes shorter steps."""
     factors = [k / (len(values) - 1) for k in range(1, len(values))]
     with bench.simulation(content | _path(values), land=factors[:-1]) as trial:
-        yield trial.through(factors)
+        yield trial.run_through(factors)
 
 
 def _to_and_fro(largest: float, steps: int, *, closed: bool) -> list[float]:
@@ -491,7 +490,7 @@ PIXELS = 240
 def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
     """A disc of radius 1, a square of irregular cells mapped smoothly: no direction has more folds for it."""
     flat, faces = irregular_rectangle(cells, cells, 2.0, 2.0, seed)
-    return rounded(flat - [1.0, 1.0, 0.0]), faces
+    return square_to_disc(flat - [1.0, 1.0, 0.0]), faces
 
 
 def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
@@ -501,10 +500,10 @@ def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     dark = np.zeros((1, 1), dtype=np.bool_)
     for start in range(STARTS):
         flat, faces = _disc(ACROSS, start)
-        x = draped(bench, CLOTH * flat, faces, CLOTH * flat[:, :2], fabric.turned(degrees), start)
+        x = drape_cloth(bench, CLOTH * flat, faces, CLOTH * flat[:, :2], fabric.turned(degrees), start)
         dark = shadow(x, faces, PIXELS)
         coefficients.append(100.0 * drape_coefficient(dark))
-        counts.append(float(folds(dark)))
+        counts.append(float(count_folds(dark)))
     record.numbers = [
         Number(name, float(np.mean(values)), unit, float(np.std(values, ddof=1)))
         for name, values, unit in (("drape coefficient", coefficients, "%"), ("folds", counts, "1"))
@@ -530,14 +529,14 @@ class TextileTest:
     measure : callable (bench, fabric, degrees) → Record
     both : bool
         Warp and weft have one each.
-    exact : bool
+    direct : bool
         By a direct solver.
     """
 
     title: str
     measure: Measure
     both: bool = True
-    exact: bool = True
+    direct: bool = True
 
 
 TESTS = {
@@ -546,7 +545,7 @@ TESTS = {
     "bending": TextileTest("KES-F 2, 1 cm bent to ±2.5 cm⁻¹", bending),
     "cantilever": TextileTest("ASTM D1388, overhang at 41.5°", cantilever),
     "loop": TextileTest("Peirce's heart loop", loop),
-    "cusick": TextileTest("BS 5058, 30 cm on a disc of 18 cm", cusick, both=False, exact=False),
+    "cusick": TextileTest("BS 5058, 30 cm on a disc of 18 cm", cusick, both=False, direct=False),
 }
 ALL = "all"
 
@@ -576,12 +575,12 @@ def cases_of(test: str) -> list[FabricCase]:
 def run_case(comm: MPI.Comm, case: FabricCase, fabric: Fabric, watch: Watch) -> FabricOutcome:
     """Run a test; collective, the same outcome on all ranks."""
     began, test = time.perf_counter(), TESTS[case.test]
-    with Bench(comm, watch, exact=test.exact) as bench:
+    with Bench(comm, watch, direct=test.direct) as bench:
         bench.watch()
         try:
             record = test.measure(bench, fabric, case.degrees)
         except SolverError as error:
-            record = Record(stopped=problem_of(comm, error))
+            record = Record(stopped=failure_message(comm, error))
     record.seconds = comm.bcast(time.perf_counter() - began)
     return outcome_of(case, record)
 
@@ -594,6 +593,5 @@ def launched(launcher: Launcher, case: FabricCase, asked: Sequence[str], watch: 
     InputError
         If the launched program refuses what it was asked for.
     """
-    words = [case.test, *asked, "--only", case.name]
-    outcome, told = launcher.restored(words, watch, lambda folder: restore(folder, case))
-    return outcome_of(case, Record(stopped=told)) if outcome is None else outcome
+    record, message = launcher.run_case([case.test, *asked, "--only", case.name], watch, Record)
+    return outcome_of(case, record or Record(stopped=message))

@@ -12,7 +12,7 @@ import numpy as np
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.fit.estimate import Estimate
 from lyra_petsc.experiments.fit.fit_runner import Fitted
-from lyra_petsc.experiments.results import View, aligned
+from lyra_petsc.experiments.results import View, align_columns
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
 from lyra_petsc.show.report.plots import colour, drawn, empty_figure, surface
 
@@ -52,23 +52,23 @@ class Fit(View[FitOutcome]):
     def __init__(self, title: str) -> None:
         self.title, self.ready = title, False  # nothing is told of a fit that was stopped
 
-    def ended(self, outcomes: Sequence[FitOutcome]) -> None:
+    def case_ended(self, outcomes: Sequence[FitOutcome]) -> None:
         self.ready = True
 
-    def rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
+    def csv_rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
         for each in outcome.fitted.conclusion.estimates:
             low, high = each.interval
             numbers = each.key, each.start, each.low, each.high, each.value, each.deviation, low, high
             yield dict(zip(self.columns, [*numbers, int(each.at_bound)], strict=True))
 
-    def summary(self, outcomes: Sequence[FitOutcome]) -> list[Sequence[str]]:
+    def summary_table(self, outcomes: Sequence[FitOutcome]) -> list[Sequence[str]]:
         fitted = outcomes[0].fitted
         rows: list[Sequence[str]] = [("parameter", "start", "found", "95 % interval")]
         for each in fitted.conclusion.estimates:
             rows.append((each.key, f"{each.start:.5g}", f"{each.value:.5g}", _deviation(each)))
         return rows
 
-    def told(self, outcome: FitOutcome) -> dict[str, Any]:
+    def case_content(self, outcome: FitOutcome) -> dict[str, Any]:
         fitted = outcome.fitted
         conclusion = fitted.conclusion
 
@@ -95,7 +95,7 @@ class Fit(View[FitOutcome]):
             ],
         }  # fmt: skip
 
-    def page(self, report: Report, outcomes: Sequence[FitOutcome], summary: str, *, drawn: bool) -> None:
+    def fill(self, report: Report, outcomes: Sequence[FitOutcome], summary: str, *, plots: bool) -> None:
         fitted = outcomes[0].fitted
         conclusion = fitted.conclusion
         report.heading("Numbers")
@@ -113,7 +113,7 @@ class Fit(View[FitOutcome]):
                 f"Sum of squares over degrees of freedom: {short(conclusion.misfit)} (1 is expected)."
             )
         report.heading("Before and after")
-        if drawn:
+        if plots:
             report.figure(_residuals(fitted))
             report.figure(_costs(fitted))
             if fitted.triangles is not None:
@@ -154,8 +154,8 @@ class Fit(View[FitOutcome]):
     def terminal(self, outcome: FitOutcome) -> list[str]:
         """What the terminal shows at the end."""
         fitted = outcome.fitted
-        table = self.summary([outcome])
-        return [*aligned(table, len(table[0])), *fitted.conclusion.words, fitted.words]
+        table = self.summary_table([outcome])
+        return [*align_columns(table, len(table[0])), *fitted.conclusion.words, fitted.words]
 
 
 def _residuals(fitted: Fitted) -> Drawing:

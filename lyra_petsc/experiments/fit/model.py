@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments.bench import simulated
+from lyra_petsc.experiments.bench import open_simulation
 from lyra_petsc.experiments.case import Watch
 from lyra_petsc.experiments.fit.readings import SAME_TIME, HandleForce, Reading, instants
 from lyra_petsc.mesh.build import build_scene_mesh
@@ -150,7 +150,7 @@ class Model:
         values: list[Array] = []
         slopes: list[Array] = []
         self.runs += 1
-        with simulated(self.comm, scene, mesh=self.mesh, land=land) as simulation:
+        with open_simulation(self.comm, scene, mesh=self.mesh, land=land) as simulation:
             beside: Sensitivities | None = None
             if derivatives:
                 chosen = [

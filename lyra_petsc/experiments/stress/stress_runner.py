@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments.bench import Trial, problem_of
-from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, read_record, save_record
+from lyra_petsc.experiments.bench import Trial, failure_message
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
     LITTLE_LOST,
@@ -47,6 +46,18 @@ BASE_STEPS = 20
 
 
 @dataclass
+class SavedOutcome:
+    """A `StressOutcome` without its case, as the process of a case returns it to the one that launched it."""
+
+    verdicts: dict[str, Verdict]
+    seconds: float
+    left_out: str
+    record: Record
+    ratio: float
+    busy_ratio: float
+
+
+@dataclass
 class StressOutcome(Outcome[StressCase]):
     """The result of a case.
 
@@ -69,6 +80,10 @@ class StressOutcome(Outcome[StressCase]):
         if not self.passed:
             return "FAILED"
         return "right" if self.record.lost <= LITTLE_LOST else "solved"
+
+    def saved(self) -> SavedOutcome:
+        """All but the case, which cannot be stored in a file."""
+        return SavedOutcome(**{name: value for name, value in vars(self).items() if name != "case"})
 
 
 class BaseClock:
@@ -156,7 +171,7 @@ def run_case(
             with bench.simulation(content) as trial:
                 _run(trial, case, record, began - compiled + LONGEST[setting.level])
         except (InputError, SolverError) as error:
-            record.stopped = problem_of(comm, error)
+            record.stopped = failure_message(comm, error)
         outcome.verdicts = of_physics(record)
         if clock is not None and before is not None:
             wall, busy = 0.5 * (before + clock.measure())
@@ -228,21 +243,6 @@ def _energy(trial: Trial) -> float:
     return budget.kinetic + budget.membrane + budget.bending + budget.potential
 
 
-OUTCOME_FILE = "outcome.json"
-
-
-@dataclass
-class SavedOutcome:
-    """A `StressOutcome` without its case, for the process that has launched this one."""
-
-    verdicts: dict[str, Verdict]
-    seconds: float
-    left_out: str
-    record: Record
-    ratio: float
-    busy_ratio: float
-
-
 def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: Watch) -> StressOutcome:
     """The result of a case that is run in processes of its own.
 
@@ -260,24 +260,11 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
     InputError
         If the launched program refuses what it was asked for.
     """
-    words = [*asked, "--only", case.name]
-    outcome, told = launcher.restored(words, watch, lambda folder: restore(folder, case))
-    if outcome is None:
-        record = Record(case.steps, stopped=told)
-        outcome = StressOutcome(case, of_physics(record), record=record)
-    return outcome
-
-
-def save(outcome: StressOutcome, folder: Path) -> None:
-    """Write an outcome, but for its case. On one rank."""
-    content = {name: value for name, value in vars(outcome).items() if name != "case"}
-    save_record(folder / OUTCOME_FILE, SavedOutcome(**content))
-
-
-def restore(folder: Path, case: StressCase) -> StressOutcome | None:
-    """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
-    told = read_record(folder / OUTCOME_FILE, SavedOutcome)
-    return StressOutcome(case, **vars(told)) if told is not None else None
+    saved, message = launcher.run_case([*asked, "--only", case.name], watch, SavedOutcome)
+    if saved is not None:
+        return StressOutcome(case, **vars(saved))
+    record = Record(case.steps, stopped=message)
+    return StressOutcome(case, of_physics(record), record=record)
 
 
 PICTURES = 6
@@ -324,7 +311,7 @@ def row_of(outcome: StressOutcome) -> dict[str, Any]:
         "step_over_base": outcome.ratio,
         "step_over_base_cpu": outcome.busy_ratio,
         "wall_seconds": outcome.seconds,
-        "failures": "; ".join(f"{name}: {verdict.words}" for name, verdict in outcome.failures.items()),
+        "failures": "; ".join(f"{name}: {verdict.message}" for name, verdict in outcome.failures.items()),
     }
 
 
@@ -369,15 +356,15 @@ class Stress(View[StressOutcome]):
     def heading(self) -> str:
         return _padded(list(HEADINGS))
 
-    def lines(self, outcome: StressOutcome) -> Iterable[Line]:
+    def terminal_lines(self, outcome: StressOutcome) -> Iterable[Line]:
         if outcome.left_out:
             yield f"{outcome.case.name}: left out: {outcome.left_out}", "dim"
             return
         yield _padded(cells(outcome)), "" if outcome.passed else "bold red"
         for name, verdict in outcome.failures.items():
-            yield f"    {name}: {verdict.words}", "red"
+            yield f"    {name}: {verdict.message}", "red"
 
-    def summary(self, outcomes: Sequence[StressOutcome]) -> list[Sequence[str]]:
+    def summary_table(self, outcomes: Sequence[StressOutcome]) -> list[Sequence[str]]:
         table: list[Sequence[str]] = [("family", "passed", "run time [s]")]
         run = [outcome for outcome in outcomes if not outcome.left_out]
         for family in dict.fromkeys(outcome.case.family for outcome in run):
@@ -386,15 +373,15 @@ class Stress(View[StressOutcome]):
             table.append((family, passed, f"{sum(outcome.seconds for outcome in mine):.1f}"))
         return table
 
-    def ended(self, outcomes: Sequence[StressOutcome]) -> None:
+    def case_ended(self, outcomes: Sequence[StressOutcome]) -> None:
         """Free the shapes that the page will not show, since there are worse cases."""
         for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
             outcome.record.last = outcome.record.triangles = None
 
-    def rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
+    def csv_rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
         yield row_of(outcome)
 
-    def told(self, outcome: StressOutcome) -> dict[str, Any]:
+    def case_content(self, outcome: StressOutcome) -> dict[str, Any]:
         record = outcome.record
         return row_of(outcome) | {
             "notes": record.notes,
@@ -403,11 +390,11 @@ class Stress(View[StressOutcome]):
             "energies": [record.start_energy, *record.energies],
         }
 
-    def facts(self, outcomes: Sequence[StressOutcome]) -> dict[str, Any]:
+    def summary_content(self, outcomes: Sequence[StressOutcome]) -> dict[str, Any]:
         left_out = {outcome.case.name: outcome.left_out for outcome in outcomes if outcome.left_out}
         return {"complete": len(outcomes) == self._count, "left_out": left_out}
 
-    def page(self, report: Report, outcomes: Sequence[StressOutcome], summary: str, *, drawn: bool) -> None:
+    def fill(self, report: Report, outcomes: Sequence[StressOutcome], summary: str, *, plots: bool) -> None:
         run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=badness, reverse=True)
         base = self._setting.base.get("title") or "without a title"
         report.paragraph(
@@ -421,7 +408,7 @@ class Stress(View[StressOutcome]):
         )
         report.table(list(HEADINGS), [cells(one) for one in run], marked=[not one.passed for one in run])
         failed = [
-            f"{outcome.case.name} ({outcome.case.title}): {name}: {verdict.words}"
+            f"{outcome.case.name} ({outcome.case.title}): {name}: {verdict.message}"
             for outcome in run
             for name, verdict in outcome.failures.items()
         ]
@@ -432,7 +419,7 @@ class Stress(View[StressOutcome]):
         for outcome in run[:PICTURES]:
             report.paragraph(f"{outcome.case.name}: {outcome.case.title}.")
             report.bullets(outcome.record.notes)
-            if drawn:
+            if plots:
                 _figures(report, outcome)
         report.heading("What was judged")
         report.table(

@@ -74,7 +74,7 @@ class Setting:
 
     def bench(self, comm: MPI.Comm, watch: Callable[[], None] | None) -> Bench:
         """Where its scenes run as a user's do."""
-        return Bench(comm, watch, exact=False, trust_mesh=self.trust_mesh)
+        return Bench(comm, watch, direct=False, trust_mesh=self.trust_mesh)
 
     @property
     def step(self) -> float:

@@ -19,7 +19,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError, SolverError
-from lyra_petsc.experiments.bench import problem_of, simulated
+from lyra_petsc.experiments.bench import failure_message, open_simulation
 from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
 from lyra_petsc.output.agreement import reason
@@ -233,13 +233,13 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
         for repeat in range(job.repeats):
             _repeat(comm, scene, job, repeat, result, watch)
     except (InputError, SolverError) as error:
-        result.fail(problem_of(comm, error))
+        result.fail(failure_message(comm, error))
     on_root(comm, lambda: save_record(folder / RESULT_FILE, result))
     return result
 
 
 def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
-    with simulated(comm, scene) as simulation:
+    with open_simulation(comm, scene) as simulation:
         simulation.problem.release()
         if not simulation.finished:
             simulation.step()
@@ -250,7 +250,7 @@ def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result,
     folder = Path(job.folder)
     comm.Barrier()
     phases, began = Phases(), time.perf_counter()
-    with simulated(comm, scene, phases) as simulation, ExitStack() as stack:
+    with open_simulation(comm, scene, phases) as simulation, ExitStack() as stack:
         comm.Barrier()
         set_up = time.perf_counter() - began
         recorder, outline = None, simulation.problem.outline

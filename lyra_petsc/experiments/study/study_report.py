@@ -541,11 +541,11 @@ class Study(View[Outcome[Any]]):
             choose_recommended(self.advice[physics])
         self.columns, self.ready = list(record(plan, work.rows[0])), True
 
-    def rows(self, outcome: Outcome[Any]) -> Iterator[dict[str, Any]]:
+    def csv_rows(self, outcome: Outcome[Any]) -> Iterator[dict[str, Any]]:
         if isinstance(outcome, StudyRow):
             yield record(self.plan, outcome)
 
-    def cell(self, value: Any) -> str:
+    def csv_cell(self, value: Any) -> str:
         if value is None:
             return ""
         if isinstance(value, bool):
@@ -604,7 +604,7 @@ class Study(View[Outcome[Any]]):
             ],
         }
 
-    def page(self, report: Report, outcomes: Sequence[Outcome[Any]], summary: str, *, drawn: bool) -> None:
+    def fill(self, report: Report, outcomes: Sequence[Outcome[Any]], summary: str, *, plots: bool) -> None:
         plan, rows, known = self.plan, self.work.rows, self.work.known
         for physics, one in known.items():
             _advise(report, plan, physics, one, self.advice[physics])
@@ -625,7 +625,7 @@ class Study(View[Outcome[Any]]):
             report.heading("What failed")
             report.table(["combination", "why"], failed)
 
-    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+    def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         report.heading("To repeat it")
         report.code(shlex.join(command))
         report.table(["", "version"], list(all_versions().items()))

@@ -21,7 +21,7 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.meshes import SIDES, irregular_rectangle, rectangle, rectangle_script, sides
+from lyra_petsc.experiments.meshes import SIDES, irregular_rectangle, rectangle, rectangle_script, side_edges
 from lyra_petsc.experiments.verification.verification_case import grid, isotropic, scene
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
@@ -37,8 +37,8 @@ HELD = {"CCCC": (True, SIDES), "SSSS": (False, SIDES), "CFFF": (True, ("left",))
 
 def held(edges: str) -> list[dict[str, Any]]:
     """The handles of a plate whose edges are named as in `HELD`."""
-    clamp, sides = HELD[edges]
-    return [{"group": side, "clamp": clamp} for side in sides]
+    clamp, clamped = HELD[edges]
+    return [{"group": side, "clamp": clamp} for side in clamped]
 
 
 def flat_mesh(
@@ -49,10 +49,10 @@ def flat_mesh(
     gmsh's edges are as long as a cell along x, and it puts a vertex in the middle where ny is even.
     """
     if kind == "irregular":
-        return bench.grouped(*irregular_rectangle(nx, ny, width, height), sides(nx, ny))
+        return bench.mesh_with_groups(*irregular_rectangle(nx, ny, width, height), side_edges(nx, ny))
     if kind == "gmsh":
         middle = () if ny % 2 else (0.5 * width, 0.5 * height)
-        return bench.script(rectangle_script(width, height, width / nx, middle))
+        return bench.gmsh_mesh(rectangle_script(width, height, width / nx, middle))
     return grid(width, height, nx, ny, kind)
 
 

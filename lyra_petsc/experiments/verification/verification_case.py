@@ -18,9 +18,9 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments.bench import Bench, problem_of
+from lyra_petsc.experiments.bench import Bench, failure_message
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
-from lyra_petsc.experiments.results import Line, View, aligned, verdict_line
+from lyra_petsc.experiments.results import Line, View, align_columns, verdict_line
 from lyra_petsc.extras import remedy
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
@@ -345,7 +345,7 @@ def _rows_at(
                 row.steps, row.wall_seconds = bench.latest
                 rows.append(row)
         except (InputError, SolverError) as error:
-            problem = problem_of(comm, error)
+            problem = failure_message(comm, error)
         except ModuleNotFoundError as error:  # on all ranks
             problem = remedy([str(error.name)])
     if not isinstance(measured, Generator):
@@ -394,7 +394,7 @@ class Verification(View[VerificationOutcome]):
         "passed", "problem",
     )  # fmt: skip
 
-    def lines(self, outcome: VerificationOutcome) -> Iterable[Line]:
+    def terminal_lines(self, outcome: VerificationOutcome) -> Iterable[Line]:
         case = outcome.case
         yield f"{case.name}: {case.title}", "bold"
         yield f"source: {case.source}; n: {case.counts}", ""
@@ -402,16 +402,16 @@ class Verification(View[VerificationOutcome]):
             if not rows[0].problem:
                 yield f"  {quantity}", ""
                 table = [headings(rows[0].unit), *map(cells, rows)]
-                yield from ((line, "") for line in aligned(table, words=0))
+                yield from ((line, "") for line in align_columns(table, text_columns=0))
             yield verdict_line(outcome.verdicts[quantity])
         yield "", ""
 
-    def rows(self, outcome: VerificationOutcome) -> Iterable[Mapping[str, Any]]:
+    def csv_rows(self, outcome: VerificationOutcome) -> Iterable[Mapping[str, Any]]:
         for row in outcome.rows:
             passed = outcome.verdicts[row.quantity].passed
             yield asdict(row) | {"case": outcome.case.name, "passed": passed}
 
-    def told(self, outcome: VerificationOutcome) -> dict[str, Any]:
+    def case_content(self, outcome: VerificationOutcome) -> dict[str, Any]:
         return {
             "source": outcome.case.source,
             "counts": outcome.case.counts,
@@ -420,8 +420,8 @@ class Verification(View[VerificationOutcome]):
             "rows": [asdict(row) for row in outcome.rows],
         }
 
-    def page(
-        self, report: Report, outcomes: Sequence[VerificationOutcome], summary: str, *, drawn: bool
+    def fill(
+        self, report: Report, outcomes: Sequence[VerificationOutcome], summary: str, *, plots: bool
     ) -> None:
         report.paragraph(
             f"{summary} The error is |value − exact| over the size of the exact value, or over a natural "
@@ -439,8 +439,8 @@ class Verification(View[VerificationOutcome]):
                 if not rows[0].problem:
                     report.table(headings(rows[0].unit), [cells(row) for row in rows], caption=quantity)
                 verdict = outcome.verdicts[quantity]
-                report.paragraph(f"{'Passed' if verdict.passed else 'FAILED'}: {verdict.words}.")
-            if drawn:
+                report.paragraph(f"{'Passed' if verdict.passed else 'FAILED'}: {verdict.message}.")
+            if plots:
                 _figures(report, outcome)
 
 

@@ -11,9 +11,10 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.drape import DISC, disc_of, drape_coefficient, folds, shadow
+from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
+from lyra_petsc.experiments.drape import DISC, count_folds, disc_mesh, drape_coefficient, shadow
 from lyra_petsc.experiments.fabric import textile_tests
-from lyra_petsc.experiments.fabric.fabric_report import FabricCase, outcome_of, restore, save
+from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, outcome_of
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
 from lyra_petsc.scene.materials.curves import force_at
@@ -123,23 +124,22 @@ def test_a_loop_without_weight_and_one_that_hangs() -> None:
 def test_folds_and_coefficient_of_a_shadow_that_is_known(count: int) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     rim = 0.12 * (1.0 + 0.08 * np.cos(count * angle))
-    vertices, faces = disc_of(angle)
+    vertices, faces = disc_mesh(angle)
     vertices[:-1] *= (rim / DISC)[:, None]
     dark = shadow(vertices, faces, 240)
-    assert folds(dark) == count
+    assert count_folds(dark) == count
     area = 0.5 * np.sum(rim[:-1] * rim[1:] * np.sin(np.diff(angle)))
     exact = (area - np.pi * DISC**2) / (np.pi * (0.15**2 - DISC**2))
     assert drape_coefficient(dark) == pytest.approx(exact, abs=0.005)
-    assert folds(shadow(*disc_of(angle), 240)) == 0
+    assert count_folds(shadow(*disc_mesh(angle), 240)) == 0
 
 
 def test_a_record_outlives_its_process(tmp_path: Path) -> None:
     case = FabricCase("loop-warp", "title", "loop", 0.0)
     with Bench(MPI.COMM_SELF) as bench:
         outcome = outcome_of(case, textile_tests.tensile(bench, FABRIC, 0.0))
-    save(outcome, tmp_path)
-    found = restore(tmp_path, case)
-    assert found is not None
+    save_record(tmp_path / OUTCOME_FILE, outcome.record)
+    found = outcome_of(case, load_record(tmp_path / OUTCOME_FILE, Record))
     assert found.record.curves == outcome.record.curves
     assert [(n.quantity, n.value) for n in found.record.numbers] == [
         (n.quantity, n.value) for n in outcome.record.numbers

@@ -81,7 +81,7 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     [case] = selected(["pressed"], Scope.QUICK)
     outcome = run_case(comm, case, Setting(sheet(10), False, Scope.QUICK))
     assert any(balance.jumped for balance in outcome.record.balances)
-    assert "jumped" in outcome.verdicts["energy"].words
+    assert "jumped" in outcome.verdicts["energy"].message
     assert outcome.failures == {}
 
 
@@ -160,7 +160,7 @@ def test_a_torque_from_within_is_seen(comm: MPI.Comm, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
     failures = run(comm).failures
-    assert "angular" in failures["momentum"].words
+    assert "angular" in failures["momentum"].message
 
 
 def test_a_step_that_was_not_solved_is_seen(comm: MPI.Comm) -> None:

@@ -84,7 +84,7 @@ def test_an_unknown_name_is_refused(name: str) -> None:
 def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None:
     setting = setting_of(scene if given else None, (), Scope.QUICK)
     made, left_out = 0, []
-    with Bench(comm, exact=False) as bench:
+    with Bench(comm, direct=False) as bench:
         for case in selected([], Scope.FULL):
             try:
                 content = case.content(setting, bench)

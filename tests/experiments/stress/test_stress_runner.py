@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
 from lyra_petsc.experiments.stress import stress_runner
 from lyra_petsc.experiments.stress.cases import selected
 from lyra_petsc.experiments.stress.stress_runner import (
     PICTURES,
     BaseClock,
+    SavedOutcome,
     Stress,
     StressOutcome,
-    restore,
     row_of,
     run_case,
-    save,
 )
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
@@ -62,7 +62,7 @@ def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
 def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
     outcomes = [run_case(comm, StressCase("a", "b", as_it_is, steps=1), SMALL) for _ in range(PICTURES + 2)]
     outcomes[-1].record.stopped = "at once"
-    Stress(SMALL, len(outcomes)).ended(outcomes)
+    Stress(SMALL, len(outcomes)).case_ended(outcomes)
     assert outcomes[-1].record.last is not None
     assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
 
@@ -72,7 +72,7 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_max_it": 0}}
     outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert not outcome.passed
-    assert "did not converge" in outcome.failures["converged"].words
+    assert "did not converge" in outcome.failures["converged"].message
     row = row_of(outcome)
     assert (row["steps"], row["converged"]) == (0, False)
     # where it stood is kept to be drawn
@@ -83,7 +83,7 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
 def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_atol": 1e9}}
     outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
-    assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].words
+    assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].message
 
 
 @pytest.mark.parallel(2)
@@ -101,14 +101,14 @@ def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None
     content = sheet(6)
     content["handles"] = [{"group": "nowhere"}]
     outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
-    assert "nowhere" in outcome.failures["converged"].words
+    assert "nowhere" in outcome.failures["converged"].message
 
 
 @pytest.mark.parallel(2)
 def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(stress_runner.LONGEST, Scope.QUICK, 0.0)
     outcome = run_case(comm, StressCase("a", "b", as_it_is), SMALL)
-    assert "has had its time" in outcome.failures["converged"].words
+    assert "has had its time" in outcome.failures["converged"].message
 
 
 def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> None:
@@ -132,10 +132,8 @@ def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
 
 def test_an_outcome_goes_through_files(comm: MPI.Comm, tmp_path: Path) -> None:
     outcome = run(comm, "pressed")
-    assert restore(tmp_path, outcome.case) is None
-    save(outcome, tmp_path)
-    back = restore(tmp_path, outcome.case)
-    assert back is not None
+    save_record(tmp_path / OUTCOME_FILE, outcome.saved())
+    back = StressOutcome(outcome.case, **vars(load_record(tmp_path / OUTCOME_FILE, SavedOutcome)))
     assert back.verdicts == outcome.verdicts
     mine, theirs = row_of(outcome), row_of(back)
     assert tuple(mine) == tuple(theirs) == Stress.columns

@@ -28,7 +28,7 @@ def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: objec
 
 
 def failures(found: Record) -> dict[str, str]:
-    return {name: verdict.words for name, verdict in of_physics(found).items() if not verdict.passed}
+    return {name: verdict.message for name, verdict in of_physics(found).items() if not verdict.passed}
 
 
 def test_a_good_record_passes() -> None:
@@ -81,11 +81,11 @@ def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(left: float, 
 def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
     buckling = replace(GOOD, bracket=0.7, change=0.4)
     assert failures(record(buckling)) == {}
-    assert "buckling" in of_physics(record(buckling))["no gain"].words
+    assert "buckling" in of_physics(record(buckling))["no gain"].message
 
 
 def test_round_off_as_the_promise_is_said() -> None:
-    words = of_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].words
+    words = of_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].message
     assert "floor of round-off" in words
 
 
@@ -97,8 +97,8 @@ def test_a_run_that_stopped_has_not_converged() -> None:
 def test_rejected_steps_are_told_and_allowed() -> None:
     verdict = of_physics(record(report=replace(STEP, rejected=2, dt=0.0025)))["converged"]
     assert verdict.passed
-    assert "2 attempts rejected" in verdict.words
-    assert "0.0025 s" in verdict.words
+    assert "2 attempts rejected" in verdict.message
+    assert "0.0025 s" in verdict.message
 
 
 def test_softening_must_be_told() -> None:
@@ -144,5 +144,5 @@ def test_the_whole_run_is_judged(integrator: str, lost: float, gained: float, go
     found = replace(record(integrator=integrator), balance=balance)
     verdicts = of_physics(found)
     assert verdicts["whole run"].passed is good
-    assert "2 attempts repeated" in verdicts["whole run"].words
+    assert "2 attempts repeated" in verdicts["whole run"].message
     assert StressOutcome(StressCase("a", "b", as_it_is), verdicts, record=found).verdict == word

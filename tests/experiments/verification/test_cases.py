@@ -86,5 +86,5 @@ def test_passes(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(sys.modules[case.measure.__module__], constant, fewer)
     # on several ranks, those resolutions that show that they give the same
     outcome = run_case(comm, case, quick=comm.size > 1 or name in LONG, warm=False)
-    words = "; ".join(f"{quantity}: {verdict.words}" for quantity, verdict in outcome.verdicts.items())
+    words = "; ".join(f"{quantity}: {verdict.message}" for quantity, verdict in outcome.verdicts.items())
     assert outcome.passed, words

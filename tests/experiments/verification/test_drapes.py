@@ -12,7 +12,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments import drape
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.drape import CLOTH, STARTS
-from lyra_petsc.experiments.meshes import rings
+from lyra_petsc.experiments.meshes import ring_disc
 from lyra_petsc.experiments.verification.cases import contacts
 from lyra_petsc.stepping.simulation import StepReport
 
@@ -29,7 +29,7 @@ def lengths(x: Array, pairs: Ints) -> Array:
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_rings_fill_a_polygon(n: int) -> None:
-    vertices, faces = rings(n)
+    vertices, faces = ring_disc(n)
     sides = vertices[faces][:, 1:, :2] - vertices[faces][:, :1, :2]
     areas = 0.5 * np.linalg.det(sides)
     pairs, counts = edges(faces)

@@ -70,8 +70,8 @@ def test_orders_are_those_of_the_errors() -> None:
 def test_claims(claim: Claim, errors: tuple[float, ...], good: bool) -> None:
     rows = table(*errors)
     verdict = claim.judge(rows, finest(rows))
-    assert verdict.passed is good, verdict.words
-    assert verdict.words
+    assert verdict.passed is good, verdict.message
+    assert verdict.message
 
 
 def test_the_bound_of_a_quick_run_grows_with_its_h() -> None:
@@ -124,7 +124,7 @@ def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
         (8, "the step did not converge"),
         (16, "some.key: is not there"),
     ]
-    assert "n = 8" in outcome.verdicts["could not run"].words
+    assert "n = 8" in outcome.verdicts["could not run"].message
 
 
 @pytest.mark.parallel(2)
@@ -180,4 +180,4 @@ def test_a_package_that_is_missing_is_named() -> None:
     case = VerificationCase("a", "b", measure, "c", (1.0,), Exact())
     [verdict] = run_case(MPI.COMM_SELF, case).verdicts.values()
     assert not verdict.passed
-    assert "scipy is not installed; get the extra" in verdict.words
+    assert "scipy is not installed; get the extra" in verdict.message

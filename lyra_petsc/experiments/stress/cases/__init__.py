@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.experiments.case import Registry, in_modules
+from lyra_petsc.experiments.case import Registry, module_by_name
 from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase
 
 FAMILIES: Registry[CaseFamily] = Registry(
     "lyra_petsc.experiments.stress.cases",
-    in_modules(
+    module_by_name(
         ("sheets", "stiff-steps membrane bending time-step density anisotropy damping wind gravity"),
         ("sheets", "handles start elements free compression"),
         ("contact", "contact"),

@@ -16,7 +16,7 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.meshes import evenly, rectangle
+from lyra_petsc.experiments.meshes import rectangle, resample_polyline
 from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
@@ -137,7 +137,7 @@ def _knot(setting: Setting, bench: Bench) -> Content:
     way = KNOT * np.concatenate([tails[0][::-1], bow, tails[1]])
     length = float(np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))[-1])
     cells = round(length / STRAND)
-    middle = evenly(way, cells + 1)
+    middle = resample_polyline(way, cells + 1)
     along = np.gradient(middle, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from lyra_petsc.experiments.case import Registry, in_modules
+from lyra_petsc.experiments.case import Registry, module_by_name
 from lyra_petsc.experiments.verification.verification_case import VerificationCase
 
 CASES: Registry[VerificationCase] = Registry(
     "lyra_petsc.experiments.verification.cases",
-    in_modules(
+    module_by_name(
         ("membranes", "patch-states"),
         ("motions", "free-fall oscillator rigid-rotation wind-drag"),
         ("membranes", "uniaxial-pull"),

@@ -445,7 +445,7 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                 loads=[{"traction": [0.0, 0.0, ASIDE], "until": 0.1}],
             )
             with bench.simulation(shortened) as trial:
-                for shortening, _ in zip(SHORTENINGS, trial.through((0.5, 1.0)), strict=True):
+                for shortening, _ in zip(SHORTENINGS, trial.run_through((0.5, 1.0)), strict=True):
                     load, height = column_shape(shortening=shortening)
                     load *= COLUMNS[words][1] / math.pi**2
                     name = f"{words}, {kind}, shortened by {shortening:g} L"

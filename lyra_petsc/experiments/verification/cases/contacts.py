@@ -17,11 +17,11 @@ from lyra_petsc.experiments.drape import (
     CLOTH,
     DISC,
     STARTS,
+    drape_cloth,
     drape_coefficient,
-    draped,
     shadow,
 )
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rings, rounded
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, ring_disc, square_to_disc
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.verification_case import (
     FLOOR,
@@ -86,16 +86,9 @@ def _roof(bench: Bench, degrees: float) -> dict[str, Any]:
     return {"mesh": bench.mesh(np.column_stack([math.cos(angle) * x, y, -math.sin(angle) * x]), faces)}
 
 
-def _at(trial: Trial, time: float) -> Trial:
-    """Steps to a time [s]; collective."""
-    while trial.simulation.time < time - 0.5 * STEP:
-        trial.step()
-    return trial
-
-
 def _creep(trial: Trial, down: Array) -> float:
     """Farthest way [m] of a vertex down a slope from when it has settled to the end; collective."""
-    settled = _at(trial, SETTLED).x
+    settled = trial.run_to(SETTLED).x
     return float(np.abs((trial.run().x - settled) @ down).max())
 
 
@@ -123,7 +116,7 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
         for part in SLIDING[1:2] if triangles else SLIDING:
             friction = part * math.tan(angle)
             with bench.simulation(sheet_on_slope(degrees, friction, round(n), SLID) | slope) as trial:
-                before, weight = _at(trial, 0.5 * SLID).v, G * float(trial.mass.sum())
+                before, weight = trial.run_to(0.5 * SLID).v, G * float(trial.mass.sum())
                 while not trial.simulation.finished:
                     trial.step()
                     along = float(trial.simulation.ledger.obstacle_forces(1)[0, :3] @ down)
@@ -427,8 +420,7 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
         "time": {"end": SETTLE + 1.4 * PUSH / slows, "step": 1.0 / n},
     }
     with bench.simulation(content) as trial:
-        while trial.simulation.time < SETTLE - 0.5 / n:
-            trial.step()
+        trial.run_to(SETTLE)
         number = np.minimum(np.arange(len(trial.start)) // (WIDE_CELLS + 1) ** 2, LAYERS)
         top, mass, before = number == LAYERS, trial.mass, trial.x[:, 0]
         trial.set_state(v=np.where(top[:, None], [PUSH, 0.0, 0.0], 0.0))
@@ -512,8 +504,7 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
     found: list[Measured] = []
     with bench.simulation(content) as trial:
         for (force, half_length, _, height), frame in zip(rows, frames[2::2], strict=True):
-            while trial.simulation.time < frame["time"] - 0.01 * LONG_STEP:
-                trial.step()
+            trial.run_to(frame["time"])
             push = trial.gather(trial.simulation.ledger.reaction)[ends[1], 0]
             z = trial.x[:, 2] - trial.x[ends[1], 2].mean()
             root = np.cbrt(z / z.max())
@@ -637,13 +628,13 @@ def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
     Folds of coarse meshes follow edges, which would have a fixed direction to warp and weft.
     """
     if kind == "rings":
-        flat, faces = rings(round(n / math.sqrt(3.0)))  # as many triangles as the others
+        flat, faces = ring_disc(round(n / math.sqrt(3.0)))  # as many triangles as the others
     else:
         if kind == "irregular":
             flat, faces = irregular_rectangle(n, n, 2.0, 2.0, int(random.integers(2**31)))
         else:
             flat, faces = rectangle(n, n, 2.0, 2.0, alternating=kind == "alternating")
-        flat = rounded(flat - [1.0, 1.0, 0.0])
+        flat = square_to_disc(flat - [1.0, 1.0, 0.0])
     angle = random.uniform(0.0, 2.0 * math.pi)
     cos, sin = math.cos(angle), math.sin(angle)
     return flat @ [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], faces
@@ -664,7 +655,7 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
     random = np.random.default_rng([MESHES.index(kind), start])
     flat, faces = _disc(kind, n, random)
     lifted, rest = _wavy(flat, random), CLOTH * flat[:, :2]
-    x = draped(bench, lifted, faces, rest, material, start, gap=SHORT, speed=AT_REST)
+    x = drape_cloth(bench, lifted, faces, rest, material, start, gap=SHORT, speed=AT_REST)
     return drape_coefficient(shadow(x, faces, PIXELS))
 
 
@@ -748,7 +739,7 @@ def sheets(bench: Bench, n: float) -> Iterator[Measured]:
             content, count = _sheet_on_sheet(round(n), part * math.tan(angle), integrator, RAN)
             with bench.simulation(content) as trial:
                 mass = trial.mass[count:]
-                before, begin = _at(trial, BEGIN).v[count:] @ down, trial.simulation.time
+                before, begin = trial.run_to(BEGIN).v[count:] @ down, trial.simulation.time
                 change = trial.run().v[count:] @ down - before
             exact = G * (1.0 - part) * math.sin(angle)
             found = float(mass @ change) / mass.sum() / (RAN - begin)  # steps may have been shortened

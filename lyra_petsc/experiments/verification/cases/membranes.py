@@ -96,7 +96,7 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
     membrane, points = problem.membrane, problem.points
     exact, stored = answer(gradient, c)
     stiffness, area = max(c["c11"], c["c22"]), BASE * HEIGHT
-    energy = trial.total(membrane.energies(problem.system.x)) / area
+    energy = trial.sum_over_ranks(membrane.energies(problem.system.x)) / area
     force = np.zeros((points.n_local, 3))
     membrane.add_gradient(problem.system.x, None, force)
     x, y = trial.start.T[:2]

@@ -171,7 +171,7 @@ def _disc(bench: Bench, n: float, load: float, step: float, **held: Any) -> floa
     lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};", "Point{1} In Surface{1};"]
     lines += ['Physical Surface("plate") = {1};', 'Physical Curve("rim") = {1, 2, 3, 4};']
     content = scene(
-        bench.script("\n".join(lines) + "\n"),
+        bench.gmsh_mesh("\n".join(lines) + "\n"),
         DISC,
         STATIC | {"step": step},
         gravity=[0.0, 0.0, load * DISC["young"] * DISC["thickness"] ** 4],
