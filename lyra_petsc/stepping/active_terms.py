@@ -26,7 +26,7 @@ class ActiveTerms:
         By kind.
     following : list of Load
         Those that follow the shape.
-    sheet, constraints, moving, pushing, limiting, near, edged : list of Elastic
+    sheet, constraints, moving, pushing, limiting, changing, with_edges : list of Elastic
         Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
         those of them that work by forces, those that limit the length of Newton's steps, those whose stencils
         change, and those with unknowns on edges.
@@ -47,8 +47,8 @@ class ActiveTerms:
         self.moving = [term for term in self.sheet if term.moving]
         self.pushing = [term for term in self.moving if term.pushes]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
-        self.near = [term for term in self.elastic if term.registration.neighbours]
-        self.edged = [term for term in self.elastic if term.registration.edge_state]
+        self.changing = [term for term in self.elastic if term.registration.neighbours]
+        self.with_edges = [term for term in self.elastic if term.registration.edge_state]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
@@ -82,16 +82,16 @@ class ActiveTerms:
 
     def accept_substep(self, x: Array) -> None:
         """A part of a static load step led to positions x."""
-        for term in self.near:
+        for term in self.changing:
             term.accept_substep(x, self.frozen[term])
 
     def friction_lag(self, x: Array) -> dict[str, Array]:
         """See `Elastic.friction_lag`."""
-        return {name: sums for t in self.near for name, sums in t.friction_lag(x, self.frozen[t]).items()}
+        return {name: sums for t in self.changing for name, sums in t.friction_lag(x, self.frozen[t]).items()}
 
     def contact_state(self) -> dict[Elastic, Any]:
         """What terms know of what touches, to come back to by `restore_contacts`."""
-        return {term: term.contact_state() for term in self.near}
+        return {term: term.contact_state() for term in self.changing}
 
     def restore_contacts(self, touched: Mapping[Elastic, Any]) -> None:
         """Know just this of what touches."""
@@ -100,5 +100,5 @@ class ActiveTerms:
 
     def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
-        for term in self.edged:
+        for term in self.with_edges:
             term.accept(x, (frozen or self.frozen)[term])

@@ -24,11 +24,11 @@ class AppliedLoads:
 
     Attributes
     ----------
-    now : (n_owned, 3)
+    force : (n_owned, 3)
         Force [N] of the present step.
     factor : float
         On all loads (1 in a motion).
-    unbalanced, given : (n_owned, 3) or None
+    unbalanced, override : (n_owned, 3) or None
         Static: force [N] that holds the start shape, reduced as the factor grows; loads in place of the
         present ones.
     following : FollowingLoads or None
@@ -37,17 +37,17 @@ class AppliedLoads:
 
     def __init__(self, terms: Sequence[Load], layout: Layout) -> None:
         self._terms = terms
-        self.now: Array = np.zeros((layout.n_owned, 3))
+        self.force: Array = np.zeros((layout.n_owned, 3))
         self.factor = 1.0
         self.unbalanced: Array | None = None
-        self.given: Array | None = None
+        self.override: Array | None = None
         self.following: FollowingLoads | None = None
 
-    def at(self, x: Array) -> Array:
+    def force_at(self, x: Array) -> Array:
         """Force [N] in a solve, (n_owned, 3), at positions x (n_local, 3)."""
         if self.following is None:
-            return self.now
-        force = self.now.copy()
+            return self.force
+        force = self.force.copy()
         self.following.add_force(x, force)
         return force
 
@@ -59,9 +59,9 @@ class AppliedLoads:
         force = np.zeros_like(x)
         for load in self._terms:
             load.add_force(x, t0, t1, force)
-        self.now = force[: len(self.now)]
+        self.force = force[: len(self.force)]
         if wind is not None:
-            self.now -= wind
-        self.now *= self.factor
+            self.force -= wind
+        self.force *= self.factor
         if self.unbalanced is not None:
-            self.now += (1.0 - self.factor) * self.unbalanced
+            self.force += (1.0 - self.factor) * self.unbalanced

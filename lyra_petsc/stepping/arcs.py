@@ -69,7 +69,7 @@ class Arcs:
 
     def matter(self, way: Array) -> bool:
         """Whether a way (n_owned, 3) [m/s] turns anything so far that its arc is another one."""
-        return self._equations.farthest_turn(way * self._equations.stage.reach) > STRAIGHT
+        return self._equations.farthest_turn(way * self._equations.stage.c) > STRAIGHT
 
     def bend(self, v: Array, way: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """The way from v by ``way`` (n_owned, 3) [m/s] along arcs, and on the tangent, as far as no triangle
@@ -87,7 +87,7 @@ class Arcs:
         missing = self._area[:, None, None] * (gradient - shape - self._gradients(ahead))
         pulls, corners = self._slopes @ missing.transpose(0, 2, 1), self._term.stencil.ravel()
         forces = [np.bincount(corners, pulls[:, :, i].ravel(), len(x))[: len(way)] for i in range(3)]
-        bent = way + self._solve(np.stack(forces, axis=1)) / equations.stage.reach
+        bent = way + self._solve(np.stack(forces, axis=1)) / equations.stage.c
         equations.let_directors_follow(v, way, bent)
         return bent, way
 

@@ -149,7 +149,7 @@ class ContactModel:
         """By how much springs become longer [m] in a step y."""
         equations = self._equations
         ahead = np.zeros((equations.points.n_local, 3))
-        ahead[: equations.points.n_owned] = -equations.stage.reach * y.getArray(readonly=True).reshape(-1, 3)
+        ahead[: equations.points.n_owned] = -equations.stage.c * y.getArray(readonly=True).reshape(-1, 3)
         equations.points.update_ghosts(ahead)
         return np.concatenate([np.empty(0), *(each.longer(ahead) for each in self._springs.values())])
 

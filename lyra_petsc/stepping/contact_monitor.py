@@ -30,7 +30,7 @@ class ContactMonitor:
 
     def __init__(self, equations: StageEquations, allowed: Callable[[], float]) -> None:
         self._equations, self._allowed = equations, allowed
-        near = equations.active.near
+        near = equations.active.changing
         self._contact = next(term for term in near if isinstance(term, ContactBarrier))
         self._friction = next((term for term in near if isinstance(term, CoulombFriction)), None)
 

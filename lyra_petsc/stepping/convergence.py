@@ -102,7 +102,7 @@ class Convergence:
         Where its line search fails, PETSc takes a short direction for convergence, whatever the residual. In
         statics small forces may lead far.
         """
-        return self._ended or (self._equations.integrator.moves and self.balanced)
+        return self._ended or (self._equations.integrator.dynamic and self.balanced)
 
     @property
     def balanced(self) -> bool:
@@ -123,7 +123,7 @@ class Convergence:
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
-            moved = increment * self._equations.stage.reach
+            moved = increment * self._equations.stage.c
             if moved > self.farthest:
                 return int(Reason.DIVERGED_MAX_IT)
             self._moved_by(moved)
@@ -169,7 +169,7 @@ class Convergence:
         """
         equations, was_good = self._equations, self._was_good
         self._was_good = True
-        if was_good or not (equations.discretisation.limits_motion and equations.integrator.moves):
+        if was_good or not (equations.discretisation.limits_motion and equations.integrator.dynamic):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
         return (self.norm > part * enough or self.left > part * near) and equations.may_impact
@@ -186,7 +186,7 @@ class Convergence:
         """
         part = correction / last
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
-        self._expected = expected * self._equations.stage.reach
+        self._expected = expected * self._equations.stage.c
         near = self._tolerances.step_tolerance * self.spacing
         return self._expected <= near and residual <= self._force_tolerance()
 

@@ -52,14 +52,14 @@ class Damping:
     discretisation : Discretisation
     elastic : sequence of Elastic
         All of the scene; those without damping are passed over.
-    moves : bool
+    dynamic : bool
         Nothing is damped where time does not pass.
-    once : bool
+    single_assembly : bool
         A step's matrix is put together once, and stays until the step's end.
 
     Attributes
     ----------
-    acts : bool
+    active : bool
         Whether anything is damped, on any rank; without, nothing is stored.
     frozen : mapping of Term → any
         What terms froze for the step, before edges turned far.
@@ -68,13 +68,18 @@ class Damping:
     """
 
     def __init__(
-        self, discretisation: Discretisation, elastic: Sequence[Elastic], *, moves: bool, once: bool
+        self,
+        discretisation: Discretisation,
+        elastic: Sequence[Elastic],
+        *,
+        dynamic: bool,
+        single_assembly: bool,
     ) -> None:
-        self._discretisation, self._once = discretisation, once
+        self._discretisation, self._single_assembly = discretisation, single_assembly
         self._terms = [
-            t for t in elastic if moves and t.registration.damped and np.any(t.elements.data["damping"])
+            t for t in elastic if dynamic and t.registration.damped and np.any(t.elements.data["damping"])
         ]
-        self.acts = bool(discretisation.layout.comm.allreduce(len(self._terms), MPI.MAX))
+        self.active = bool(discretisation.layout.comm.allreduce(len(self._terms), MPI.MAX))
         self._values: Array | None = None
         self._stored = False
         self._multiple: Multiple | None = None
@@ -94,14 +99,14 @@ class Damping:
 
     def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
         """Take the geometry of positions x (n_local, 3), left as they are, and what terms froze for it."""
-        self.let_go()
+        self.release_values()
         self._at, self._stored, self.frozen = x, False, frozen
         self.product.forget()
-        if not self._once:
+        if not self._single_assembly:
             self._own()
 
-    def let_go(self) -> None:
-        """Work no longer with the rows that ``with_stiffness_into`` was given."""
+    def release_values(self) -> None:
+        """Work no longer with the rows that ``assemble_with_stiffness`` was given."""
         self._multiple = None
 
     def _add(self, x: Array, weight: Callable[[Elastic], Array | float], values: Array) -> None:
@@ -133,18 +138,18 @@ class Damping:
         self.product.forget()
         return out
 
-    def into(self, values: Array, diagonal: Array) -> None:
+    def assemble(self, values: Array, diagonal: Array) -> None:
         """Let ``values`` (n_stored, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
-        self.let_go()
+        self.release_values()
         rows, place = self._discretisation.rows, self._discretisation.fixed_positions
-        if self.acts and place is None:
+        if self.active and place is None:
             rows.scale(self._own(), 1.0, diagonal, values)
         else:
             rows.set_diagonal(diagonal, values)
-            if self.acts and place is not None:
+            if self.active and place is not None:
                 rows.add_blocks(self._own(), place, values)
 
-    def with_stiffness_into(
+    def assemble_with_stiffness(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
     ) -> bool:
         """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
@@ -153,7 +158,7 @@ class Damping:
         semi-implicit step, and D need not be stored beside it. Else False. The caller may change ``changing``
         (n,), in the flat form, afterwards.
         """
-        self.let_go()
+        self.release_values()
         other = self._discretisation.fixed_positions is not None or any(
             term.n_elements for term in self._undamped
         )
@@ -162,7 +167,7 @@ class Damping:
         if self._at is None or not np.array_equal(x, self._at):
             return False
         factor = 1.0 + weight / self._gamma
-        if self._once and not self._stored:
+        if self._single_assembly and not self._stored:
             self._blocks.set_diagonal(diagonal, values)
             self._add(x, lambda term: self._gamma + weight, values)
             self._multiple = Multiple(values, factor, diagonal, changing)

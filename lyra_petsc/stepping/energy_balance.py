@@ -101,11 +101,11 @@ class Ledger:
         named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
         self._more = [name for name in named if name not in (*ENERGIES, "")]
         self.budget = Budget()
-        self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
+        self._at, self._reactions = system.prescribed.indices, np.zeros(len(system.prescribed.indices))
         self._moving = 0.0
         self._pull: Array | None = None
         self._targets: list[tuple[Array, Array]] = []
-        if not system.integrator.moves:
+        if not system.integrator.dynamic:
             self._pull, self._targets = self._external(system.forces_now())[0], self._turning()
         self.measure()
 
@@ -186,7 +186,7 @@ class Ledger:
         of damping at the prescribed unknowns (m,), and its heat [J].
         """
         system = self._system
-        self._at = at = system.prescribed.at
+        self._at = at = system.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
         if system.damped:
             self._reactions += system.damped.held
@@ -204,7 +204,7 @@ class Ledger:
                 damping = part.take(at)
                 heat = system.dt * float(np.vdot(system.stage_velocity, part))
             del part  # the next needs the room
-        system.prescribed.put(external, external.take(at) + self._reactions)
+        system.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat
 
     def memory(self) -> tuple[dict[str, Array], dict[str, Any]]:

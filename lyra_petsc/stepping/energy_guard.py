@@ -38,7 +38,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import Budget, Works
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.state import fitted, kinetic_energy
+from lyra_petsc.stepping.state import kinetic_energy, resized
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -157,10 +157,10 @@ class EnergyGuard:
         system = self._system
         layout, n = system.points, system.points.n_owned
         if system.discretisation.stencils_change:  # there may be other ghosts by now
-            x0, v0 = fitted(x0, n, layout.n_local), fitted(v0, n, layout.n_local)
+            x0, v0 = resized(x0, n, layout.n_local), resized(v0, n, layout.n_local)
             for values in (x0, v0):
                 layout.update_ghosts(values)
-        x1, v1, at = system.x, system.v, system.prescribed.at
+        x1, v1, at = system.x, system.v, system.prescribed.indices
         change = kinetic_energy(system.mass, v1[:n] - v0[:n])
         moved = x1[:n] - x0[:n]
         works, heat_beside = self._with_least_heat(x0, x1, works)
@@ -202,13 +202,13 @@ class EnergyGuard:
         rank must add to their heat [J] for it to be that of this motion.
         """
         system = self._system
-        if not system.damping.acts or system.integrator.order == 1 or system.integrator.by_stage:
+        if not system.damping.active or system.integrator.order == 1 or system.integrator.exact_work:
             return works, 0.0
         moved = x1 - x0
         # about the middle, chords of what turns stretch nothing
         force = system.damping.product_at(0.5 * (x0 + x1), moved / system.dt)
         heat = float(np.vdot(force, moved[: len(force)]))
-        return replace(works, damping=force.take(system.prescribed.at)), heat - works.damped
+        return replace(works, damping=force.take(system.prescribed.indices)), heat - works.damped
 
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
         """What terms freeze with their targets where they are at time ``at`` [s] of the step."""
@@ -261,7 +261,7 @@ class EnergyGuard:
         """Work [J] of exact handles on this rank, by the mean over both ends of what the sheet and its weight
         pull them with."""
         system, self._next_pull = self._system, None
-        at = system.prescribed.at
+        at = system.prescribed.indices
         way = moved.take(at)
         if not way.any():  # most handles stand still
             return 0.0
@@ -297,7 +297,7 @@ class EnergyGuard:
         ``strict``: where something touches, it may make but little under an integrator of second order.
         """
         new = self._with(step)
-        over = self._system.integrator.judged_over
+        over = self._system.integrator.gain_window
         # a step that makes none of it would make none either if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
@@ -341,7 +341,7 @@ class EnergyGuard:
             heat=heat,
             inertia=old.inertia + step.inertia,
             bracket=old.bracket + step.bracket,
-            recent=_with_gain(old.recent, judged, self._system.integrator.judged_over)[-RECENT:],
+            recent=_with_gain(old.recent, judged, self._system.integrator.gain_window)[-RECENT:],
             repeated=old.repeated,
         )
 

@@ -201,7 +201,7 @@ class Equilibrium:
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.limits_motion
         contacts = system.active.contact_state()
-        self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
+        self._integrator.predicted = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
         self._friction.begin()
@@ -216,7 +216,7 @@ class Equilibrium:
             if balanced and self._friction.settled():
                 self._friction.found(factor - before)
                 system.moving_energy_before = anchored
-                self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
+                self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo_dt, factor
                 linear += self._learn_rate(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = anew + _last_lessened([each.residual for each in history[anew:]])
@@ -227,43 +227,43 @@ class Equilibrium:
             if words:
                 break
             if force > WORSE * last:
-                self._integrator.pseudo *= SHRINK
+                self._integrator.pseudo_dt *= SHRINK
             last = force
             if attempt.converged:
                 system.active.accept_substep(system.x)
             if balanced:  # but for friction
                 anew = len(history)
-                longest, leaps = self._integrator.pseudo, not system.active.viscous
+                longest, leaps = self._integrator.pseudo_dt, not system.active.viscous
                 last = self._out_of_balance(before, factor, first=True)
-                self._integrator.pseudo = longest
+                self._integrator.pseudo_dt = longest
             if self._follows:
                 linear += self._take_loads(relaxation, before, factor, first=solves == 0)
-            leap = leaps and self._integrator.pseudo > self._careful
+            leap = leaps and self._integrator.pseudo_dt > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
-                relaxation.solved_with(system.applied.at(system.x))
-            system.applied.given = system.applied.following = self._integrator.ahead = None
-            self._integrator.others = []
+                relaxation.solved_with(system.applied.force_at(system.x))
+            system.applied.override = system.applied.following = self._integrator.predicted = None
+            self._integrator.alternatives = []
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if attempt.converged:
                 arrived = True
                 system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
-                self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
-                self._careful = max(min(self._careful, BELOW * ceiling), self._integrator.pseudo)
+                self._careful = self._integrator.pseudo_dt * growth(attempt.newton_iterations)
+                self._careful = max(min(self._careful, BELOW * ceiling), self._integrator.pseudo_dt)
                 ceiling *= RISE
-                self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
+                self._integrator.pseudo_dt = min(self._careful * (LEAP if leaps else 1.0), self._longest)
             elif leap and resumed < MOST_RESUMED and self._go_on(attempt):
                 resumed += 1
             elif leap:  # too far, also where without inertia no preconditioner can be set up
                 leaps = self._sufficed == ANY and not arrived and not touches
-                self._integrator.pseudo = self._careful
+                self._integrator.pseudo_dt = self._careful
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
-                ceiling = self._integrator.pseudo if touches else ceiling
-                self._integrator.pseudo *= SHRINK
+                ceiling = self._integrator.pseudo_dt if touches else ceiling
+                self._integrator.pseudo_dt *= SHRINK
                 leaps = False
         slides = self._friction.lost(factor - before) if words and arrived else ""
         if slides:
@@ -290,7 +290,7 @@ class Equilibrium:
             return
         self._pull = self._system.out_of_balance()[0] / (factor - before)
         if self._rate is not None:
-            self._integrator.others = self._extrapolation.along(factor, self._rate)
+            self._integrator.alternatives = self._extrapolation.along(factor, self._rate)
 
     def _learn_rate(self, start: Array, before: float, factor: float) -> int:
         """How the equilibrium just found changes as loads do and handles go on from where they were in the
@@ -326,9 +326,9 @@ class Equilibrium:
 
         Returns linear iterations.
         """
-        system, now = self._system, self._system.applied.now.copy()
+        system, now = self._system, self._system.applied.force.copy()
         if self._pressures is None:
-            system.applied.given = relaxation.following(now)
+            system.applied.override = relaxation.following(now)
             return 0
         loads = system.applied.following = self._pressures.linearised(before, factor)
         way, spent = None, 0
@@ -336,12 +336,12 @@ class Equilibrium:
             pass
         elif not first:
             way, spent = self._pressures.tangent(system.out_of_balance()[0], loads)
-        elif self._integrator.others and self._rate is not None:
+        elif self._integrator.alternatives and self._rate is not None:
             way = (factor - before) * self._rate
         if way is None:
-            system.applied.given = relaxation.following(now)
+            system.applied.override = relaxation.following(now)
         else:
-            system.applied.given = now + self._pressures.skew_force(loads, way)
+            system.applied.override = now + self._pressures.skew_force(loads, way)
         return spent
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
@@ -473,7 +473,7 @@ class Equilibrium:
             velocity=np.zeros_like(x),
             position=system.x[:n].copy(),
             residual=-force,
-            forces={"loads": -system.applied.now, "internal": system.applied.now - force},
+            forces={"loads": -system.applied.force, "internal": system.applied.force - force},
             prescribed=system.prescribed.mask[:n].copy(),
             goal=goal,
             snes_reason=0,
@@ -500,7 +500,7 @@ class Equilibrium:
             self._careful = float(np.sqrt(self._spacing / fastest))
             self._longest = LONGEST * self._careful
             sufficed = 0.0 if system.active.viscous else self._sufficed
-            self._integrator.pseudo = min(max(self._careful, sufficed), self._longest)
+            self._integrator.pseudo_dt = min(max(self._careful, sufficed), self._longest)
         return norm
 
     def _balanced(self, force: float, last: float) -> bool:

@@ -131,7 +131,7 @@ class Globalisation:
         self._at_norm = self._snes.getFunctionNorm()
         # where forces are in balance differences of energies are round-off, and kinks far away; in statics,
         # where steps are long, searches along tangents would creep
-        kinks = self._equations.touches and self._equations.integrator.moves
+        kinks = self._equations.touches and self._equations.integrator.dynamic
         self._near = kinks and not self._convergence.balanced
         energy, size = self._at
         if self._snes.getIterationNumber() == 0:

@@ -121,7 +121,7 @@ def damp_impacts(system: StageEquations) -> Damped:
     layout, n, dt, felt = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
     every = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in every))):
-        held = np.zeros(len(system.prescribed.at))
+        held = np.zeros(len(system.prescribed.indices))
         return Damped(felt, held, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3)))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
     mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
@@ -159,7 +159,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     corrections = term.friction_corrections(stage, x, system.v, frozen, damped.felt, dt, sheets=sheets)
     points, beta, along, ways, more, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
-    if system.integrator.by_stage:
+    if system.integrator.exact_work:
         pairs, moments = term.moments(stage, frozen)
     if not any(system.points.global_max(float(np.abs(more).max(initial=0.0)), len(pairs))):
         return damped
@@ -172,7 +172,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     push = -np.clip(more, -stops, stops)
     force, impulses = push[:, None] * along, (dt * push)[:, None, None] * ways
     np.add.at(impulse, points, impulses)
-    if system.integrator.by_stage:
+    if system.integrator.exact_work:
         between = obstacle < 0
         theirs = np.cross(x[points[between]], impulses[between]).sum(axis=1)
         pairs, moments = np.concatenate([pairs, points[between]]), np.concatenate([dt * moments, theirs])
@@ -191,7 +191,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
 
 def _between_sheets_too(system: StageEquations) -> bool:
     """Whether friction between sheets follows their normal forces, too: of a stage before the step's end."""
-    return system.stage.after < system.dt
+    return system.stage.offset < system.dt
 
 
 def _inverse_masses(system: StageEquations, every: Iterable[tuple[Ints, Array, NDArray[np.bool_]]]) -> Array:
@@ -236,5 +236,5 @@ def _give(system: StageEquations, impulse: Array, work: float) -> tuple[Array, f
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
     heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
-    system.integrator.take_jump(change)
-    return -impulse[:n].take(system.prescribed.at) / system.dt, heat
+    system.integrator.shift_past_velocities(change)
+    return -impulse[:n].take(system.prescribed.indices) / system.dt, heat

@@ -20,9 +20,9 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     if integrator.starts_at_rest:
         out[:], ahead = 0.0, None
         if isinstance(integrator, Static) and not system.discretisation.limits_motion:
-            ahead = integrator.ahead
+            ahead = integrator.predicted
             if ahead is not None:
-                out[:] = ahead / integrator.pseudo
+                out[:] = ahead / integrator.pseudo_dt
                 system.leap()
         system.prescribe(out)
         return ahead is not None

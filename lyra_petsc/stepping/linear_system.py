@@ -114,7 +114,7 @@ class Reuse:
 
     def begin(self, equations: StageEquations) -> bool:
         """Whether the next solve can do with the preconditioner that there is."""
-        reach, mask = equations.stage.reach, equations.prescribed.mask
+        reach, mask = equations.stage.c, equations.prescribed.mask
         if self._for is None or self._for[1] is not mask or not _alike(reach, self._for[0]):
             self.renew()
         self.reused = self._acts and self._solves > 0
@@ -281,7 +281,7 @@ class LinearSystem:
             return
         assert self._ksp is not None
         # an equilibrium's Newton steps are large, and factors cost less than one more
-        keep = keep and (self._equations.integrator.moves or not self.factors)
+        keep = keep and (self._equations.integrator.dynamic or not self.factors)
         self.kept = keep
         self.same = convex and not keep and shows_negative_curvature(self._ksp.getPC())
         if self.same:

@@ -35,11 +35,11 @@ class LocalError:
         """Whether the coming step's accelerations at its start are asked for."""
         return self._system.integrator.order > 1 and self._slope is None
 
-    def start_from(self, acceleration: Array) -> None:
+    def set_acceleration(self, acceleration: Array) -> None:
         """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
         self._slope, self._dt = acceleration, 0.0
 
-    def disturbed(self) -> None:
+    def restart(self) -> None:
         """Forces jump at the start of the coming step."""
         self._slope = None
 
@@ -60,7 +60,7 @@ class LocalError:
         largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.prescribed.free[vertices]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
-    def accepted(self, v_before: Array, dt: float) -> None:
+    def record_step(self, v_before: Array, dt: float) -> None:
         """The step stands."""
         if self._system.integrator.order > 1:
             n = self._system.points.n_owned

@@ -108,14 +108,14 @@ class Newton:
         self._from: PETSc.Vec | None = None
         self._reach = 0.0
         self._began_convex = False
-        still = not (equations.integrator.moves or equations.discretisation.limits_motion)
-        self._corrects = still and linear.factors and bool(equations.active.edged)
+        still = not (equations.integrator.dynamic or equations.discretisation.limits_motion)
+        self._corrects = still and linear.factors and bool(equations.active.with_edges)
         self._arcs: Arcs | None = None
         if self._corrects:
             from lyra_petsc.stepping.arcs import Arcs, possible  # of use for nothing else
 
             self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
-        fixed = is_set("ksp_rtol") or not equations.integrator.moves
+        fixed = is_set("ksp_rtol") or not equations.integrator.dynamic
         self.forcing = Forcing(
             self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.limits_motion
         )
@@ -143,7 +143,7 @@ class Newton:
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.set(v, blend, keep=self.convergence.fell, convex=self._convex)
-        self._reach = self._equations.stage.reach
+        self._reach = self._equations.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -181,7 +181,7 @@ class Newton:
         if self._contact is not None and not useless:
             changed |= self._foresee(x, residual, y)
         bent = self._arcs is not None and self.globalisation.trusts and self._bend(x, residual, y)
-        if self._equations.active.edged and self.globalisation.trusts and not bent:
+        if self._equations.active.with_edges and self.globalisation.trusts and not bent:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps and not bent:
             changed |= self._limit(x, residual, y)
@@ -275,7 +275,7 @@ class Newton:
         integrator = self._equations.integrator
         if self._arcs is None or not isinstance(integrator, Static):
             return
-        least, ways = np.inf, [guess - v, *(way / integrator.pseudo for way in integrator.others)]
+        least, ways = np.inf, [guess - v, *(way / integrator.pseudo_dt for way in integrator.alternatives)]
         for way in ways:
             there = v + self._arcs.bend(v, way, strains=False)[0]
             self._equations.prescribe(there)

@@ -134,17 +134,17 @@ class Trace:
             velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
         residual = np.empty((n, 3))
         system.residual(velocity, stage.sigma * (velocity - system.history), residual)
-        position = (system.x[:n] if stage.x is None else stage.x) + stage.reach * velocity
+        position = (system.x[:n] if stage.x is None else stage.x) + stage.c * velocity
         goal = system.x[:n].copy()
         if system.held:
-            if system.integrator.given:
-                system.prescribed.targets(system.t0, system.t1, system.t0 + stage.after, position)
+            if system.integrator.handles_at_stage:
+                system.prescribed.targets(system.t0, system.t1, system.t0 + stage.offset, position)
             system.prescribed.targets(system.t0, system.t1, system.t1, goal)
         square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
         return FailedSolve(
             tuple(self._iterations),
             float(np.sqrt(square)),
-            system.t0 + stage.after,
+            system.t0 + stage.offset,
             velocity,
             position,
             residual,

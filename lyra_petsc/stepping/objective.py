@@ -53,7 +53,7 @@ class Objective:
 
     def _computed(self, v: Array) -> tuple[float, float]:
         of = self._equations
-        n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.reach
+        n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.c
         x, vs = of.evaluate_at(v)
         parts, square = [sigma * kinetic_energy(of.mass, v - of.history)], 0.0
         for term in of.active.elastic:
@@ -68,10 +68,10 @@ class Objective:
             of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
             # ** would raise where the square is infinite
             square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
-        parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
+        parts.append(-rate * float(np.vdot(of.applied.force, x[:n] - of.x[:n])))
         if of.applied.following is not None:
             parts.append(rate * of.applied.following.energy(x))
-        if of.damping.acts:
+        if of.damping.active:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))
         if not of.integrator.lagged_loads:
             parts += [float(wind.potentials(vs, of.active.frozen[wind]).sum()) for wind in of.active.viscous]

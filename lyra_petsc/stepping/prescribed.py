@@ -39,8 +39,8 @@ class Prescribed:
         own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
         own.ravel()[discretisation.layout.padding] = True
         self._set(own)
-        self.not_counted = self.at
-        self.goal = self.velocity = np.zeros(len(self.at))
+        self.not_counted = self.indices
+        self.goal = self.velocity = np.zeros(len(self.indices))
 
     def _set(self, own: Mask) -> None:
         """Prescribe these owned unknowns (n_owned, 3); collective."""
@@ -50,10 +50,10 @@ class Prescribed:
         layout.update_ghosts(flags)
         self.mask: Mask = flags > 0.5
         self.free: Mask = ~own
-        self.at: Ints = np.flatnonzero(own)
+        self.indices: Ints = np.flatnonzero(own)
         self._beside = None
 
-    def fit(self) -> None:
+    def resize(self) -> None:
         """Follow the layout to other ghosts; collective."""
         self._set(~self.free)
 
@@ -80,7 +80,7 @@ class Prescribed:
             own = self.held.mask(t0, t1, layout.n_owned)
             own.ravel()[layout.padding] = True
             self._set(own)
-            self.not_counted = self.at
+            self.not_counted = self.indices
         self.goal = self._positions(t1)
         return changed
 
@@ -91,36 +91,36 @@ class Prescribed:
         own = ~self.free
         own[: layout.n_vertices] = True
         self._set(own)
-        self.goal = x.take(self.at)
+        self.goal = x.take(self.indices)
 
     def release_vertices(self) -> None:
         """Prescribe again what was prescribed before `hold_vertices`; collective."""
         own, self.goal, self.velocity = self._kept
         self._set(own)
 
-    def solve(self, x_h: Array, reach: float) -> None:
+    def set_velocity_to_goal(self, x_h: Array, c: float) -> None:
         """Take the velocities that lead from the history x_h (n_owned, 3) to the goal."""
-        self.velocity = (self.goal - x_h.take(self.at)) / reach
+        self.velocity = (self.goal - x_h.take(self.indices)) / c
 
-    def give(self, at: float, x_h: Array, reach: float) -> None:
+    def set_motion_at(self, at: float, x_h: Array, c: float) -> None:
         """Take position and velocity at time ``at`` [s], and change x_h (n_owned, 3) to agree with them."""
         self.velocity = self._rates(at)
-        self.put(x_h, self._positions(at) - reach * self.velocity)
+        self.overwrite(x_h, self._positions(at) - c * self.velocity)
 
-    def put(self, values: Array, prescribed: Array) -> None:
+    def overwrite(self, values: Array, prescribed: Array) -> None:
         """Overwrite the prescribed unknowns of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""
-        np.put(values, self.at, prescribed)
+        np.put(values, self.indices, prescribed)
 
-    def overwrite_with_rates(self, velocity: Array) -> None:
+    def overwrite_with_end_velocity(self, velocity: Array) -> None:
         """Write ẋ* [m/s] at the end of the step over the prescribed unknowns of ``velocity``."""
         if self.held and self._span[1] > self._span[0]:
-            self.put(velocity, self._rates(self._span[1]))
+            self.overwrite(velocity, self._rates(self._span[1]))
 
-    def begin_with_rates(self, velocity: Array) -> None:
-        """Write ẋ* [m/s] just after the start of the step, where it may jump, as `overwrite_with_rates`."""
+    def overwrite_with_start_velocity(self, velocity: Array) -> None:
+        """Write ẋ* [m/s] just after the start of the step, where it may jump."""
         if self.held and self._span[1] > self._span[0]:
             start, end = self._span
-            self.put(velocity, self._rates(start + 1e-3 * (end - start)))
+            self.overwrite(velocity, self._rates(start + 1e-3 * (end - start)))
 
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
         """Write what handles prescribe at time ``at`` [s] over present positions in ``out`` (n_owned, 3)."""
@@ -129,9 +129,9 @@ class Prescribed:
     def _positions(self, at: float) -> Array:
         out = self._x[: self._discretisation.layout.n_owned].copy()
         self.targets(*self._span, at, out)
-        return out.take(self.at)
+        return out.take(self.indices)
 
     def _rates(self, at: float) -> Array:
         out = np.zeros((self._discretisation.layout.n_owned, 3))
         self.held.velocities(*self._span, at, self._reference.at, out)
-        return out.take(self.at)
+        return out.take(self.indices)

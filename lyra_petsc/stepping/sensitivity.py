@@ -328,7 +328,7 @@ class Sensitivities:
         """A number's neighbours with the velocities (n_owned, 3) of their stages; collective."""
         change = _combined(beside, step, lambda each: each.system.prescribed.velocity)
         prescribed = np.zeros_like(velocity)
-        self._system.prescribed.put(prescribed, change)
+        self._system.prescribed.overwrite(prescribed, change)
         of_stage = partial(self._change_of_stage, beside, step, velocity)
         way = self._solved(solve, of_stage, prescribed, step)
         found = []
@@ -388,7 +388,7 @@ class Sensitivities:
         if turns:
             system.x[: system.points.n_owned] += change
             system.state.update_ghosts()
-            system.integrator.shift_past(change)
+            system.integrator.shift_past_positions(change)
 
     # -- edges whose unknowns are in equilibrium at the end of the step -------------------------------
 
@@ -396,7 +396,7 @@ class Sensitivities:
         """Let the neighbours' edges be in equilibrium at the end of the step, as the simulation's are."""
         system, n = self._system, self._system.points.n_owned
         system.begin_edges(before.x)
-        rates = (system.x[:n] - before.x) / system.stage.reach
+        rates = (system.x[:n] - before.x) / system.stage.c
         for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
             for each in beside:
                 each.system.begin_edges(before.x + each.offset * step * tangent.x)
@@ -416,16 +416,16 @@ class Sensitivities:
         now = _Equilibrium(
             before.time, self.simulation.time, system.x[:n].copy(), [term.frames for term in _edged(system)]
         )
-        pseudo = integrator.pseudo
-        integrator.pseudo = math.sqrt(LONGEST) * self._slowest()
+        pseudo = integrator.pseudo_dt
+        integrator.pseudo_dt = math.sqrt(LONGEST) * self._slowest()
         system.begin_step(now.before, now.factor)
-        reach = system.stage.reach
+        reach = system.stage.c
         with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:
             for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
                 self._change_of_force(now, beside, step, np.zeros_like(now.x))  # so that goals are known
                 prescribed = np.zeros_like(now.x)
                 change = _combined(beside, step, lambda each: each.system.prescribed.goal)
-                system.prescribed.put(prescribed, change)
+                system.prescribed.overwrite(prescribed, change)
                 _drop_rounding(prescribed, now.x, step)
                 forces = partial(self._change_of_force, now, beside, step)
                 tangent.x = self._solved(lambda r: reach * solve(r), forces, prescribed, step)
@@ -435,7 +435,7 @@ class Sensitivities:
                         each.system.stay()
                         each.ledger.record(now.x)
                     each.system.begin(now.factor)
-        integrator.pseudo = pseudo
+        integrator.pseudo_dt = pseudo
         system.begin_step(now.before, now.factor)
         system.stay()
 
@@ -456,7 +456,7 @@ class Sensitivities:
     def _slowest(self) -> float:
         """A time [s] in which sheets of this mass fall far."""
         system = self._system
-        loads, mass = np.linalg.norm(system.applied.now), system.mass.sum()
+        loads, mass = np.linalg.norm(system.applied.force), system.mass.sum()
         force, total = system.points.global_sum(float(loads) ** 2, float(mass))
         return math.sqrt(self.simulation.problem.outline.size * total / math.sqrt(force)) if force else 1.0
 
@@ -573,7 +573,7 @@ def _drop_rounding(values: Array, base: Array, step: float) -> None:
 
 
 def _edged(system: StageEquations) -> list[MidEdge]:
-    return [term for term in system.active.edged if isinstance(term, MidEdge)]
+    return [term for term in system.active.with_edges if isinstance(term, MidEdge)]
 
 
 def _product(system: StageEquations, values: Array, v: Array) -> Array:

@@ -199,7 +199,7 @@ class SteppedScene:
             self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
         self._usual = system.integrator
         self.ledger = Ledger(system)
-        self.guard = EnergyGuard(system) if system.integrator.moves else None
+        self.guard = EnergyGuard(system) if system.integrator.dynamic else None
 
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
@@ -295,7 +295,7 @@ class SteppedScene:
                     assert self.guard is not None
                     # not under the midpoint rule, which keeps angular momentum
                     last = halvings == HALVINGS - 1
-                    impact = not system.integrator.by_stage and self._take_impact(
+                    impact = not system.integrator.exact_work and self._take_impact(
                         end - self.time, self.guard.words, last=last
                     )
                     if not impact:
@@ -305,13 +305,13 @@ class SteppedScene:
         if system.integrator is not self._usual:
             by_end = system.integrator.order == 1
             system.integrator = self._usual
-            self._usual.disturbed()
+            self._usual.restart()
             if by_end:  # before velocities jumped at the end, over which stiff damping would accelerate much
                 rate = (system.stage_velocity - v_before[:n]) / (end - self.time)
                 moves = system.prescribed.free & (system.mass[:, None] > 0.0)
-                self._usual.start_from(np.where(moves, rate, 0.0))
+                self._usual.set_acceleration(np.where(moves, rate, 0.0))
             if self.local_error is not None:
-                self.local_error.disturbed()
+                self.local_error.restart()
         if self._equilibrium is not None and self.control.is_end(end):
             with self.phases("solve"):
                 settled = self._equilibrium.settle(self.time, end)
@@ -359,7 +359,7 @@ class SteppedScene:
 
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
-        loads = float(np.sum(self.problem.system.applied.now**2))
+        loads = float(np.sum(self.problem.system.applied.force**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
             self._tell_once(
@@ -370,7 +370,7 @@ class SteppedScene:
 
     def _now(self) -> str:
         """The present time, or load factor, in words."""
-        moves = self.problem.system.integrator.moves
+        moves = self.problem.system.integrator.dynamic
         return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
     def _accurate(self, v_before: Array, dt: float) -> bool:
@@ -384,7 +384,7 @@ class SteppedScene:
         least = self._shortest_over_impacts()
         stands = control.judge(dt, error / share, self.problem.system.integrator.order, least)
         if stands:
-            self.local_error.accepted(v_before, dt)
+            self.local_error.record_step(v_before, dt)
             self.estimated_error += error
             if error > share:
                 where = "of those that follow impacts " if least > control.smallest else ""
@@ -420,7 +420,7 @@ class SteppedScene:
             after = self.ledger.record(x_before[: system.points.n_owned])
             balance = self.guard.balance(x_before, v_before, kept[0], after, self.ledger.works)
             # by shorter steps, and at last by backward Euler where that keeps what the integrator keeps
-            strict = not system.integrator.by_stage or end - self.time > FINER * self.control.step
+            strict = not system.integrator.exact_work or end - self.time > FINER * self.control.step
             stands = self.guard.stands(balance, strict=strict)
             if not stands:
                 self.ledger.take_back(kept)
@@ -435,7 +435,7 @@ class SteppedScene:
         """
         system, usual = self.problem.system, self._usual
         if system.integrator is usual and attempt.words.startswith(MEETS):
-            ends, far = system.stage.after == system.dt, dt > FAR * self._time_through_skin()
+            ends, far = system.stage.offset == system.dt, dt > FAR * self._time_through_skin()
             if ends or self.scene.time.adaptive or not far:
                 return self._take_impact(dt, "finds no way")
             from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # of use for nothing else
@@ -458,8 +458,8 @@ class SteppedScene:
         if self.scene.time.adaptive:
             long = not last and dt > 2.0 * self._shortest_over_impacts()
         else:
-            long = dt > (FINEST if usual.by_stage else FINER) * self.control.step
-        if long or usual.name == "beuler" or not usual.moves or not system.touches:
+            long = dt > (FINEST if usual.exact_work else FINER) * self.control.step
+        if long or usual.name == "beuler" or not usual.dynamic or not system.touches:
             return False
         if system.integrator is not usual and system.integrator.order == 1:
             system.integrator = usual  # nor did that help
@@ -527,10 +527,10 @@ class SteppedScene:
         times = sum(self._repeated.values())
         often = sorted(self._repeated.items(), key=lambda each: -each[1])
         reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
-        what, unit = ("Δt", " s") if self.problem.system.integrator.moves else ("increment", "")
+        what, unit = ("Δt", " s") if self.problem.system.integrator.dynamic else ("increment", "")
         note = f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "
         note += f"down to {self._least:.3g}{unit} ({reasons})"
-        if self.scene.time.adaptive or not self.problem.system.integrator.moves:
+        if self.scene.time.adaptive or not self.problem.system.integrator.dynamic:
             return note
         planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
         return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
@@ -561,7 +561,7 @@ class SteppedScene:
             step=self.step_number + 1,
             time=self.time,
             dt=now.dt,
-            static=not system.integrator.moves,
+            static=not system.integrator.dynamic,
             kind=trouble(diagnosis, stuck),
             tried=self._tried,
             diagnosis=diagnosis,

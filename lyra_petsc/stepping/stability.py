@@ -180,7 +180,7 @@ class Examination:
             return None
         way, system = best * mode, self._system
         if system.limits_steps:
-            way *= system.largest_step(np.zeros_like(mode), way / system.stage.reach)
+            way *= system.largest_step(np.zeros_like(mode), way / system.stage.c)
         return way
 
     def _potential(self, way: Array) -> float:
@@ -192,7 +192,7 @@ class Examination:
         stored = sum(
             float(term.energies(x, system.active.frozen[term]).sum()) for term in system.active.elastic
         )
-        force = system.applied.now.copy()
+        force = system.applied.force.copy()
         for load in system.active.following:
             force += system.applied.factor * self._change(load, x, len(way))
         return float(system.points.global_sum(stored - float(np.vdot(force, way)))[0])

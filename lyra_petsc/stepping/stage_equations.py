@@ -36,7 +36,7 @@ from lyra_petsc.stepping.integrators.integrator import Integrator, NeedsAccelera
 from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
-from lyra_petsc.stepping.state import State, fitted
+from lyra_petsc.stepping.state import State, resized
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, StepInterval, Term, UpcomingStep, Viscous
@@ -150,7 +150,9 @@ class StageEquations:
         # moving targets change the forces at one and the same place
         self._internal = internal if active.moving else Remembered(internal)
         self._frames: dict[Term, Any] = {}  # by which these are known at the end of a step
-        self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
+        self.damping = Damping(
+            discretisation, active.elastic, dynamic=integrator.dynamic, single_assembly=once
+        )
         last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
         self.state = State(discretisation)
@@ -189,7 +191,7 @@ class StageEquations:
         lost their area nothing else is left.
         """
         least = np.zeros((self.points.n_local, 3))
-        for term in self.active.edged:
+        for term in self.active.with_edges:
             least.reshape(-1)[term.edge_indices] = LEAST * term.edge_stiffness
         return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
@@ -203,7 +205,7 @@ class StageEquations:
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
         self._follow(self.x)  # energies at the start of a run are those of all stencils
-        for term in self.active.near:
+        for term in self.active.changing:
             term.initialise_pairs(self.x, self.active.frozen[term])
 
     # -- a step ------------------------------------------------------------------------------------
@@ -213,7 +215,7 @@ class StageEquations:
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
         self.refused_way = self._may_begin = None
         self.new_iterate(None)
-        after = self.integrator.stage_after(self.dt)
+        after = self.integrator.stage_offset(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
         ahead = self._expected() if self.discretisation.limits_motion else None
         stops = () if ahead is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
@@ -225,11 +227,11 @@ class StageEquations:
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in (self.integrator, *self.followers):
-                follower.disturbed()
+                follower.restart()
         asking = [each for each in (self.integrator, *self.followers) if each.needs_acceleration]
         acceleration = self._accelerations(t0 + after) if asking else self.history
         for follower in asking:
-            follower.start_from(acceleration)
+            follower.set_acceleration(acceleration)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
         if self.watches_impacts:
@@ -242,14 +244,14 @@ class StageEquations:
     def _expected(self) -> Array:
         """How far (n_local, 3) [m] points would go in the step if they went on as they do."""
         ahead, n = self.dt * self.v, self.points.n_owned
-        self.prescribed.put(ahead[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.at))
+        self.prescribed.overwrite(ahead[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.indices))
         self.points.update_ghosts(ahead)
         return ahead
 
     def _accelerations(self, at: float) -> Array:
         """Of the free unknowns (n_owned, 3) [m/s²] at the start of the step, with its stage at ``at`` [s]."""
         v = self.v.copy()
-        self.prescribed.begin_with_rates(v[: self.points.n_owned])
+        self.prescribed.overwrite_with_start_velocity(v[: self.points.n_owned])
         self.points.update_ghosts(v)
         x, turns = self._frozen_positions(at), bool(self.active.pushing)
         if turns:  # by the stage an obstacle may be where the sheet is yet
@@ -264,17 +266,17 @@ class StageEquations:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
         x = self._frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
-        frozen, moves, self._frozen_before = self.active.frozen, self.integrator.moves, None
-        if moves and any(frozen[term] is not self._frames.get(term) for term in self.active.edged):
+        frozen, moves, self._frozen_before = self.active.frozen, self.integrator.dynamic, None
+        if moves and any(frozen[term] is not self._frames.get(term) for term in self.active.with_edges):
             self.forget_forces()  # by frames that have followed, they are others
         self.objective.begin_step()
-        if self.integrator.moves or self.applied.given is None:
+        if self.integrator.dynamic or self.applied.override is None:
             lagged = self.active.viscous and self.integrator.lagged_loads
             wind = self._sum(self.active.viscous, self.v) if lagged else None
             self.applied.freeze(self.t0, self.t1, x, wind)
         else:
-            self.applied.now = self.applied.given
-        if self.damping.acts:
+            self.applied.force = self.applied.override
+        if self.damping.active:
             self.damping.freeze(x, self.active.frozen)
 
     def _frozen_positions(self, at: float) -> Array:
@@ -295,17 +297,17 @@ class StageEquations:
     def _set_history(self, stage: Stage, at: float) -> None:
         """x_h with its ghosts, and the velocities of the prescribed unknowns."""
         n = self.points.n_owned
-        given = bool(self.held) and self.integrator.given
+        given = bool(self.held) and self.integrator.handles_at_stage
         if stage.x is None and not given:
             self._xh = self.x
-            self.prescribed.solve(self.x[:n], stage.reach)
+            self.prescribed.set_velocity_to_goal(self.x[:n], stage.c)
             return
         self._xh = np.empty_like(self.x)
         self._xh[:n] = self.x[:n] if stage.x is None else stage.x
         if given:
-            self.prescribed.give(at, self._xh[:n], stage.reach)
+            self.prescribed.set_motion_at(at, self._xh[:n], stage.c)
         else:
-            self.prescribed.solve(self._xh[:n], stage.reach)
+            self.prescribed.set_velocity_to_goal(self._xh[:n], stage.c)
         self.points.update_ghosts(self._xh)
 
     def out_of_balance(self) -> tuple[Array, float]:
@@ -329,11 +331,11 @@ class StageEquations:
 
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
-        self.prescribed.put(v, self.prescribed.velocity)
+        self.prescribed.overwrite(v, self.prescribed.velocity)
 
     def velocity_of_staying(self) -> Array:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
-        return ((self.x - self._xh) / self.stage.reach)[: self.points.n_owned]
+        return ((self.x - self._xh) / self.stage.c)[: self.points.n_owned]
 
     def beginning(self) -> Array:
         """Velocities (n_owned, 3) [m/s] of staying, or going on where only that leads past what is near; what
@@ -350,19 +352,19 @@ class StageEquations:
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
-        n, given, free = self.points.n_owned, self.integrator.given, self.prescribed.free
+        n, given, free = self.points.n_owned, self.integrator.handles_at_stage, self.prescribed.free
         self.evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n], self.v[:n]
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
-        self.integrator.accepted(before, rate_before, free, self.dt)
-        self.prescribed.put(moved, self.prescribed.goal)
+        self.integrator.record_step(before, rate_before, free, self.dt)
+        self.prescribed.overwrite(moved, self.prescribed.goal)
         if given:
-            self.prescribed.overwrite_with_rates(rate)
+            self.prescribed.overwrite_with_end_velocity(rate)
         self.state.set(moved, rate)
-        if self.active.limiting and self.integrator.moves:
+        if self.active.limiting and self.integrator.dynamic:
             from lyra_petsc.stepping import impacts  # of no use elsewhere
 
-            if self.stage.after < self.dt:  # what is met behind the stage has its energy from here on
+            if self.stage.offset < self.dt:  # what is met behind the stage has its energy from here on
                 self._follow(self._xs, self.x - self._xs, (1.0,))
             if not self.discretisation.has_near_elements:
                 self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
@@ -371,14 +373,14 @@ class StageEquations:
                 left = self.integrator.surplus
                 self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
             self.damped = impacts.damp_impacts(self)
-            for term in self.active.near:
+            for term in self.active.changing:
                 if term.slips:
                     self.damped = impacts.make_up_friction(self, term, self.damped)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
         if self._xh is self.x:
-            self._xh = fitted(x_before, self.points.n_owned, self.points.n_local)
+            self._xh = resized(x_before, self.points.n_owned, self.points.n_local)
             self.points.update_ghosts(self._xh)
 
     def begin_at_rest(self) -> float:
@@ -393,8 +395,8 @@ class StageEquations:
         """Let frames of edges follow to the end of a step that is one linear solve: so the forces there are
         those that the next one begins with.
         """
-        edged, frozen = self.active.edged, self.active.frozen
-        if edged and self.integrator.lagged_loads and self.integrator.moves:
+        edged, frozen = self.active.with_edges, self.active.frozen
+        if edged and self.integrator.lagged_loads and self.integrator.dynamic:
             self.active.refreeze({term: term.frames_at_end(self.x, frozen[term]) for term in edged})
             self._frozen_before = frozen
             self.forget_forces()
@@ -410,7 +412,7 @@ class StageEquations:
         whether any did, and the vertices' forces are others; collective.
         """
         found: dict[Term, Any] = {}
-        for term in () if self._at_end else self.active.edged:
+        for term in () if self._at_end else self.active.with_edges:
             nearer = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
             found |= {} if nearer is None else {term: nearer}
         if not self.points.comm.allreduce(len(found), MPI.MAX):
@@ -425,11 +427,11 @@ class StageEquations:
 
         On the tangent at v the vertices go beside their circles, and directors far beyond.
         """
-        if not self.active.edged or self.stage.reach * self.farthest_turn(way) <= LARGEST_TURN:
+        if not self.active.with_edges or self.stage.c * self.farthest_turn(way) <= LARGEST_TURN:
             return False
         x, ahead = self.ahead(v, way)
         changed = 0
-        for term in self.active.edged:
+        for term in self.active.with_edges:
             changed += self._follow_in(way, *term.followed(x, ahead, self.active.frozen[term]))
         return bool(self.points.comm.allreduce(changed, MPI.MAX))
 
@@ -439,20 +441,20 @@ class StageEquations:
         """
         along = self.ahead(v, bent)[1]
         x, ahead = self.ahead(v, way)
-        for term in self.active.edged:
+        for term in self.active.with_edges:
             self._follow_in(bent, *term.followed(x, ahead, self.active.frozen[term], along))
 
     def _follow_in(self, way: Array, places: Ints, values: Array) -> bool:
         """Put ways (m,) [m] of the free unknowns at ``places`` (m,) into way (n_owned, 3) [m/s]; if any."""
         own = places < way.size
         own[own] = self.prescribed.free.ravel()[places[own]]
-        way.reshape(-1)[places[own]] = values[own] / self.stage.reach
+        way.reshape(-1)[places[own]] = values[own] / self.stage.c
         return bool(own.any())
 
     @property
     def edges_lag(self) -> bool:
         """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
-        return bool(self.points.n_edges_global) and self.integrator.moves and self.stage.after < self.dt
+        return bool(self.points.n_edges_global) and self.integrator.dynamic and self.stage.offset < self.dt
 
     def begin_edges(self, x_before: Array) -> None:
         """Seek the edges' unknowns at the end of the step just accepted, from x_before (n_owned, 3);
@@ -467,17 +469,17 @@ class StageEquations:
         self.objective.forget()
         self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
-        self._xh = fitted(x_before, n, self.points.n_local)
+        self._xh = resized(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
         self._at_end = True
-        self.prescribed.solve(self._xh[:n], dt)
+        self.prescribed.set_velocity_to_goal(self._xh[:n], dt)
 
     def end_edges(self, v: Array | None) -> None:
         """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""
         n = self.points.n_owned
-        moved = None if v is None else self._xh[:n] + self.stage.reach * v
+        moved = None if v is None else self._xh[:n] + self.stage.c * v
         self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._kept
         self.prescribed.release_vertices()
         self._at_end = False
@@ -493,7 +495,7 @@ class StageEquations:
 
     def written_velocity(self) -> Array:
         """Velocities (n_owned, 3) to write out: those of prescribed unknowns are ẋ*(t)."""
-        self.prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
+        self.prescribed.overwrite_with_end_velocity(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
     def pull_of(self, terms: Sequence[Elastic], x: Array) -> Array:
@@ -502,13 +504,13 @@ class StageEquations:
 
     def pushed(self) -> float:
         """Work [J] in the step of what pushes this rank's elements, by its forces at the stage."""
-        at = self.t0 + self.stage.after if self.integrator.moves else self.t1
+        at = self.t0 + self.stage.offset if self.integrator.dynamic else self.t1
         work = sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
         return work + (self.damped.work if self.damped else 0.0)
 
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""
-        if self.stage.after == self.dt or not (self.active.moving or self.active.constraints):
+        if self.stage.offset == self.dt or not (self.active.moving or self.active.constraints):
             return 0.0
         before = self.active.moving_energy(self.x)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
@@ -517,18 +519,18 @@ class StageEquations:
     @property
     def watches_impacts(self) -> bool:
         """Whether what contact adds to the energy is known and taken back; not so where obstacles move."""
-        return self.integrator.by_stage and bool(self.active.limiting) and not self.active.pushing
+        return self.integrator.exact_work and bool(self.active.limiting) and not self.active.pushing
 
     @property
     def limits_steps(self) -> bool:
         """Whether `largest_step` may be less than 1: also in statics with directors, which would else go to
         quite another equilibrium.
         """
-        return bool(self.active.limiting) or (bool(self.active.edged) and not self.integrator.moves)
+        return bool(self.active.limiting) or (bool(self.active.with_edges) and not self.integrator.dynamic)
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        turn = 0.0 if self.integrator.moves else self.farthest_turn(way * self.stage.reach)
+        turn = 0.0 if self.integrator.dynamic else self.farthest_turn(way * self.stage.c)
         most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
         for _ in range(SEARCHES):
             whole = gone == 0.0 and most == 1.0  # mostly
@@ -583,7 +585,7 @@ class StageEquations:
             ahead[:n] += np.where(self.prescribed.free, aside, 0.0)
             self.points.update_ghosts(ahead)
             pushed = True
-        return ahead[:n] / self.stage.reach if pushed else None
+        return ahead[:n] / self.stage.c if pushed else None
 
     def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
         """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
@@ -598,7 +600,7 @@ class StageEquations:
         """Add springs of this stiffness [N/m] to the Jacobian's block rows (n_blocks, 3, 3)."""
         rows, beside = self.discretisation.rows, self.prescribed.beside
         for term, each in springs.items():
-            reach = self.stage.reach
+            reach = self.stage.c
             each.add_stiffness(reach * stiffness[term], rows.pattern.offsets[term.name], values)
         if len(beside.changing):
             rows.constrain(values, self.prescribed.mask, beside)
@@ -610,7 +612,7 @@ class StageEquations:
 
     def farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
-        turn = max((term.largest_turn(way) for term in self.active.edged), default=0.0)
+        turn = max((term.largest_turn(way) for term in self.active.with_edges), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
 
     def _least_of(self, number: float) -> float:
@@ -620,7 +622,7 @@ class StageEquations:
     def ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
         x = self.evaluate_at(v)[0]
-        ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
+        ahead = resized(way * self.stage.c, len(way), self.points.n_local)
         self.points.update_ghosts(ahead)
         return x, ahead
 
@@ -631,7 +633,7 @@ class StageEquations:
         what obstacles take along.
         """
         here = self.velocity_of_staying()
-        goes = self.prescribed.velocity != here.take(self.prescribed.at)
+        goes = self.prescribed.velocity != here.take(self.prescribed.indices)
         if not any(self.points.global_max(bool(self.active.pushing) or bool(goes.any()))):
             return True
         rests, refused = self.integrator.starts_at_rest, None
@@ -662,7 +664,7 @@ class StageEquations:
             change = taken[:n] != ahead[:n]
             if not self.points.comm.allreduce(bool(change.any()), MPI.LOR):
                 break
-            way = np.where(change, taken[:n] / self.stage.reach, way)
+            way = np.where(change, taken[:n] / self.stage.c, way)
         return way
 
     def _may_go(self, v: Array, way: Array, *, after: bool = False) -> bool:
@@ -691,7 +693,7 @@ class StageEquations:
         """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
         collective.
         """
-        if self.stage.after == self.dt and self.integrator.iterates:
+        if self.stage.offset == self.dt and self.integrator.iterates:
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
@@ -701,7 +703,7 @@ class StageEquations:
         if not self.discretisation.has_near_elements and self.discretisation.searched_fraction(x, way) == 1.0:
             return True
         v = v if self.integrator.iterates else self.velocity_of_staying()
-        return self._may_go(v, way / self.stage.reach, after=True)
+        return self._may_go(v, way / self.stage.c, after=True)
 
     # -- what Newton asks for ----------------------------------------------------------------------
 
@@ -714,19 +716,19 @@ class StageEquations:
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
         same = self._xh is self.x
-        self.state.fit()
-        self._xh = self.x if same else fitted(self._xh, n, n_local)
-        self._xs, self._vs = fitted(self._xs, n, n_local), fitted(self._vs, n, n_local)
+        self.state.resize()
+        self._xh = self.x if same else resized(self._xh, n, n_local)
+        self._xs, self._vs = resized(self._xs, n, n_local), resized(self._vs, n, n_local)
         for values in (self._xh, self._xs, self._vs):
             layout.update_ghosts(values)
         self.__dict__.pop("_vertex_rows", None)
-        self.prescribed.fit()
+        self.prescribed.resize()
 
     def evaluate_at(self, v: Array) -> tuple[Array, Array]:
         """Positions and velocities (n_local, 3) of the stage, ghosts up to date; collective."""
         self._vs[: self.points.n_owned] = v
         self.points.update_ghosts(self._vs)
-        np.multiply(self._vs, self.stage.reach, out=self._xs)
+        np.multiply(self._vs, self.stage.c, out=self._xs)
         self._xs += self._xh
         self._follow(self._xs)
         return self._xs, self._vs
@@ -750,8 +752,8 @@ class StageEquations:
         del vdot
         if self.active.constraints:
             yield self._counted("springs", self._sum(self.active.constraints, x))
-        yield self._counted("loads", -self.applied.at(x))
-        if self.damping.acts:
+        yield self._counted("loads", -self.applied.force_at(x))
+        if self.damping.active:
             yield self._counted("damping", self.damping.product(vs))
             if self.integrator.lagged_loads:  # nobody asks again
                 self.damping.product.forget()
@@ -778,8 +780,8 @@ class StageEquations:
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
         self._total(*self.evaluate_at(v), vdot, out)
-        at, velocity = self.prescribed.at, self.prescribed.velocity
-        self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
+        at, velocity = self.prescribed.indices, self.prescribed.velocity
+        self.prescribed.overwrite(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
@@ -789,7 +791,7 @@ class StageEquations:
         """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
         collective.
         """
-        near, frozen = self.active.near, self.active.frozen
+        near, frozen = self.active.changing, self.active.frozen
         if not near:
             return []
         acting = [np.count_nonzero(t.active_elements(self._xs, frozen[t])[: t.n_owned]) for t in near]
@@ -811,7 +813,7 @@ class StageEquations:
         if not self.discretisation.has_near_elements:
             self.touches = False
             return self.discretisation.update_pattern({})
-        acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.near}
+        acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
             self.touches = any(self.points.global_max(number))
@@ -822,7 +824,7 @@ class StageEquations:
         """Whether there is anything of which one linear solve cannot tell whether it sticks or slides;
         collective.
         """
-        number = sum(term.n_friction_pairs for term in self.active.near)
+        number = sum(term.n_friction_pairs for term in self.active.changing)
         return self.discretisation.has_near_elements and any(self.points.global_max(number))
 
     @property
@@ -831,13 +833,13 @@ class StageEquations:
         limiting = self.active.limiting
         if not (limiting and self.discretisation.has_near_elements):
             return False
-        way = self.stage.reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
+        way = self.stage.c * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
         return self.points.global_max(float(way))[0] > IMPACT * min(term.skin for term in limiting)
 
     def collides(self, far: float) -> bool:
         """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""
         limiting = self.active.limiting
-        if not self.discretisation.has_near_elements or not self.integrator.moves or self._at_end:
+        if not self.discretisation.has_near_elements or not self.integrator.dynamic or self._at_end:
             return False
         x, ahead, frozen = self.x, self._expected(), self.active.frozen
         return any(self.points.global_max(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))
@@ -871,12 +873,12 @@ class StageEquations:
 
     def forget_directors(self) -> None:
         """Keep none while a linear system is solved, which needs the room: next they are elsewhere."""
-        for term in self.active.edged:
+        for term in self.active.with_edges:
             term.forget()
 
     def forget_rows(self) -> None:
         """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
-        self.damping.let_go()
+        self.damping.release_values()
 
     def jacobian(self, v: Array, blend: float, values: Array) -> None:
         """Let block rows (n_blocks, 3, 3) be σ M + c K + D + ∇∇P, prescribed unknowns decoupled.
@@ -890,14 +892,14 @@ class StageEquations:
         lagged = self.integrator.lagged_loads
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
-        reach = self.stage.reach
+        reach = self.stage.c
         inertia = self.stage.sigma * self.mass
-        if self.active.edged:
+        if self.active.with_edges:
             inertia[self.points.n_vertices :] += reach * self._least
         beside = self.prescribed.beside
         changing = beside.changing
-        if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, changing):
-            self.damping.into(values, inertia)
+        if blend < 1.0 or not self.damping.assemble_with_stiffness(x, reach, inertia, values, changing):
+            self.damping.assemble(values, inertia)
             for term in self.active.elastic:
                 rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, predicted)
         if not lagged:

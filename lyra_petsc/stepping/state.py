@@ -28,23 +28,23 @@ class State:
         for values in (self.x, self.v):
             layout.update_ghosts(values)
 
-    def fit(self) -> None:
+    def resize(self) -> None:
         """Follow the layout to other ghosts; collective."""
         layout = self._discretisation.layout
         self.x, self.v = (
-            fitted(self.x, layout.n_owned, layout.n_local),
-            fitted(self.v, layout.n_owned, layout.n_local),
+            resized(self.x, layout.n_owned, layout.n_local),
+            resized(self.v, layout.n_owned, layout.n_local),
         )
         self.update_ghosts()
 
     def set(self, x: Array, v: Array) -> None:
         """Take positions and velocities (n_owned, 3); collective. The arrays before stay what they are."""
         layout = self._discretisation.layout
-        self.x, self.v = (fitted(values, layout.n_owned, layout.n_local) for values in (x, v))
+        self.x, self.v = (resized(values, layout.n_owned, layout.n_local) for values in (x, v))
         self.update_ghosts()
 
 
-def fitted(values: Array, n_owned: int, n_local: int) -> Array:
+def resized(values: Array, n_owned: int, n_local: int) -> Array:
     """The owned rows of an array, with room for so many local rows."""
     out = np.zeros((n_local, 3))
     out[:n_owned] = values[:n_owned]

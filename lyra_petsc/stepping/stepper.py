@@ -186,7 +186,7 @@ class Stepper:
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
-        if equations.discretisation.stencils_change or (equations.active.edged and self._iterates):
+        if equations.discretisation.stencils_change or (equations.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
         if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.limits_motion:
             from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
@@ -203,7 +203,7 @@ class Stepper:
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=LOOSEST if equations.integrator.moves else STATIC, max_it=5000)
+            ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=ONCE, max_it=5000)
@@ -302,7 +302,7 @@ class Stepper:
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.left, outcome.at_roundoff
         if velocity is not None:
-            if not self._iterates and equations.active.edged:
+            if not self._iterates and equations.active.with_edges:
                 velocity = self._with_triangles(velocity)
             equations.accept(velocity)
             if before is not None:
@@ -372,7 +372,7 @@ class Stepper:
         # a TS step that ends where its stage shall be, with the shift that the integrator wants
         theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
-        self.ts.setTime(t0 + stage.after - theta * length)
+        self.ts.setTime(t0 + stage.offset - theta * length)
         self.ts.setTimeStep(length)
         self._newton.begin_step()
         if not self._iterates and not is_set("ksp_rtol"):

@@ -61,14 +61,14 @@ class VertexEquations:
         decoupled.
         """
         equations, rows = self._equations, self._rows
-        (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.acts
+        (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.set(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
         rows.set_diagonal(stage.sigma * equations.mass, values)
         for term in self._elastic:
-            weight: Array | float = stage.reach
+            weight: Array | float = stage.c
             if damped and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
             rows.add_stiffness(term, x, equations.active.frozen.get(term), 1.0, weight, values)
@@ -90,9 +90,9 @@ class VertexEquations:
         edge = head - tail
         normal = np.cross(edge, opposite - tail)
         square = np.sum(normal * normal, axis=1)
-        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.stage.reach
-        if self._equations.damping.acts:
-            factor *= 1.0 + data["damping"][triangle] / self._equations.stage.reach
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.stage.c
+        if self._equations.damping.active:
+            factor *= 1.0 + data["damping"][triangle] / self._equations.stage.c
         # n nᵀ / height²
         factor *= np.divide(
             np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0

@@ -30,11 +30,11 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
     system.begin_step(0.0, 1.0)
     way = np.zeros_like(system.history)
     way[:n] = angle * np.cross(AXIS, system.x[:n])
-    for term in system.active.edged:
+    for term in system.active.with_edges:
         places = term.edge_indices
         own = places < way.size
         way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.tangent @ AXIS))[own]
-    return system.velocity_of_staying(), way / system.stage.reach
+    return system.velocity_of_staying(), way / system.stage.c
 
 
 @pytest.mark.parallel(2, 3)
@@ -72,7 +72,7 @@ def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
     staying, _ = turning(simulation, 0.0)
     arcs, random = Arcs(system), np.random.default_rng(3)
     way = np.where(system.prescribed.free, random.uniform(-1.0, 1.0, staying.shape), 0.0)
-    way *= 0.01 / (system.stage.reach * np.abs(way[:n]).max())
+    way *= 0.01 / (system.stage.c * np.abs(way[:n]).max())
     apart = []
     for size in (0.1, 0.01):
         bent, _ = arcs.bend(staying, size * way)

@@ -117,7 +117,7 @@ def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
     system = simulation.problem.system
     n, n_local = system.points.n_owned, system.points.n_local
     v = np.zeros((n, 3))
-    v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, 0.0, 0.8 * GAP / system.stage.reach)
+    v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, 0.0, 0.8 * GAP / system.stage.c)
     system.evaluate_at(v)
     assert comm.size == 1 or comm.allreduce(system.points.n_local > n_local, MPI.LOR)
     assert simulation.stepper.linear.renew()

@@ -76,7 +76,7 @@ def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> Non
         system = simulation.problem.system
         values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         system.damping.freeze(system.x, system.active.frozen)
-        assert system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
         assert not system.discretisation.has_near_elements
         assert not damp_impacts(system).felt.any()
     floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
@@ -84,7 +84,7 @@ def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> Non
         system = simulation.problem.system
         values = system.discretisation.rows.zeros()
         system.damping.freeze(system.x, system.active.frozen)
-        assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
         assert system.discretisation.has_near_elements
 
 

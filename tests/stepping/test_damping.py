@@ -23,15 +23,15 @@ def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: 
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
         damping.freeze(x, system.active.frozen)
         expected, found = blocks.zeros(), blocks.zeros()
-        damping.into(expected, diagonal := 1.0 + np.arange(len(system.mass)))
+        damping.assemble(expected, diagonal := 1.0 + np.arange(len(system.mass)))
         for term in system.active.elastic:
             blocks.add_stiffness(term, x, system.active.frozen[term], 1.0, 0.3, expected)
         none = np.empty(0, dtype=np.int64)
-        if damping.with_stiffness_into(x, 0.3, diagonal, found, none):
+        if damping.assemble_with_stiffness(x, 0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
         else:
             assert comm.size > 1  # a rank without an element of a term takes the long way
-        assert not damping.with_stiffness_into(x + 1e-9, 0.3, diagonal, found, none)
+        assert not damping.assemble_with_stiffness(x + 1e-9, 0.3, diagonal, found, none)
 
 
 def test_two_factors_are_no_multiple() -> None:
@@ -45,7 +45,7 @@ def test_two_factors_are_no_multiple() -> None:
         system.damping.freeze(system.x, system.active.frozen)
         values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
-        assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
 
 
 def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> None:
@@ -99,8 +99,8 @@ def test_rows_that_become_another_matrix_are_let_go() -> None:
         system = simulation.problem.system
         damping, rows, none = system.damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         damping.freeze(system.x, system.active.frozen)
-        assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)
+        assert damping.assemble_with_stiffness(system.x, 0.3, system.mass, rows, none)
         once = damping.product(v := np.cos(3.0 * system.x))
-        damping.into(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may
+        damping.assemble(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may
         damping.product.forget()
         np.testing.assert_allclose(damping.product(v), once, rtol=0.0, atol=1e-12 * np.abs(once).max())

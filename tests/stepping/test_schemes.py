@@ -30,7 +30,7 @@ def parabola(t: float) -> Array:
 def test_bdf2_differentiates_parabolas_exactly(steps: tuple[float, ...]) -> None:
     scheme, times = Bdf2(), np.concatenate([[0.0], np.cumsum(steps)])
     for i, step in enumerate(steps[:-1]):
-        scheme.accepted(parabola(times[i]), parabola(times[i]), np.ones((1, 3), dtype=bool), step)
+        scheme.record_step(parabola(times[i]), parabola(times[i]), np.ones((1, 3), dtype=bool), step)
     stage = scheme.stage(parabola(times[-2]), parabola(times[-2]), steps[-1])
     assert stage.x is not None
     slope = stage.sigma * (parabola(times[-1]) - stage.x)
@@ -40,7 +40,7 @@ def test_bdf2_differentiates_parabolas_exactly(steps: tuple[float, ...]) -> None
 
 def test_bdf2_goes_on_after_a_restart_with_the_accelerations_it_was_given() -> None:
     scheme, resumed = Bdf2(), Bdf2()
-    scheme.start_from(parabola(1.0))
+    scheme.set_acceleration(parabola(1.0))
     resumed.restore(*scheme.memory())
     assert not resumed.needs_acceleration
     stages = [each.stage(parabola(0.0), parabola(0.0), 0.1) for each in (scheme, resumed)]
@@ -55,14 +55,14 @@ def amplification(radius: float, omega_dt: float) -> float:
     for unit in np.eye(3):
         x, v, a = (np.array([[value]]) for value in unit)
         scheme = GeneralisedAlpha(radius)
-        scheme.start_from(a)
+        scheme.set_acceleration(a)
         stage = scheme.stage(x, v, 1.0)
         assert stage.x is not None
         assert stage.v is not None
         # σ (u − v_h) + ω² (x_h + c u) = 0
-        u = (stage.sigma * stage.v - omega_dt**2 * stage.x) / (stage.sigma + omega_dt**2 * stage.reach)
+        u = (stage.sigma * stage.v - omega_dt**2 * stage.x) / (stage.sigma + omega_dt**2 * stage.c)
         end_x, end_v = scheme.end(x, v, u, 1.0)
-        scheme.accepted(x, v, np.ones((1, 1), dtype=bool), 1.0)
+        scheme.record_step(x, v, np.ones((1, 1), dtype=bool), 1.0)
         columns.append([end_x[0, 0], end_v[0, 0], scheme.memory()[0]["acceleration"][0, 0]])
     return float(np.abs(np.linalg.eigvals(np.array(columns).T)).max())
 

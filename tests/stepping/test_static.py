@@ -250,7 +250,7 @@ def test_the_jacobian_of_directors_is_that_of_their_energy(comm: MPI.Comm) -> No
         add_exact_hessian(system, exact := rows.zeros())
         edges = rows.pattern.indptr[system.points.n_vertices : -1]  # each row's first block is its own
         found, plain = (np.diagonal(each[edges], axis1=1, axis2=2) for each in (values, exact))
-        np.testing.assert_allclose(found, system.stage.reach * plain, rtol=1e-8)
+        np.testing.assert_allclose(found, system.stage.c * plain, rtol=1e-8)
 
 
 NOWHERE: dict[str, tuple[dict[str, Any], str]] = {

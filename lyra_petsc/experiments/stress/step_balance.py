@@ -38,7 +38,7 @@ from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
-from lyra_petsc.stepping.state import fitted
+from lyra_petsc.stepping.state import resized
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge
@@ -254,7 +254,7 @@ class Accountant:
     def _fit(self) -> None:
         """Give the positions in which the step began the ghosts that contact needs now; collective."""
         layout = self._system.points
-        self._x = fitted(self._x, layout.n_owned, layout.n_local)
+        self._x = resized(self._x, layout.n_owned, layout.n_local)
         layout.update_ghosts(self._x)
 
     @property
@@ -274,7 +274,7 @@ class Accountant:
         parts = self._parts(report, dv / dt)
         reaction = self._simulation.ledger.reaction
         if system.damped is not None:  # after the equations were solved
-            at = system.prescribed.at
+            at = system.prescribed.indices
             reaction.put(at, reaction.take(at) - system.damped.held)
         weight = self._gravity(report)
         moved = dx[:n]
@@ -453,7 +453,7 @@ class StageAccountant(Accountant):
         self._fit()
         x0, x1 = self._x, system.x
         # targets that move stand where the step ends by now; damping is right in the frames of the step
-        system.active.turn_targets(self._at(system.t0 + system.stage.after))
+        system.active.turn_targets(self._at(system.t0 + system.stage.offset))
         parts = dict(system.forces_at_stage())
         ended = self._at(system.t1)
         frozen = {term: term.freeze(ended) for term in system.active.elastic}

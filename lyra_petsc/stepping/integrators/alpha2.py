@@ -23,8 +23,8 @@ class GeneralisedAlpha(Integrator):
     name = "alpha2"
     order = 2
     centred = True
-    judged_over = 4
-    given = True
+    gain_window = 4
+    handles_at_stage = True
 
     def __init__(self, radius: float) -> None:
         self._am = (2.0 * radius - 1.0) / (radius + 1.0)
@@ -43,23 +43,23 @@ class GeneralisedAlpha(Integrator):
     def needs_acceleration(self) -> bool:
         return self._a is None
 
-    def start_from(self, acceleration: Array) -> None:
+    def set_acceleration(self, acceleration: Array) -> None:
         self._a = acceleration
 
-    def disturbed(self) -> None:
+    def restart(self) -> None:
         self._a = None
 
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         return (1.0 - self._af) * dt
 
     def stage(self, x: Array, v: Array, dt: float) -> Stage:
         assert self._a is not None
         am, af, gamma, beta = self._am, self._af, self._gamma, self._beta
         sigma = (1.0 - am) / ((1.0 - af) * gamma * dt)
-        reach = beta * dt / gamma
+        c = beta * dt / gamma
         v_h = v + (((1.0 - am) * (1.0 - gamma) / gamma - am) / sigma) * self._a
-        x_h = x + ((1.0 - af) * dt - reach) * v + (1.0 - af) * dt * dt * (0.5 - beta / gamma) * self._a
-        return Stage(sigma, reach, (1.0 - af) * dt, x_h, v_h)
+        x_h = x + ((1.0 - af) * dt - c) * v + (1.0 - af) * dt * dt * (0.5 - beta / gamma) * self._a
+        return Stage(sigma, c, (1.0 - af) * dt, x_h, v_h)
 
     def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
         assert self._a is not None
@@ -69,7 +69,7 @@ class GeneralisedAlpha(Integrator):
         moved = x + dt * v + dt * dt * ((0.5 - beta) * self._a + beta * self._next)
         return moved, v + dt * ((1.0 - gamma) * self._a + gamma * self._next)
 
-    def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
+    def record_step(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         assert self._next is not None
         self._a = np.where(free, self._next, 0.0)
 

@@ -24,7 +24,7 @@ class Bdf2(Integrator):
     name = "bdf2"
     order = 2
     centred = True
-    judged_over = 4
+    gain_window = 4
 
     SHARE = 0.48
     """Of the third-order formula; up to 0.5 is A-stable."""
@@ -44,22 +44,22 @@ class Bdf2(Integrator):
         return (1.0 + r) ** 2 / (6.0 * r * (1.0 + 2.0 * r))
 
     @property
-    def given(self) -> bool:  # type: ignore[override]
+    def handles_at_stage(self) -> bool:  # type: ignore[override]
         return not self._past
 
     @property
     def needs_acceleration(self) -> bool:
         return not self._past and self._starter.needs_acceleration
 
-    def start_from(self, acceleration: Array) -> None:
-        self._starter.start_from(acceleration)
+    def set_acceleration(self, acceleration: Array) -> None:
+        self._starter.set_acceleration(acceleration)
 
-    def disturbed(self) -> None:
+    def restart(self) -> None:
         # a polynomial through states before and after a jump is of first order
         self._past = []
-        self._starter.disturbed()
+        self._starter.restart()
 
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         return dt
 
     def weights(self, dt: float) -> tuple[float, list[float]]:
@@ -94,13 +94,13 @@ class Bdf2(Integrator):
         sigma, x_h, _ = self._history(x, v, dt)
         return x_h + stage_velocity / sigma, stage_velocity
 
-    def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
+    def record_step(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         self._past = [(x, v, dt), *self._past[:1]]
 
-    def shift_past(self, change: Array) -> None:
+    def shift_past_positions(self, change: Array) -> None:
         self._past = [(x + change, v, dt) for x, v, dt in self._past]
 
-    def take_jump(self, change: Array) -> None:
+    def shift_past_velocities(self, change: Array) -> None:
         past, ago = [], 0.0
         for x, v, dt in self._past:
             ago += dt

@@ -12,7 +12,7 @@ class BackwardEuler(Integrator):
     name = "beuler"
     error_constant = 0.5
 
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         return dt
 
     def stage(self, x: Array, v: Array, dt: float) -> Stage:

@@ -31,17 +31,17 @@ class Stage:
     ----------
     sigma : float
         dv̇/dv [1/s].
-    reach : float
+    c : float
         dx/dv [s].
-    after : float
+    offset : float
         Time [s] from the start of the step to the stage.
     x, v : (n_owned, 3) or None
         Histories x_h [m] and v_h [m/s]; None: positions and velocities at the start of the step.
     """
 
     sigma: float
-    reach: float
-    after: float
+    c: float
+    offset: float
     x: Array | None = None
     v: Array | None = None
 
@@ -53,10 +53,10 @@ class NeedsAcceleration(Protocol):
     def needs_acceleration(self) -> bool:
         """Whether it must be told them now."""
 
-    def start_from(self, acceleration: Array) -> None:
+    def set_acceleration(self, acceleration: Array) -> None:
         """Take them, (n_owned, 3) [m/s²]."""
 
-    def disturbed(self) -> None:
+    def restart(self) -> None:
         """Forces jump at the start of the coming step."""
 
 
@@ -65,22 +65,22 @@ class NoHistory:
 
     @property
     def needs_acceleration(self) -> bool:
-        """Whether `start_from` must be called before `Integrator.stage`."""
+        """Whether `set_acceleration` must be called before `Integrator.stage`."""
         return False
 
-    def start_from(self, acceleration: Array) -> None:
+    def set_acceleration(self, acceleration: Array) -> None:
         """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
 
-    def disturbed(self) -> None:
+    def restart(self) -> None:
         """Forces jump at the start of the coming step: forget accelerations."""
 
-    def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
+    def record_step(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         """Remember the step that led from x, v; ``free`` marks the coordinates nothing prescribed."""
 
-    def shift_past(self, change: Array) -> None:
+    def shift_past_positions(self, change: Array) -> None:
         """Add ``change`` (n_owned, 3) [m] to remembered positions, as their reference is another."""
 
-    def take_jump(self, change: Array) -> None:
+    def shift_past_velocities(self, change: Array) -> None:
         """Velocities jump by ``change`` (n_owned, 3) [m/s] at the end of the step: change what is remembered
         as if they had been so before, too.
         """
@@ -109,18 +109,18 @@ class Integrator(NoHistory, ABC):
         Velocity-dependent loads are taken at the start of the step.
     iterates : bool
         Newton's method solves for the stage; else one linear solve does.
-    moves : bool
+    dynamic : bool
         It is a motion in time, with damping.
     centred : bool
         What is frozen during a step is frozen at the extrapolated stage, as second order needs.
-    judged_over : int
+    gain_window : int
         Steps over which its gain of energy is averaged before it is judged: a scheme of several steps gives
         back in the next ones what it has taken in one.
-    by_stage : bool
+    exact_work : bool
         Kinetic energy changes by just the work of the stage's forces, so that it is known what contact adds.
     surplus : float
         Energy [J] that it has added and not yet lost again, where that is known.
-    given : bool
+    handles_at_stage : bool
         Prescribed coordinates take part in the stage with their exact position and velocity at its
         time; else with the velocity that the integrator gives them for their position at the end.
     """
@@ -130,17 +130,17 @@ class Integrator(NoHistory, ABC):
     ts_type: ClassVar[str] = "beuler"
     lagged_loads: ClassVar[bool] = False
     iterates: ClassVar[bool] = True
-    moves: ClassVar[bool] = True
+    dynamic: ClassVar[bool] = True
     centred: ClassVar[bool] = False
-    judged_over: ClassVar[int] = 1
-    by_stage: ClassVar[bool] = False
+    gain_window: ClassVar[int] = 1
+    exact_work: ClassVar[bool] = False
     surplus: float = 0.0
-    given: bool = False
+    handles_at_stage: bool = False
 
     @property
     def starts_at_rest(self) -> bool:
         """Whether a solve starts where the sheet is, at rest."""
-        return not (self.iterates and self.moves)
+        return not (self.iterates and self.dynamic)
 
     @property
     @abstractmethod
@@ -148,7 +148,7 @@ class Integrator(NoHistory, ABC):
         """Local error of the positions in the last step over Δt² ẍ (order 1) or Δt³ x⃛ (order 2)."""
 
     @abstractmethod
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         """Time [s] from the start of a step of length dt to its stage."""
 
     @abstractmethod

@@ -16,13 +16,13 @@ class Midpoint(Integrator):
     error_constant = 1.0 / 12.0
     ts_type = "theta"
     centred = True
-    given = True
-    by_stage = True
+    handles_at_stage = True
+    exact_work = True
 
     def __init__(self) -> None:
         self.surplus = 0.0
 
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         return 0.5 * dt
 
     def stage(self, x: Array, v: Array, dt: float) -> Stage:

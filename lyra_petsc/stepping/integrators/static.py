@@ -13,29 +13,29 @@ class Static(Integrator):
 
     Attributes
     ----------
-    pseudo : float
+    pseudo_dt : float
         Pseudo time step [s]: the larger, the closer to equilibrium a solve gets.
-    ahead : (n_owned, 3) or None
+    predicted : (n_owned, 3) or None
         Way [m] that the next solve is expected to go; where Newton's method starts.
-    others : list of (n_owned, 3)
+    alternatives : list of (n_owned, 3)
         Other ways [m] that may be better.
     """
 
     name = "static"
     error_constant = 0.0
     lagged_loads = True
-    moves = False
+    dynamic = False
 
     def __init__(self) -> None:
-        self.pseudo = 1.0
-        self.ahead: Array | None = None
-        self.others: list[Array] = []
+        self.pseudo_dt = 1.0
+        self.predicted: Array | None = None
+        self.alternatives: list[Array] = []
 
-    def stage_after(self, dt: float) -> float:
+    def stage_offset(self, dt: float) -> float:
         return dt
 
     def stage(self, x: Array, v: Array, dt: float) -> Stage:
-        return Stage(1.0 / self.pseudo, self.pseudo, dt)
+        return Stage(1.0 / self.pseudo_dt, self.pseudo_dt, dt)
 
     def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
-        return x + self.pseudo * stage_velocity, np.zeros_like(v)
+        return x + self.pseudo_dt * stage_velocity, np.zeros_like(v)
