@@ -223,7 +223,7 @@ class Simulation:
 
     def step(self, dt: float) -> Attempt:
         """One step, which must converge."""
-        self.system.begin(self.time)
+        self.system.set_references(self.time)
         end = self.time + dt
         attempt = self.stepper.attempt(self.time, end)
         assert attempt.converged, f"step to {end} s: {attempt}"

@@ -170,7 +170,7 @@ class Simulation:
     @property
     def velocities(self) -> Array:
         """(n, 3) current velocities [m/s] of this rank's vertices, a copy."""
-        return np.array(self._running.problem.system.written_velocity()[: len(self.vertices)])
+        return np.array(self._running.problem.system.output_velocity()[: len(self.vertices)])
 
     def field(self, name: str) -> Array:
         """A field that ``output.fields`` of a scene may name, on this rank's vertices or triangles.

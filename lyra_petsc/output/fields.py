@@ -27,7 +27,7 @@ Ints = NDArray[np.int32]
 
 
 def _velocity(problem: Problem) -> Array:
-    return problem.system.written_velocity()[: problem.points.n_vertices]
+    return problem.system.output_velocity()[: problem.points.n_vertices]
 
 
 def _displacement(problem: Problem) -> Array:

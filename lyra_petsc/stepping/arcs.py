@@ -69,14 +69,14 @@ class Arcs:
 
     def matter(self, way: Array) -> bool:
         """Whether a way (n_owned, 3) [m/s] turns anything so far that its arc is another one."""
-        return self._equations.farthest_turn(way * self._equations.stage.c) > STRAIGHT
+        return self._equations.largest_turn(way * self._equations.stage.c) > STRAIGHT
 
     def bend(self, v: Array, way: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """The way from v by ``way`` (n_owned, 3) [m/s] along arcs, and on the tangent, as far as no triangle
         turns too far; without ``strains`` all of it, and triangles keep their shape.
         """
         equations = self._equations
-        x, ahead = equations.ahead(v, way)
+        x, ahead = equations.displacement(v, way)
         shape, spin, strain = self._turn(x, ahead)
         turn = np.linalg.norm(spin, axis=1)
         farthest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
@@ -88,7 +88,7 @@ class Arcs:
         pulls, corners = self._slopes @ missing.transpose(0, 2, 1), self._term.stencil.ravel()
         forces = [np.bincount(corners, pulls[:, :, i].ravel(), len(x))[: len(way)] for i in range(3)]
         bent = way + self._solve(np.stack(forces, axis=1)) / equations.stage.c
-        equations.let_directors_follow(v, way, bent)
+        equations.match_directors(v, way, bent)
         return bent, way
 
     def _gradients(self, x: Array) -> Array:

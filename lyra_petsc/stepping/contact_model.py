@@ -68,13 +68,13 @@ class ContactModel:
         the residual.
         """
         equations, linear, self.linear_iterations = self._equations, self._linear, 0
-        self._springs = equations.springs(v, -y.getArray(readonly=True).reshape(v.shape))
+        self._springs = equations.contact_springs(v, -y.getArray(readonly=True).reshape(v.shape))
         self._take(list(self._springs.values()))
         change, size = self._longer(y), residual.norm()
         length = self._length + change
         force, expected = self._law(length)[0], self._force - self._stiffness * change
         if self._apart(force, expected) <= MATCH * size:
-            equations.release({})
+            equations.release_contact_springs({})
             return False
         if self._follow():
             assemble()
@@ -99,7 +99,9 @@ class ContactModel:
         downwards = bool(residual.dot(y) > 0.0)
         if not downwards:
             first.copy(y)
-        equations.release(dict(zip(self._springs, self._split(length), strict=True)) if downwards else {})
+        equations.release_contact_springs(
+            dict(zip(self._springs, self._split(length), strict=True)) if downwards else {}
+        )
         for each in (first, z, left):
             each.destroy()
         return downwards
@@ -161,7 +163,7 @@ class ContactModel:
         each = dict(zip(self._springs, self._split(slopes - self._stiffness), strict=True))
 
         def add(rows: Array) -> None:
-            equations.add_springs(self._springs, each, rows)
+            equations.add_contact_springs(self._springs, each, rows)
 
         linear.with_more(add)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)

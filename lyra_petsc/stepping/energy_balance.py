@@ -151,7 +151,7 @@ class Ledger:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
-        system.end_frames()
+        system.move_frames_to_end()
         external, damping, damped = self._external(system.forces_at_stage())
         # targets that move with a handle let it work on the sheet
         if self._pull is None:
@@ -163,7 +163,7 @@ class Ledger:
                 0.5 * float(np.vdot(pull + pull0, at - at0))
                 for (at0, pull0), (at, pull) in zip(before, self._targets, strict=True)
             )
-        turned += system.pushed() + system.turn_targets_to_end()
+        turned += system.obstacle_work() + system.move_targets_to_end()
         local = np.array([_work(external, x_before, system.x) + turned, damped])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         local[1] += system.damped.heat if system.damped else 0.0

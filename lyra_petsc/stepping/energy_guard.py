@@ -267,8 +267,8 @@ class EnergyGuard:
             return 0.0
         n = system.points.n_owned
         if self._pull is None or self._pull[0] != system.t0:
-            self._pull = system.t0, system.pull_of(self._plain, x0)
-        self._next_pull = system.t1, system.pull_of(self._plain, x1)
+            self._pull = system.t0, system.gradient_of(self._plain, x0)
+        self._next_pull = system.t1, system.gradient_of(self._plain, x1)
         force = 0.5 * (self._pull[1] + self._next_pull[1]).take(at)
         targets = np.zeros_like(x1)
         for time, x in ((system.t0, x0), (system.t1, x1)):
@@ -302,7 +302,7 @@ class EnergyGuard:
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self.gain = of_step, of_steps, new.scale
-        meets = strict and self._system.touches and self._system.integrator.order > 1
+        meets = strict and self._system.has_active_pairs and self._system.integrator.order > 1
         most, most_in_all = (IMPACT_GAIN, IMPACT_SUM) if meets else (LARGEST_GAIN, LARGEST_SUM)
         good = of_step <= max(most * new.scale, step.noise)
         # one that makes nothing cannot mend what others made

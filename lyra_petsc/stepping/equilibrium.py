@@ -409,7 +409,7 @@ class Equilibrium:
             if not attempt.converged:
                 system.state.set(x, np.zeros_like(x))
                 system.begin_step(before, factor)
-                system.stay()
+                system.evaluate_at_start()
                 words = "from its lowest mode no other was found"
                 break
             followed += 1

@@ -207,7 +207,7 @@ class Failure:
 def _apart(near: NearPair) -> str:
     """A pair, and what is left between its parts."""
     beyond = f" beside contact.thickness = {near.kept:g} m" if near.kept else ""
-    return f"{near.words} {near.gap:.3g} m apart{beyond}"
+    return f"{near.text} {near.gap:.3g} m apart{beyond}"
 
 
 def _iterate(each: Iteration) -> str:

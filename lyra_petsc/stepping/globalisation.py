@@ -131,7 +131,7 @@ class Globalisation:
         self._at_norm = self._snes.getFunctionNorm()
         # where forces are in balance differences of energies are round-off, and kinks far away; in statics,
         # where steps are long, searches along tangents would creep
-        kinks = self._equations.touches and self._equations.integrator.dynamic
+        kinks = self._equations.has_active_pairs and self._equations.integrator.dynamic
         self._near = kinks and not self._convergence.balanced
         energy, size = self._at
         if self._snes.getIterationNumber() == 0:
@@ -153,7 +153,7 @@ class Globalisation:
         self._returns = self._watchdog.lost
         if self._returns:
             self._watchdog.go_back(x, y)
-            self._equations.new_iterate(None)
+            self._equations.set_iterate(None)
         return self._returns
 
     @property

@@ -23,7 +23,7 @@ def first_guess(system: StageEquations, out: Array) -> bool:
             ahead = integrator.predicted
             if ahead is not None:
                 out[:] = ahead / integrator.pseudo_dt
-                system.leap()
+                system.linearise_at_state()
         system.prescribe(out)
         return ahead is not None
     going_on = system.v[:n].copy()
@@ -31,7 +31,7 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     if integrator.order > 1 and not system.discretisation.limits_motion:
         out[:] = going_on
         return False
-    staying = system.beginning()
+    staying = system.start_velocity()
     if system.discretisation.limits_motion:
         going_on = staying + system.largest_step(staying, going_on - staying) * (going_on - staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]

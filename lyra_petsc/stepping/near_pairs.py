@@ -1,4 +1,4 @@
-"""Which two parts of sheets and obstacles are nearest, or in each other's way; collective."""
+"""The pair of parts of sheets and obstacles that is nearest, or that stops a step; collective."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
 
 TOUCHING = 2e-9
-"""Gap over the skin of a search up to which there is none."""
+"""Gap over the skin of contact below which the gap counts as closed."""
 
 TIGHT = 0.1
-"""The same, up to which next to nothing is left."""
+"""Gap over the skin below which the gap counts as nearly closed."""
 
 
 @dataclass(frozen=True)
 class NearPair:
-    """Two parts of sheets, or one of a sheet and an obstacle.
+    """Two parts of sheets, or a part of a sheet and an obstacle.
 
     Attributes
     ----------
     parts : tuple of tuples of int
-        Vertices of each part of a sheet, by their numbers in the mesh: one, two of an edge, three of a
-        triangle.
+        Vertices of each part of a sheet, by their numbers in the mesh: one of a vertex, two of an edge, three
+        of a triangle.
     obstacle : str
-        Its name; empty between sheets.
+        Name of the obstacle; empty between sheets.
     position : tuple of 3 floats
         Middle of the first part [m].
     gap, kept : float
-        Distance less what is to be kept, and this [m].
+        Distance minus the distance to keep, and the distance to keep [m].
     blocks : bool
-        A step may not go its way because of it, or next to nothing is left of the distance at which the
-        parts begin to feel each other.
+        Whether the pair stops a step, or its gap is nearly closed.
     """
 
     parts: tuple[tuple[int, ...], ...]
@@ -48,8 +47,8 @@ class NearPair:
     blocks: bool
 
     @property
-    def words(self) -> str:
-        """Which and where."""
+    def text(self) -> str:
+        """Description of the pair and its position."""
         named = [_named(part) for part in self.parts]
         if self.obstacle:
             named.append(f"the obstacle {self.obstacle!r}")
@@ -67,27 +66,30 @@ def nearest_pair(system: StageEquations, x: Array) -> NearPair | None:
 
 
 def worst_pair(system: StageEquations) -> NearPair | None:
-    """Of a step that failed: the pair that lets go the least of the way that it may not go; without such a
-    way the nearest one where the solver stands; collective.
+    """The pair at which a failed step collides first; collective.
+
+    If no displacement was refused, it is the nearest pair at the positions last evaluated.
     """
-    way = system.refused_way
-    if way is None:
+    refused = system.refused_displacement
+    if refused is None:
         return nearest_pair(system, system.evaluated[0])
 
     def obstruction(term: Elastic) -> Array:
-        return 1.0 - term.collision_free_fractions(way.x, way.ahead, system.active.frozen[term], way.part)
+        return 1.0 - term.collision_free_fractions(
+            refused.x, refused.displacement, system.active.frozen[term], refused.part
+        )
 
-    return _worst(system, way.x, obstruction)
+    return _worst(system, refused.x, obstruction)
 
 
 def nearest_obstacle(system: StageEquations) -> NearPair | None:
-    """The nearest pair with an obstacle that touches where the solver stands; collective."""
+    """The nearest touching pair with an obstacle at the positions last evaluated; collective."""
 
     def nearness(term: Elastic) -> Array:
         gaps = _gaps(system, term, system.evaluated[0])
-        touch = [row for row in np.flatnonzero(gaps < 2.0 * term.skin) if term.pair(int(row)).obstacle]
+        rows = [row for row in np.flatnonzero(gaps < 2.0 * term.skin) if term.pair(int(row)).obstacle]
         out = np.zeros(len(gaps))
-        out[touch] = 1.0 / np.maximum(gaps[touch], TOUCHING * term.skin)
+        out[rows] = 1.0 / np.maximum(gaps[rows], TOUCHING * term.skin)
         return out
 
     return _worst(system, system.evaluated[0], nearness)
@@ -97,31 +99,35 @@ def _gaps(system: StageEquations, term: Elastic, x: Array) -> Array:
     return term.gaps(x, system.active.frozen[term])
 
 
-def _worst(system: StageEquations, x: Array, sizes: Callable[[Elastic], Array]) -> NearPair | None:
-    """The counted element of the largest size above 0, at positions x (n_local, 3)."""
+def _worst(system: StageEquations, x: Array, badness: Callable[[Elastic], Array]) -> NearPair | None:
+    """The pair with the largest positive badness at positions x (n_local, 3), or None; collective.
+
+    ``badness`` gives a number for each owned element of a term.
+    """
     terms = [term for term in system.active.elastic if term.registration.neighbours]
     if not terms:
         return None
-    points, found = system.points, [sizes(term) for term in terms]
-    sized = np.concatenate(found)
-    if not points.comm.allreduce(float(sized.max(initial=0.0)), MPI.MAX) > 0.0:
+    points, by_term = system.points, [badness(term) for term in terms]
+    values = np.concatenate(by_term)
+    if not points.comm.allreduce(float(values.max(initial=0.0)), MPI.MAX) > 0.0:
         return None
     numbers = points.mesh_vertex_of_local()
-    ends = np.cumsum([len(size) for size in found])
-    first = [numbers[term.stencil[: len(size)]].min(axis=1) for term, size in zip(terms, found, strict=True)]
+    ends = np.cumsum([len(part) for part in by_term])
+    stencils = [term.stencil[: len(part)] for term, part in zip(terms, by_term, strict=True)]
+    first = np.concatenate([numbers[stencil].min(axis=1) for stencil in stencils])
 
     def describe(row: int) -> NearPair:
         which = int(np.searchsorted(ends, row, side="right"))
-        term, row = terms[which], row - int(ends[which] - len(found[which]))
+        term, row = terms[which], row - int(ends[which] - len(by_term[which]))
         pair = term.pair(row)
         middle = tuple(float(value) for value in x[list(pair.parts[0])].mean(axis=0))
         gap = float(_gaps(system, term, x)[row])
         gap = gap if gap > TOUCHING * term.skin else min(gap, 0.0)
         parts = tuple(tuple(int(numbers[point]) for point in part) for part in pair.parts)
-        blocks = system.refused_way is not None or gap <= TIGHT * term.skin
+        blocks = system.refused_displacement is not None or gap <= TIGHT * term.skin
         return NearPair(parts, pair.obstacle, middle, gap, pair.thickness, blocks)
 
-    return worst(points.comm, sized, np.concatenate(first), describe)
+    return worst(points.comm, values, first, describe)
 
 
 def _named(part: tuple[int, ...]) -> str:

@@ -126,7 +126,7 @@ class Newton:
         self._length, self.allowed = 0.0, 1.0
         # a step begins as the one before did
         self._convex = self._began_convex
-        collides = self._iterates and self._equations.collides(COLLISION * self.convergence.spacing)
+        collides = self._iterates and self._equations.may_collide(COLLISION * self.convergence.spacing)
         self._linear.begin()
         self._linear.shift.begin()
         self.convergence.begin()
@@ -138,7 +138,7 @@ class Newton:
         """Jacobian, and preconditioning matrix, at velocities u."""
         v = self._array(u)
         if self._iterates:
-            self._equations.new_iterate(v)
+            self._equations.set_iterate(v)
             self.forcing.before_solve(self.convergence.norm)
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
@@ -321,7 +321,7 @@ class Newton:
     def _follow_triangles(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let directors follow their triangles in a step y that is taken in full; whether any does."""
         way = -self._array(y)
-        if not self._equations.follow_triangles(self._array(x), way):
+        if not self._equations.turn_directors(self._array(x), way):
             return False
         before = y.copy()
         y.setArray(-way.ravel())
@@ -336,7 +336,7 @@ class Newton:
         equations, v = self._equations, self._array(x)
         fraction = equations.largest_step(v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell
-        past = equations.pushed_apart(v, -self._array(y)) if fraction < 1.0 or slow else None
+        past = equations.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
         if past is not None:
             before = y.copy()
             y.setArray(-past.ravel())

@@ -380,14 +380,14 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
         system.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
     )
     # handles start from the undisturbed shape
-    system.begin(0.0)
+    system.set_references(0.0)
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
     system.stage_positions[:] = system.x
     for term in system.active.elastic:
         term.begin(system.x)
-    system.rest_at(0.0)
+    system.hold_targets(0.0)
     refuse_contact(system, scene, "at the start", TOO_NEAR * outline.barrier.gap if outline.barrier else 0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Problem(
@@ -426,7 +426,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float
         apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
         apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
     raise InputError(
-        f"{when} {near.words} are {apart}; {remedy}",
+        f"{when} {near.text} are {apart}; {remedy}",
         file=scene.source,
         key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
     )

@@ -227,26 +227,26 @@ class Sensitivities:
         system, n = self._system, self._system.points.n_owned
         start, vertices = system.x[:n].copy(), self._system.points.n_vertices
         frames = [term.frames for term in _edged(system)]
-        system.begin_at_rest()
-        system.begin_edges(start)
+        system.initial_edge_moments()
+        system.begin_edge_solve(start)
         for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
             for each in beside:
                 way = each.offset * step
                 each.system.state.set(start + way * tangent.x, system.v[:n] + way * tangent.v)
                 for term, own in zip(_edged(each.system), frames, strict=True):
                     term.frames = own
-                each.system.begin_at_rest()
-                each.system.begin_edges(start + way * tangent.x)
+                each.system.initial_edge_moments()
+                each.system.begin_edge_solve(start + way * tangent.x)
                 self._use_frames(each.system, frames)
         still = np.zeros_like(start)
         with self._solver(still, set_up=True, keep=False) as solve:
             for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
                 for each, ahead in self._at_their_stages(solve, beside, step, still):
-                    each.system.end_edges(ahead)
+                    each.system.end_edge_solve(ahead)
                     self._to_frames(each.system)
                 change = _combined(beside, step, lambda each: each.system.x[:n])
                 tangent.x[vertices:] = change[vertices:]
-        system.end_edges(still)
+        system.end_edge_solve(still)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -282,7 +282,7 @@ class Sensitivities:
                     self._put(each, before, tangent, step, end)
                 for each, ahead in self._at_their_stages(solve, beside, step, velocity):
                     each.system.accept(ahead)
-        if system.edges_lag:
+        if system.solves_edges_at_end:
             self._follow_edges(before)
         for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
             for each in beside:
@@ -290,7 +290,7 @@ class Sensitivities:
                     each.ledger.record(before.x + each.offset * step * tangent.x)
             self._take(tangent, beside, step)
             for each in beside:
-                each.system.begin(end)
+                each.system.set_references(end)
 
     def _put(self, each: Neighbour, before: _Before, tangent: Tangent, step: float, end: float) -> None:
         """Let a neighbour begin the step that the simulation has taken."""
@@ -395,17 +395,17 @@ class Sensitivities:
     def _follow_edges(self, before: _Before) -> None:
         """Let the neighbours' edges be in equilibrium at the end of the step, as the simulation's are."""
         system, n = self._system, self._system.points.n_owned
-        system.begin_edges(before.x)
+        system.begin_edge_solve(before.x)
         rates = (system.x[:n] - before.x) / system.stage.c
         for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
             for each in beside:
-                each.system.begin_edges(before.x + each.offset * step * tangent.x)
+                each.system.begin_edge_solve(before.x + each.offset * step * tangent.x)
                 self._use_frames(each.system, before.frames)
         with self._solver(rates, set_up=True, keep=False) as solve:
             for beside, step in zip(self._neighbours, self._steps, strict=True):
                 for each, ahead in self._at_their_stages(solve, beside, step, rates):
-                    each.system.end_edges(ahead)
-        system.end_edges(rates)
+                    each.system.end_edge_solve(ahead)
+        system.end_edge_solve(rates)
 
     # -- equilibria --------------------------------------------------------------------------------
 
@@ -432,12 +432,12 @@ class Sensitivities:
                 self._change_of_force(now, beside, step, tangent.x)
                 for each in beside:
                     if each.ledger is not None:
-                        each.system.stay()
+                        each.system.evaluate_at_start()
                         each.ledger.record(now.x)
-                    each.system.begin(now.factor)
+                    each.system.set_references(now.factor)
         integrator.pseudo_dt = pseudo
         system.begin_step(now.before, now.factor)
-        system.stay()
+        system.evaluate_at_start()
 
     def _change_of_force(self, now: _Equilibrium, beside: list[Neighbour], step: float, way: Array) -> Array:
         """Derivative (n_owned, 3) [N] of what is out of balance where positions change by ``way``."""
@@ -468,7 +468,7 @@ class Sensitivities:
         stepper, system = self.simulation.stepper, self._system
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
-            system.new_iterate(None)
+            system.set_iterate(None)
             linear.set(velocity, 0.0, keep=keep, convex=True)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()

@@ -267,7 +267,7 @@ class SteppedScene:
         newton = linear = rejected = halvings = 0
         self._tried = []
         system.integrator = self._usual
-        if not self._usual.iterates and system.slips:
+        if not self._usual.iterates and system.has_friction_pairs:
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
@@ -342,7 +342,7 @@ class SteppedScene:
             entry = term.registration
             if entry.state or entry.edge_state or entry.element_vertices:
                 term.accept(system.x, system.active.frozen[term])
-        system.begin(self.time)
+        system.set_references(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
         took = newton, linear, rejected, attempt.residual, seconds
@@ -400,7 +400,7 @@ class SteppedScene:
         where nothing does, or ``-ts_adapt_dt_min`` is given; collective.
         """
         system = self.problem.system
-        if not system.touches or is_set("ts_adapt_dt_min"):
+        if not system.has_active_pairs or is_set("ts_adapt_dt_min"):
             return 0.0
         return min(FOLLOWED * self._time_through_skin(), FOLLOWED_OF_RUN * self.control.end)
 
@@ -459,7 +459,7 @@ class SteppedScene:
             long = not last and dt > 2.0 * self._shortest_over_impacts()
         else:
             long = dt > (FINEST if usual.exact_work else FINER) * self.control.step
-        if long or usual.name == "beuler" or not usual.dynamic or not system.touches:
+        if long or usual.name == "beuler" or not usual.dynamic or not system.has_active_pairs:
             return False
         if system.integrator is not usual and system.integrator.order == 1:
             system.integrator = usual  # nor did that help
@@ -625,8 +625,8 @@ class SteppedScene:
         term_memory.restore_fixed(system, edges, elements)
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
         # loads and handles that a changed scene lets start before now start here; the others have started
-        system.begin(self.time)
-        system.rest_at(self.time)
+        system.set_references(self.time)
+        system.hold_targets(self.time)
         refuse_contact(system, self.scene, f"at {self._now()}")
         self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)

@@ -4,15 +4,16 @@ Unknown v (the velocity of the integrator's stage), with its history x_h, v_h an
 
     F(v, v̇) = M v̇ + ∇E(x_h + c v) + D v + ∇P(v) − f,  v̇ = σ (v − v_h)       Jacobian  σ M + c K + D + ∇∇P
 
-with the elastic energy E, damping D = γ K⁺, the wind's potential P and the loads f. It is the gradient
-of ``objective``. Backward Euler has x_h = x_n, v_h = v_n, σ = 1/c = 1/Δt: the Lyra paper, eq. 10-18, as
-a Newton iteration. The geometry of D, P and f is frozen during a step: at x_n for first-order integrators,
-at the extrapolated stage x_n + (t_s − t_n) v_n for second-order ones.
+with the elastic energy E, damping D = γ K⁺, the wind's potential P and the loads f. F is the gradient of
+``objective``. Backward Euler has x_h = x_n, v_h = v_n, σ = 1/c = 1/Δt: the Lyra paper, eq. 10-18, as a Newton
+iteration. The geometry of D, P and f is frozen during a step: at x_n for first-order integrators, at the
+extrapolated stage x_n + (t_s − t_n) v_n for second-order ones.
 
-Unknowns of edges have no mass: their part of F is ∂E/∂φ, and they are in equilibrium at the stage. Where that
-is not the end of the step they are sought once more there (`StageEquations.begin_edges`).
+Unknowns of edges have no mass: their rows of F are ∂E/∂φ, and they are in equilibrium at the stage. Where the
+stage is not the end of the step, a second solve finds their equilibrium at the end
+(`StageEquations.begin_edge_solve`).
 
-Arrays only: no PETSc here. Collective where sums over ranks are returned.
+This module works on arrays only, without PETSc. Methods that return sums over ranks are collective.
 """
 
 from __future__ import annotations
@@ -46,49 +47,49 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.one_sided import Springs
 
 
-FARTHEST_TURN = 0.25
-"""Angle [rad] by which a Newton iteration of a static analysis may turn a director."""
+MAX_TURN = 0.25
+"""Largest angle [rad] by which a Newton iteration of a static analysis may turn a director."""
 
-SEARCHES = 40
-"""For what is near, at most, on the way of a Newton iteration or of handles in a step."""
+MAX_SEARCHES = 40
+"""Largest number of searches for near pairs along one displacement."""
 
-FEW = 0.3
-"""Part of a way that must be known for the rest to be searched bit by bit; else all of it is at once."""
+MIN_KNOWN = 0.3
+"""If the near pairs are known on less than this fraction of a displacement, the search covers all of it."""
 
-IMPACT = 0.1
-"""How far vertices go in a step, over the skin of what they touch, from which on that may be an impact."""
+IMPACT_STEP = 0.1
+"""Displacement of a vertex in a step, over the skin of contact, from which on there may be an impact."""
 
-PUSHES = 40
-"""By which what has come too near is set aside, or what leaves taken back, at most."""
+MAX_SEPARATIONS = 40
+"""Largest number of iterations that separate pairs which come too near."""
 
-LEAST = 1e-10
-"""Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
+MIN_EDGE_STIFFNESS = 1e-10
+"""Lower bound of the Jacobian's stiffness for an edge's unknown, over its stiffness at rest."""
 
 
 class RefusedDisplacement(NamedTuple):
-    """What may not be gone because something meets there.
+    """A displacement that is not free of collisions.
 
     Attributes
     ----------
-    x, ahead : (n_local, 3)
-        Where it begins and how far it goes [m].
+    x, displacement : (n_local, 3)
+        Start positions and displacements [m].
     part : StepInterval
-        Of the step, in which obstacles go theirs, too.
+        The part of the step in which the obstacles move meanwhile.
     """
 
     x: Array
-    ahead: Array
+    displacement: Array
     part: StepInterval
 
 
 class StageEquations:
-    """One rank's part of the equations, and the state (x_n, v_n) a step starts from.
+    """One rank's part of the equations, and the state (x_n, v_n) that a step starts from.
 
     Parameters
     ----------
     discretisation : Discretisation
     mass : (n_owned,) [kg]
-        Of block rows: the lumped mass of vertices, 0 of edges.
+        Mass of each block row: the lumped mass of a vertex, 0 for an edge.
     terms : sequence of Term
     held : Held
     integrator : Integrator
@@ -104,28 +105,29 @@ class StageEquations:
         The stage's v_h [m/s].
     reference : ReferencePositions
     prescribed : Prescribed
-        Unknowns that are held in the step.
+        The prescribed unknowns of the step.
     moving_energy_before : float
-        Energy [J] of this rank's terms with moving targets at the start of the step, with these where they
-        stand at its stage.
+        Energy [J] of this rank's terms with moving targets: positions at the start of the step, targets at
+        its stage.
     dt, t0, t1 : float
         Length, start and end of the step [s].
     objective : Objective
         The function whose gradient F is.
     followers : list of NeedsAcceleration
-        Who must hear of jumps and of the accelerations after them, as the integrator does: an error estimate.
+        Objects besides the integrator (an error estimate) that need to know of jumps of the forces and of the
+        accelerations after a jump.
     active : ActiveTerms
     applied : AppliedLoads
-    touches : bool
-        Whether anything acted that changes its stencils, where the block rows were last renewed.
-    refused_way : RefusedDisplacement or None
-        What the present step may not go.
+    has_active_pairs : bool
+        Whether any pair of a term with changing stencils acted when the block rows were last renewed.
+    refused_displacement : RefusedDisplacement or None
+        The displacement of the present step that was found to collide.
     """
 
-    refused_way: RefusedDisplacement | None = None
-    touches = False
+    refused_displacement: RefusedDisplacement | None = None
+    has_active_pairs = False
     _frozen_before: Mapping[Term, Any] | None = None
-    _may_begin: Array | None = None  # where ``may_move`` found a way to
+    _start_velocity: Array | None = None  # found by `find_start`
 
     def __init__(
         self,
@@ -145,16 +147,16 @@ class StageEquations:
         self.reference = ReferencePositions(self.points, rows, starts)
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
-        self._least = self._least_stiffness()
+        self._min_stiffness = self._min_edge_stiffness()
         internal, once = partial(self._sum, active.sheet), integrator.lagged_loads
-        # moving targets change the forces at one and the same place
+        # with moving targets, forces at the same positions change
         self._internal = internal if active.moving else Remembered(internal)
-        self._frames: dict[Term, Any] = {}  # by which these are known at the end of a step
+        self._end_frames: dict[Term, Any] = {}  # frames of edges at the end of the last step
         self.damping = Damping(
             discretisation, active.elastic, dynamic=integrator.dynamic, single_assembly=once
         )
         last = (self._internal, self.damping.product) if once else ()
-        self._asked_once = [each for each in last if isinstance(each, Remembered)]
+        self._evaluated_once = [each for each in last if isinstance(each, Remembered)]
         self.state = State(discretisation)
         n_local = self.points.n_local
         self._xs, self._vs = np.zeros((n_local, 3)), np.zeros((n_local, 3))
@@ -163,17 +165,17 @@ class StageEquations:
         self.objective = Objective(self)
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
         self.followers: list[NeedsAcceleration] = []
-        self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
+        self._solving_edges = False  # between `begin_edge_solve` and `end_edge_solve`
         self._iterate: Array | None = None
         self._predicted: tuple[Array, Array] | None = None
-        self._leaps = False
+        self._linearises_at_state = False
         self._uncorrected: Array | None = None
         self._squares: list[float] = []
         self.damped: Damped | None = None
 
     @property
     def points(self) -> Layout:
-        """The layout of the rows, with the ghosts of the present stencils."""
+        """Layout of the local rows, with the ghosts that the present stencils need."""
         return self.discretisation.layout
 
     @property
@@ -186,45 +188,48 @@ class StageEquations:
         """Velocities (n_local, 3) [m/s] of the state."""
         return self.state.v
 
-    def _least_stiffness(self) -> Array:
-        """What Jacobians add to the diagonal of block rows of edges (n,) [N/m]: where their triangles have
-        lost their area nothing else is left.
+    def _min_edge_stiffness(self) -> Array:
+        """Stiffness (n,) [N/m] that Jacobians add to the diagonal of the block rows of edges.
+
+        Without it the rows of edges whose triangles have lost their area would be zero.
         """
         least = np.zeros((self.points.n_local, 3))
         for term in self.active.with_edges:
-            least.reshape(-1)[term.edge_indices] = LEAST * term.edge_stiffness
+            least.reshape(-1)[term.edge_indices] = MIN_EDGE_STIFFNESS * term.edge_stiffness
         return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
-    def begin(self, time: float) -> None:
-        """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
+    def set_references(self, time: float) -> None:
+        """Take the present positions as reference of handles that start to act by ``time`` [s]."""
         self.reference.until(time, self.x)
 
-    def rest_at(self, time: float) -> None:
-        """Let moving targets stand where they are at ``time`` [s], between two steps; collective."""
+    def hold_targets(self, time: float) -> None:
+        """Put moving targets at their positions at ``time`` [s], between two steps; collective."""
         self.t0 = self.t1 = time
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
-        self._follow(self.x)  # energies at the start of a run are those of all stencils
+        self._update_stencils(self.x)  # energies at the start of a run need all stencils
         for term in self.active.changing:
             term.initialise_pairs(self.x, self.active.frozen[term])
 
     # -- a step ------------------------------------------------------------------------------------
 
     def begin_step(self, t0: float, t1: float) -> None:
-        """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
+        """Set up the equations of the step from t0 to t1 [s], and freeze its data; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
-        self.refused_way = self._may_begin = None
-        self.new_iterate(None)
+        self.refused_displacement = self._start_velocity = None
+        self.set_iterate(None)
         after = self.integrator.stage_offset(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
-        ahead = self._expected() if self.discretisation.limits_motion else None
-        stops = () if ahead is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
-        self._follow(self.x, ahead, stops)
+        displacement = self._expected_displacement() if self.discretisation.limits_motion else None
+        stops = () if displacement is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
+        self._update_stencils(self.x, displacement, stops)
         self._freeze(t0 + after)
         if self.active.pushing:  # obstacles may have come near
-            ahead = None if ahead is None else self._expected()  # with the ghosts that there are now
-            self._follow(self.x, ahead, stops)
-        # a step may begin where a state was written, a rounding beside the event
+            displacement = (
+                None if displacement is None else self._expected_displacement()
+            )  # with the ghosts that there are now
+            self._update_stencils(self.x, displacement, stops)
+        # the start of a step may differ from the time of an event by round-off
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in (self.integrator, *self.followers):
                 follower.restart()
@@ -234,27 +239,32 @@ class StageEquations:
             follower.set_acceleration(acceleration)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
-        if self.watches_impacts:
+        if self.removes_contact_surplus:
             terms = self.active.limiting
-            self._stored = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
+            self._contact_energy = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
         self.history = self.v[:n] if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
 
-    def _expected(self) -> Array:
-        """How far (n_local, 3) [m] points would go in the step if they went on as they do."""
-        ahead, n = self.dt * self.v, self.points.n_owned
-        self.prescribed.overwrite(ahead[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.indices))
-        self.points.update_ghosts(ahead)
-        return ahead
+    def _expected_displacement(self) -> Array:
+        """Displacements (n_local, 3) [m] of the step at constant velocities, of handles exactly."""
+        displacement, n = self.dt * self.v, self.points.n_owned
+        self.prescribed.overwrite(
+            displacement[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.indices)
+        )
+        self.points.update_ghosts(displacement)
+        return displacement
 
     def _accelerations(self, at: float) -> Array:
-        """Of the free unknowns (n_owned, 3) [m/s²] at the start of the step, with its stage at ``at`` [s]."""
+        """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step.
+
+        ``at`` [s] is the time of the step's stage.
+        """
         v = self.v.copy()
         self.prescribed.overwrite_with_start_velocity(v[: self.points.n_owned])
         self.points.update_ghosts(v)
         x, turns = self._frozen_positions(at), bool(self.active.pushing)
-        if turns:  # by the stage an obstacle may be where the sheet is yet
+        if turns:  # at the stage an obstacle may be where the sheet still is now
             self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
         total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
         if turns:
@@ -263,12 +273,12 @@ class StageEquations:
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
     def _freeze(self, at: float) -> None:
-        """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
+        """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""
         x = self._frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         frozen, moves, self._frozen_before = self.active.frozen, self.integrator.dynamic, None
-        if moves and any(frozen[term] is not self._frames.get(term) for term in self.active.with_edges):
-            self.forget_forces()  # by frames that have followed, they are others
+        if moves and any(frozen[term] is not self._end_frames.get(term) for term in self.active.with_edges):
+            self.forget_forces()  # the frames of edges have changed
         self.objective.begin_step()
         if self.integrator.dynamic or self.applied.override is None:
             lagged = self.active.viscous and self.integrator.lagged_loads
@@ -280,7 +290,7 @@ class StageEquations:
             self.damping.freeze(x, self.active.frozen)
 
     def _frozen_positions(self, at: float) -> Array:
-        """Positions (n_local, 3) whose geometry stays as it is during the step."""
+        """Positions (n_local, 3) [m] whose geometry is frozen during the step."""
         if not self.integrator.centred:
             return self.x
         x = self.x + (at - self.t0) * self.v
@@ -291,11 +301,11 @@ class StageEquations:
 
     @cached_property
     def _vertex_rows(self) -> NDArray[np.bool_]:
-        """Which local rows (n_local,) are vertices; ghosts that contact adds are."""
+        """Mask (n_local,) of the local rows of vertices; ghosts that contact adds are vertices."""
         return self.points.are_vertices(self.points.global_number)
 
     def _set_history(self, stage: Stage, at: float) -> None:
-        """x_h with its ghosts, and the velocities of the prescribed unknowns."""
+        """Set x_h with its ghosts, and the velocities of the prescribed unknowns."""
         n = self.points.n_owned
         given = bool(self.held) and self.integrator.handles_at_stage
         if stage.x is None and not given:
@@ -311,12 +321,12 @@ class StageEquations:
         self.points.update_ghosts(self._xh)
 
     def out_of_balance(self) -> tuple[Array, float]:
-        """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
+        """Force (n_owned, 3) [N] on the free unknowns, and the norm [N] of its largest part; collective."""
         total = self._total(self.x, self.v, np.zeros_like(self.history), np.empty_like(self.history))
         return np.where(self.prescribed.free, -total, 0.0), self.largest_force()
 
     def forces_now(self) -> Iterator[tuple[str, Array]]:
-        """The parts of F at the start of the step, each (n_owned, 3) [N]; nothing is accelerated."""
+        """The parts of F at the start of the step without inertia, each (n_owned, 3) [N]."""
         return self._parts(self.x, self.v, np.zeros_like(self.history))
 
     @property
@@ -333,27 +343,28 @@ class StageEquations:
         """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
         self.prescribed.overwrite(v, self.prescribed.velocity)
 
-    def velocity_of_staying(self) -> Array:
-        """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
+    def stationary_velocity(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] with which the stage is at the positions where the step starts."""
         return ((self.x - self._xh) / self.stage.c)[: self.points.n_owned]
 
-    def beginning(self) -> Array:
-        """Velocities (n_owned, 3) [m/s] of staying, or going on where only that leads past what is near; what
-        is prescribed goes where it shall.
+    def start_velocity(self) -> Array:
+        """Collision-free velocities (n_owned, 3) [m/s] for the first guess, with the prescribed ones.
+
+        They are those that `find_start` found, else `stationary_velocity`.
         """
-        if self._may_begin is not None and not self._at_end:
-            return self._may_begin.copy()
-        self.prescribe(v := self.velocity_of_staying())
+        if self._start_velocity is not None and not self._solving_edges:
+            return self._start_velocity.copy()
+        self.prescribe(v := self.stationary_velocity())
         return v
 
-    def stay(self) -> None:
-        """Let the stage be where the step starts; collective."""
-        self.evaluate_at(self.velocity_of_staying())
+    def evaluate_at_start(self) -> None:
+        """Evaluate the stage at the positions where the step starts; collective."""
+        self.evaluate_at(self.stationary_velocity())
 
     def accept(self, v: Array) -> None:
-        """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
+        """Set the state at the end of the step from velocities v (n_owned, 3) of its stage; collective."""
         n, given, free = self.points.n_owned, self.integrator.handles_at_stage, self.prescribed.free
-        self.evaluate_at(v)  # what the step's forces are taken at afterwards
+        self.evaluate_at(v)  # for the forces that are asked for after the step
         before, rate_before = self.x[:n], self.v[:n]
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
         self.integrator.record_step(before, rate_before, free, self.dt)
@@ -362,110 +373,118 @@ class StageEquations:
             self.prescribed.overwrite_with_end_velocity(rate)
         self.state.set(moved, rate)
         if self.active.limiting and self.integrator.dynamic:
-            from lyra_petsc.stepping import impacts  # of no use elsewhere
+            from lyra_petsc.stepping import impacts  # needed with contact only
 
-            if self.stage.offset < self.dt:  # what is met behind the stage has its energy from here on
-                self._follow(self._xs, self.x - self._xs, (1.0,))
+            if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
+                self._update_stencils(self._xs, self.x - self._xs, (1.0,))
             if not self.discretisation.has_near_elements:
                 self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
                 return
-            if self.watches_impacts:
+            if self.removes_contact_surplus:
                 left = self.integrator.surplus
-                self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
+                self.integrator.surplus = impacts.surplus(self, self._contact_energy, before, left)
             self.damped = impacts.damp_impacts(self)
             for term in self.active.changing:
                 if term.slips:
                     self.damped = impacts.make_up_friction(self, term, self.damped)
 
     def reopen(self, x_before: Array) -> None:
-        """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
+        """Let the equations of the step just accepted, from x_before (n_owned, 3), be evaluated again;
+        collective.
+        """
         if self._xh is self.x:
             self._xh = resized(x_before, self.points.n_owned, self.points.n_local)
             self.points.update_ghosts(self._xh)
 
-    def begin_at_rest(self) -> float:
-        """Let handles hold what they do at the start; norm [N] of the moments on free edges; collective."""
+    def initial_edge_moments(self) -> float:
+        """Norm [N] of the moments on free edges at the start of a run, handles set; collective."""
         self.prescribed.begin_step(self.t0, self.t0, self.x)
         moments = np.where(self.prescribed.free, self._internal(self.x), 0.0)[self.points.n_vertices :]
         return float(np.sqrt(self.points.global_sum(float(np.vdot(moments, moments)))[0]))
 
-    # -- unknowns of edges at the end of a step ----------------------------------------------------
+    # -- unknowns of edges ---------------------------------------------------------------------------
 
-    def end_frames(self) -> None:
-        """Let frames of edges follow to the end of a step that is one linear solve: so the forces there are
-        those that the next one begins with.
+    def move_frames_to_end(self) -> None:
+        """Update the frames of edges at the end of a step that is one linear solve.
+
+        The forces at the end are then those with which the next step begins.
         """
         edged, frozen = self.active.with_edges, self.active.frozen
         if edged and self.integrator.lagged_loads and self.integrator.dynamic:
             self.active.refreeze({term: term.frames_at_end(self.x, frozen[term]) for term in edged})
             self._frozen_before = frozen
             self.forget_forces()
-            self._frames = {term: self.active.frozen[term] for term in edged}
+            self._end_frames = {term: self.active.frozen[term] for term in edged}
 
     @property
     def frozen_in_step(self) -> Mapping[Term, Any]:
-        """What terms had frozen in the step, before frames of edges followed to its end."""
+        """Frozen data of terms in the step, before `move_frames_to_end`."""
         return self.active.frozen if self._frozen_before is None else self._frozen_before
 
-    def turn_frames(self) -> bool:
-        """Let the frames of edges that have turned far follow to where the equations were last evaluated;
-        whether any did, and the vertices' forces are others; collective.
+    def update_frames(self) -> bool:
+        """Update the frames of edges that have turned far from theirs to the positions last evaluated.
+
+        Returns whether any changed, and with them the forces on vertices; collective.
         """
         found: dict[Term, Any] = {}
-        for term in () if self._at_end else self.active.with_edges:
-            nearer = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
-            found |= {} if nearer is None else {term: nearer}
+        for term in () if self._solving_edges else self.active.with_edges:
+            updated = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
+            found |= {} if updated is None else {term: updated}
         if not self.points.comm.allreduce(len(found), MPI.MAX):
             return False
         self.active.refreeze(found)
         self.forget_forces()
         return True
 
-    def follow_triangles(self, v: Array, way: Array) -> bool:
-        """Let unknowns of edges that go far on the way from v by ``way`` (n_owned, 3) [m/s] turn with their
-        triangles; whether any does; collective.
+    def turn_directors(self, v: Array, increment: Array) -> bool:
+        """Turn directors with their triangles where an increment (n_owned, 3) [m/s] from v turns them far.
 
-        On the tangent at v the vertices go beside their circles, and directors far beyond.
+        Changes ``increment``; returns whether it did; collective. The linear increment leads vertices off
+        their circles, and directors much too far.
         """
-        if not self.active.with_edges or self.stage.c * self.farthest_turn(way) <= LARGEST_TURN:
+        if not self.active.with_edges or self.stage.c * self.largest_turn(increment) <= LARGEST_TURN:
             return False
-        x, ahead = self.ahead(v, way)
-        changed = 0
+        x, displacement = self.displacement(v, increment)
+        changed, frozen = 0, self.active.frozen
         for term in self.active.with_edges:
-            changed += self._follow_in(way, *term.followed(x, ahead, self.active.frozen[term]))
+            changed += self._set_increments(increment, *term.followed(x, displacement, frozen[term]))
         return bool(self.points.comm.allreduce(changed, MPI.MAX))
 
-    def let_directors_follow(self, v: Array, way: Array, bent: Array) -> None:
-        """Let all unknowns of edges go, on the way from v that vertices go by ``bent`` (n_owned, 3) [m/s], so
-        that triangles are bent as on the tangent, by ``way``; collective.
-        """
-        along = self.ahead(v, bent)[1]
-        x, ahead = self.ahead(v, way)
-        for term in self.active.with_edges:
-            self._follow_in(bent, *term.followed(x, ahead, self.active.frozen[term], along))
+    def match_directors(self, v: Array, increment: Array, curved: Array) -> None:
+        """Set the edges' unknowns in ``curved`` (n_owned, 3) [m/s], an increment from v along arcs.
 
-    def _follow_in(self, way: Array, places: Ints, values: Array) -> bool:
-        """Put ways (m,) [m] of the free unknowns at ``places`` (m,) into way (n_owned, 3) [m/s]; if any."""
-        own = places < way.size
+        Each director gets the same angle to its triangles as by the linear ``increment``; collective.
+        """
+        along = self.displacement(v, curved)[1]
+        x, displacement = self.displacement(v, increment)
+        for term in self.active.with_edges:
+            self._set_increments(curved, *term.followed(x, displacement, self.active.frozen[term], along))
+
+    def _set_increments(self, increment: Array, places: Ints, values: Array) -> bool:
+        """Put displacements (m,) [m] of the free unknowns ``places`` (m,) into ``increment`` (n_owned, 3).
+
+        Returns whether there were any.
+        """
+        own = places < increment.size
         own[own] = self.prescribed.free.ravel()[places[own]]
-        way.reshape(-1)[places[own]] = values[own] / self.stage.c
+        increment.reshape(-1)[places[own]] = values[own] / self.stage.c
         return bool(own.any())
 
     @property
-    def edges_lag(self) -> bool:
-        """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
+    def solves_edges_at_end(self) -> bool:
+        """Whether the edges' unknowns need a solve of their own at the end of the step."""
         return bool(self.points.n_edges_global) and self.integrator.dynamic and self.stage.offset < self.dt
 
-    def begin_edges(self, x_before: Array) -> None:
-        """Seek the edges' unknowns at the end of the step just accepted, from x_before (n_owned, 3);
-        collective.
+    def begin_edge_solve(self, x_before: Array) -> None:
+        """Set up the equilibrium of the edges' unknowns at the end of the step just accepted; collective.
 
-        A stage of backward Euler in which the vertices go where they are now. Before the first step it begins
-        there, too, after `begin_at_rest`.
+        It is a stage of backward Euler from x_before (n_owned, 3) with the vertices' present positions
+        prescribed. Before the first step it starts at these positions, after `initial_edge_moments`.
         """
         n, dt = self.points.n_owned, self.dt or 1.0
-        self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.active.frozen
-        self.new_iterate(None)
+        velocity, frozen = self.stage_velocity.copy(), self.active.frozen
+        self._stage_before_edges = self.stage, self.history, self._xh, velocity, frozen
+        self.set_iterate(None)
         self.objective.forget()
         self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
@@ -473,18 +492,20 @@ class StageEquations:
         self.points.update_ghosts(self._xh)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
-        self._at_end = True
+        self._solving_edges = True
         self.prescribed.set_velocity_to_goal(self._xh[:n], dt)
 
-    def end_edges(self, v: Array | None) -> None:
-        """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""
+    def end_edge_solve(self, v: Array | None) -> None:
+        """Set the edges' unknowns from their rates v (n_owned, 3), unless None, and restore the stage;
+        collective.
+        """
         n = self.points.n_owned
         moved = None if v is None else self._xh[:n] + self.stage.c * v
-        self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._kept
+        self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._stage_before_edges
         self.prescribed.release_vertices()
-        self._at_end = False
+        self._solving_edges = False
         self.objective.forget()
-        self.new_iterate(None)
+        self.set_iterate(None)
         if moved is not None:
             rows = slice(self.points.n_vertices, n)
             self.x[rows] = moved[rows]
@@ -493,23 +514,23 @@ class StageEquations:
 
     # -- terms -------------------------------------------------------------------------------------
 
-    def written_velocity(self) -> Array:
-        """Velocities (n_owned, 3) to write out: those of prescribed unknowns are ẋ*(t)."""
+    def output_velocity(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] for output: those of prescribed unknowns are ẋ*(t)."""
         self.prescribed.overwrite_with_end_velocity(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
-    def pull_of(self, terms: Sequence[Elastic], x: Array) -> Array:
-        """Gradient (n_owned, 3) [N] of the energy of ``terms``, all without targets, at x (n_local, 3)."""
+    def gradient_of(self, terms: Sequence[Elastic], x: Array) -> Array:
+        """Gradient (n_owned, 3) [N] at x (n_local, 3) of the energy of ``terms``: all without targets."""
         return self._sum(terms, x) if self.active.moving else self._internal(x)
 
-    def pushed(self) -> float:
-        """Work [J] in the step of what pushes this rank's elements, by its forces at the stage."""
+    def obstacle_work(self) -> float:
+        """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
         at = self.t0 + self.stage.offset if self.integrator.dynamic else self.t1
         work = sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
         return work + (self.damped.work if self.damped else 0.0)
 
-    def turn_targets_to_end(self) -> float:
-        """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""
+    def move_targets_to_end(self) -> float:
+        """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
         if self.stage.offset == self.dt or not (self.active.moving or self.active.constraints):
             return 0.0
         before = self.active.moving_energy(self.x)
@@ -517,87 +538,98 @@ class StageEquations:
         return self.active.moving_energy(self.x) - before
 
     @property
-    def watches_impacts(self) -> bool:
-        """Whether what contact adds to the energy is known and taken back; not so where obstacles move."""
+    def removes_contact_surplus(self) -> bool:
+        """Whether the energy that contact adds is known and removed; not so with moving obstacles."""
         return self.integrator.exact_work and bool(self.active.limiting) and not self.active.pushing
 
     @property
     def limits_steps(self) -> bool:
-        """Whether `largest_step` may be less than 1: also in statics with directors, which would else go to
-        quite another equilibrium.
+        """Whether `largest_step` may be less than 1.
+
+        So it is with contact, and in statics with directors, which would else reach a distant equilibrium.
         """
         return bool(self.active.limiting) or (bool(self.active.with_edges) and not self.integrator.dynamic)
 
-    def largest_step(self, v: Array, way: Array) -> float:
-        """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        turn = 0.0 if self.integrator.dynamic else self.farthest_turn(way * self.stage.c)
-        most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
-        for _ in range(SEARCHES):
-            whole = gone == 0.0 and most == 1.0  # mostly
-            x, ahead, seen = self._look(*((v, way) if whole else (v + gone * way, (most - gone) * way)))
-            fraction = seen
+    def largest_step(self, v: Array, increment: Array) -> float:
+        """Largest fraction of an increment (n_owned, 3) [m/s] from v that all terms allow; collective."""
+        turn = 0.0 if self.integrator.dynamic else self.largest_turn(increment * self.stage.c)
+        maximum, done = (MAX_TURN / turn if turn > MAX_TURN else 1.0), 0.0
+        for _ in range(MAX_SEARCHES):
+            start, rest = v, increment
+            if done > 0.0 or maximum < 1.0:
+                start, rest = v + done * increment, (maximum - done) * increment
+            x, displacement, known = self._known_displacement(start, rest)
+            fraction = known
             if self.discretisation.has_near_elements:
                 frozen = self.active.frozen
-                parts = [term.largest_step(x, ahead, frozen[term]) for term in self.active.limiting]
-                fraction = self._least_of(min([fraction, *parts]))
+                allowed = [term.largest_step(x, displacement, frozen[term]) for term in self.active.limiting]
+                fraction = self._global_minimum(min([fraction, *allowed]))
             if fraction == 1.0:
-                return most
-            gone += fraction * (most - gone)
-            if fraction < seen:
+                return maximum
+            done += fraction * (maximum - done)
+            if fraction < known:
                 break
-        return gone
+        return done
 
-    def _look(self, v: Array, way: Array, least: float = FEW) -> tuple[Array, Array, float]:
-        """What `ahead` gives for the way from v by ``way`` (n_owned, 3) [m/s], and the part of it on which
-        stencils are known; where that is less than ``least``, they are searched all along it; collective.
+    def _known_displacement(
+        self, v: Array, increment: Array, minimum: float = MIN_KNOWN
+    ) -> tuple[Array, Array, float]:
+        """`displacement`, and the fraction of it on which all near pairs are known; collective.
+
+        Where the fraction is less than ``minimum``, pairs are searched along the whole displacement.
         """
-        x, ahead = self.ahead(v, way)
-        seen = self.discretisation.searched_fraction(x, ahead)
-        if seen >= least:
-            return x, ahead, seen
-        self._follow(x, ahead)
-        x, ahead = self.ahead(v, way)
-        return x, ahead, self.discretisation.searched_fraction(x, ahead)
+        x, displacement = self.displacement(v, increment)
+        known = self.discretisation.searched_fraction(x, displacement)
+        if known >= minimum:
+            return x, displacement, known
+        self._update_stencils(x, displacement)
+        x, displacement = self.displacement(v, increment)
+        return x, displacement, self.discretisation.searched_fraction(x, displacement)
 
-    def pushed_apart(self, v: Array, way: Array) -> Array | None:
-        """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
-        if nothing is; collective.
+    def second_order_correction(self, v: Array, increment: Array) -> Array | None:
+        """The increment (n_owned, 3) [m/s] from v, changed to separate the pairs that it brings too near.
 
-        On tangents sheets that turn come nearer to what they touch, or pass it, by the square of their turn.
-        (A second-order correction: Nocedal & Wright, Numerical Optimization, 2nd ed., sec. 15.6.)
+        None if no pair comes too near; collective. Along a linear increment a sheet that rotates comes nearer
+        to its contacts, or passes them, by the square of its rotation.
+        (Nocedal & Wright, Numerical Optimization, 2nd ed., sec. 15.6.)
         """
         if not self.active.limiting:
             return None
-        x, ahead, _ = self._look(v, way, 1.0)
+        x, displacement, _ = self._known_displacement(v, increment, 1.0)
         if not self.discretisation.has_near_elements:
             return None
-        n, frozen, pushed = len(way), self.active.frozen, False
-        targets = {term: term.target_distances(x, ahead, frozen[term]) for term in self.active.limiting}
-        for _ in range(PUSHES):
+        n, frozen, changed = len(increment), self.active.frozen, False
+        targets = {
+            term: term.target_distances(x, displacement, frozen[term]) for term in self.active.limiting
+        }
+        for _ in range(MAX_SEPARATIONS):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
             found = [
-                term.add_corrections(x, ahead, frozen[term], target, out, count)
+                term.add_corrections(x, displacement, frozen[term], target, out, count)
                 for term, target in targets.items()
             ]
             if not self.points.comm.allreduce(any(found), MPI.LOR):
                 break
-            aside = np.divide(out[:n], count[:n], out=np.zeros((n, 3)), where=count[:n] > 0.0)
-            ahead[:n] += np.where(self.prescribed.free, aside, 0.0)
-            self.points.update_ghosts(ahead)
-            pushed = True
-        return ahead[:n] / self.stage.c if pushed else None
+            change = np.divide(out[:n], count[:n], out=np.zeros((n, 3)), where=count[:n] > 0.0)
+            displacement[:n] += np.where(self.prescribed.free, change, 0.0)
+            self.points.update_ghosts(displacement)
+            changed = True
+        return displacement[:n] / self.stage.c if changed else None
 
-    def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
-        """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
-        x, ahead, _ = self._look(v, way, 1.0)
+    def contact_springs(self, v: Array, increment: Array) -> dict[Elastic, Springs]:
+        """Springs of the pairs that touch at v, or may touch along an increment (n_owned, 3) [m/s] from v.
+
+        Collective. Their blocks are part of the matrix until `release_contact_springs`.
+        """
+        x, displacement, _ = self._known_displacement(v, increment, 1.0)
         frozen = self.active.frozen
-        found = {term: term.springs(x, ahead, frozen[term]) for term in self.active.limiting}
+        found = {term: term.springs(x, displacement, frozen[term]) for term in self.active.limiting}
         return {term: springs for term, springs in found.items() if springs is not None}
 
-    def add_springs(
+    def add_contact_springs(
         self, springs: Mapping[Elastic, Springs], stiffness: Mapping[Elastic, Array], values: Array
     ) -> None:
-        """Add springs of this stiffness [N/m] to the Jacobian's block rows (n_blocks, 3, 3)."""
+        """Add springs with these stiffnesses [N/m] to the Jacobian's block rows (n_blocks, 3, 3)."""
         rows, beside = self.discretisation.rows, self.prescribed.beside
         for term, each in springs.items():
             reach = self.stage.c
@@ -605,112 +637,127 @@ class StageEquations:
         if len(beside.changing):
             rows.constrain(values, self.prescribed.mask, beside)
 
-    def release(self, length: Mapping[Elastic, Array]) -> None:
-        """Let `springs` go, of a ``length`` [m] where the step leads, without one if it is another."""
+    def release_contact_springs(self, length: Mapping[Elastic, Array]) -> None:
+        """End the use of `contact_springs`; ``length`` [m] is theirs after the increment taken.
+
+        It is empty where another increment is taken.
+        """
         for term in self.active.limiting:
             term.release_springs(length.get(term))
 
-    def farthest_turn(self, way: Array) -> float:
-        """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
-        turn = max((term.largest_turn(way) for term in self.active.with_edges), default=0.0)
+    def largest_turn(self, displacement: Array) -> float:
+        """Largest angle [rad] by which directors turn in a displacement (n_owned, 3) [m]; collective."""
+        turn = max((term.largest_turn(displacement) for term in self.active.with_edges), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
 
-    def _least_of(self, number: float) -> float:
-        """The least of all ranks; collective."""
+    def _global_minimum(self, number: float) -> float:
+        """Minimum over all ranks; collective."""
         return -self.points.global_max(-number)[0]
 
-    def ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
-        """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
-        x = self.evaluate_at(v)[0]
-        ahead = resized(way * self.stage.c, len(way), self.points.n_local)
-        self.points.update_ghosts(ahead)
-        return x, ahead
+    def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
+        """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].
 
-    def may_move(self) -> bool:
-        """Whether the sheet can go where the step's solve may start, while obstacles go theirs; collective.
-
-        What is prescribed goes where it shall; all else stays, or goes on as it did; at last also but for
-        what obstacles take along.
+        ``increment`` (n_owned, 3) [m/s] is added to the velocities; collective.
         """
-        here = self.velocity_of_staying()
-        goes = self.prescribed.velocity != here.take(self.prescribed.indices)
-        if not any(self.points.global_max(bool(self.active.pushing) or bool(goes.any()))):
-            return True
-        rests, refused = self.integrator.starts_at_rest, None
-        ways = [here] if rests else [here, self.v[: len(here)]]
-        tried = [(v, False) for v in ways]
-        if self.active.pushing and not rests:
-            tried += [(v, True) for v in ways]
-        for v, carried in tried:
-            there = here + self._carried(here, v - here) if carried else v.copy()
-            self.prescribe(there)
-            if self._may_go(here, there - here):
-                self.refused_way, self._may_begin = None, there
-                return True
-            refused = refused or self.refused_way  # of staying: then what moves is in the way
-        self.refused_way = refused
-        return False
+        x = self.evaluate_at(v)[0]
+        displacement = resized(increment * self.stage.c, len(increment), self.points.n_local)
+        self.points.update_ghosts(displacement)
+        return x, displacement
 
-    def _carried(self, v: Array, way: Array) -> Array:
-        """Ways (n_owned, 3) [m/s] from v like ``way``, but that obstacles take along what is in their way;
+    def find_start(self) -> bool:
+        """Find velocities from which the step's solve can start without a collision; whether there are any.
+
+        Tried in this order: all free vertices stay, all keep their velocities, and the same with vertices
+        moved by the obstacles that would hit them. Obstacles and prescribed unknowns move as they must;
         collective.
         """
-        n = len(way)
-        for _ in range(SEARCHES):
-            x, ahead = self.ahead(v, way)
-            taken = ahead
+        still = self.stationary_velocity()
+        moves = self.prescribed.velocity != still.take(self.prescribed.indices)
+        if not any(self.points.global_max(bool(self.active.pushing) or bool(moves.any()))):
+            return True
+        at_rest, refused = self.integrator.starts_at_rest, None
+        candidates = [still] if at_rest else [still, self.v[: len(still)]]
+        tried = [(v, False) for v in candidates]
+        if self.active.pushing and not at_rest:
+            tried += [(v, True) for v in candidates]
+        for v, pushed in tried:
+            start = still + self._moved_with_obstacles(still, v - still) if pushed else v.copy()
+            self.prescribe(start)
+            if self._is_collision_free(still, start - still):
+                self.refused_displacement, self._start_velocity = None, start
+                return True
+            # keep the first one: with the sheet at rest it shows what moves into the sheet
+            refused = refused or self.refused_displacement
+        self.refused_displacement = refused
+        return False
+
+    def _moved_with_obstacles(self, v: Array, increment: Array) -> Array:
+        """The ``increment`` (n_owned, 3) [m/s] from v, with vertices in the path of obstacles moved by them;
+        collective.
+        """
+        n = len(increment)
+        for _ in range(MAX_SEARCHES):
+            x, displacement = self.displacement(v, increment)
+            moved = displacement
             for term in self.active.pushing:
-                taken = term.moved_with_obstacles(x, taken, self.active.frozen[term])
-            change = taken[:n] != ahead[:n]
+                moved = term.moved_with_obstacles(x, moved, self.active.frozen[term])
+            change = moved[:n] != displacement[:n]
             if not self.points.comm.allreduce(bool(change.any()), MPI.LOR):
                 break
-            way = np.where(change, taken[:n] / self.stage.c, way)
-        return way
+            increment = np.where(change, moved[:n] / self.stage.c, increment)
+        return increment
 
-    def _may_go(self, v: Array, way: Array, *, after: bool = False) -> bool:
-        """Whether the sheet can go from velocities v by ``way`` (n_owned, 3) while obstacles go theirs.
+    def _is_collision_free(self, v: Array, increment: Array, *, after: bool = False) -> bool:
+        """Whether the sheet moves from velocities v by ``increment`` (n_owned, 3) [m/s] without a collision.
 
-        To the stage, or ``after`` it to the end of the step.
+        Obstacles move to the stage meanwhile, or with ``after`` from the stage to the end of the step. Sets
+        `refused_displacement` on a collision; collective.
         """
-        gone, begin = 0.0, float(after)
-        for _ in range(SEARCHES):
-            x, ahead, seen = self._look(v + gone * way, (1.0 - gone) * way)
-            ahead *= seen
-            part = StepInterval(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
-            free = [
-                term.is_collision_free(x, ahead, self.active.frozen[term], part)
-                for term in self.active.limiting
-            ]
-            if not self._least_of(float(all(free))):
+        done, begin = 0.0, float(after)
+        for _ in range(MAX_SEARCHES):
+            x, displacement, known = self._known_displacement(v + done * increment, (1.0 - done) * increment)
+            displacement *= known
+            part = StepInterval(begin + done, begin + (1.0 if known == 1.0 else done + known * (1.0 - done)))
+            frozen, limiting = self.active.frozen, self.active.limiting
+            free = [term.is_collision_free(x, displacement, frozen[term], part) for term in limiting]
+            if not self._global_minimum(float(all(free))):
                 break
-            if seen == 1.0:
+            if known == 1.0:
                 return True
-            gone = part.end - begin
-        self.refused_way = RefusedDisplacement(x.copy(), ahead, part)
+            done = part.end - begin
+        self.refused_displacement = RefusedDisplacement(x.copy(), displacement, part)
         return False
 
-    def may_end(self, v: Array) -> bool:
-        """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
-        collective.
+    def end_is_collision_free(self, v: Array) -> bool:
+        """Whether the sheet moves from the stage with velocities v (n_owned, 3) to the end of the step
+        without a collision; collective.
         """
         if self.stage.offset == self.dt and self.integrator.iterates:
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
-        # one linear solve has found it, or Newton's method has looked at the way to the stage
+        # Newton's method has checked the displacement to the stage, a single linear solve has not
         x = self.evaluate_at(v)[0] if self.integrator.iterates else self.x
-        way = end - x[:n]
-        if not self.discretisation.has_near_elements and self.discretisation.searched_fraction(x, way) == 1.0:
+        displacement = end - x[:n]
+        if (
+            not self.discretisation.has_near_elements
+            and self.discretisation.searched_fraction(x, displacement) == 1.0
+        ):
             return True
-        v = v if self.integrator.iterates else self.velocity_of_staying()
-        return self._may_go(v, way / self.stage.c, after=True)
+        v = v if self.integrator.iterates else self.stationary_velocity()
+        return self._is_collision_free(v, displacement / self.stage.c, after=True)
 
-    # -- what Newton asks for ----------------------------------------------------------------------
+    # -- residual and Jacobian -----------------------------------------------------------------------
 
-    def _follow(self, x: Array, ahead: Array | None = None, stops: Sequence[float] = ()) -> None:
-        """Let stencils be those at positions x (n_local, 3), and make room for their ghosts."""
+    def _update_stencils(
+        self, x: Array, displacement: Array | None = None, stops: Sequence[float] = ()
+    ) -> None:
+        """Update changing stencils to positions x (n_local, 3), and all arrays to their ghosts; collective.
+
+        ``displacement`` and ``stops`` are as in `Discretisation.update_stencils`.
+        """
         if not self.discretisation.stencils_change or not self.discretisation.update_stencils(
-            x, ahead, stops
+            x, displacement, stops
         ):
             return
         layout = self.points
@@ -730,12 +777,12 @@ class StageEquations:
         self.points.update_ghosts(self._vs)
         np.multiply(self._vs, self.stage.c, out=self._xs)
         self._xs += self._xh
-        self._follow(self._xs)
+        self._update_stencils(self._xs)
         return self._xs, self._vs
 
     @property
     def evaluated(self) -> tuple[Array, Array]:
-        """What ``evaluate_at`` last returned."""
+        """The positions and velocities that `evaluate_at` last returned."""
         return self._xs, self._vs
 
     def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
@@ -744,25 +791,27 @@ class StageEquations:
         return self._parts(self._xs, self._vs, rate)
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> Iterator[tuple[str, Array]]:
-        """One part of F after the other: there is no room for all of them. What the internal forces are
-        computed from is remembered, so that these come last.
+        """Names and values (n_owned, 3) [N] of the parts of F.
+
+        They are generated one by one, because all of them together take much memory. Internal forces come
+        last, because their remembered data take memory, too.
         """
         self._squares = []
-        yield self._counted("inertia", self.mass[:, None] * vdot)
+        yield self._with_square("inertia", self.mass[:, None] * vdot)
         del vdot
         if self.active.constraints:
-            yield self._counted("springs", self._sum(self.active.constraints, x))
-        yield self._counted("loads", -self.applied.force_at(x))
+            yield self._with_square("springs", self._sum(self.active.constraints, x))
+        yield self._with_square("loads", -self.applied.force_at(x))
         if self.damping.active:
-            yield self._counted("damping", self.damping.product(vs))
-            if self.integrator.lagged_loads:  # nobody asks again
+            yield self._with_square("damping", self.damping.product(vs))
+            if self.integrator.lagged_loads:  # there is no second evaluation
                 self.damping.product.forget()
         if self.active.viscous and not self.integrator.lagged_loads:
-            yield self._counted("wind", self._sum(self.active.viscous, vs))
-        yield self._counted("internal", self._internal(x))
+            yield self._with_square("wind", self._sum(self.active.viscous, vs))
+        yield self._with_square("internal", self._internal(x))
 
-    def _counted(self, name: str, part: Array) -> tuple[str, Array]:
-        """A part of F, whose square goes into `largest_force`."""
+    def _with_square(self, name: str, part: Array) -> tuple[str, Array]:
+        """The part of F, after its square is kept for `largest_force`."""
         self._squares.append(squared_norm_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
 
@@ -770,7 +819,7 @@ class StageEquations:
         return self.active.gradient(terms, at, self.points)
 
     def _total(self, x: Array, vs: Array, vdot: Array, out: Array) -> Array:
-        """F (n_owned, 3) [N] into ``out``."""
+        """F (n_owned, 3) [N], written to ``out``."""
         out[:] = 0.0
         for _, part in self._parts(x, vs, vdot):
             out += part
@@ -778,18 +827,20 @@ class StageEquations:
         return out
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
-        """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
+        """Write F (n_owned, 3) [N] to ``out``, in rows of prescribed unknowns σ m (v − v*); collective."""
         self._total(*self.evaluate_at(v), vdot, out)
         at, velocity = self.prescribed.indices, self.prescribed.velocity
         self.prescribed.overwrite(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
-        """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
+        """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
         return float(np.sqrt(self.points.global_sum(*self._squares).max(initial=0.0)))
 
     def block_summary(self) -> list[str]:
-        """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
+        """Lines of text on the elements with changing stencils and the blocks that they add to the matrix;
         collective.
+
+        The list is empty without such elements.
         """
         near, frozen = self.active.changing, self.active.frozen
         if not near:
@@ -806,96 +857,102 @@ class StageEquations:
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
 
     def update_pattern(self) -> bool:
-        """Let block rows have all blocks of the Jacobian where it was last evaluated; whether they are
-        others; collective.
+        """Update the pattern of the block rows to the pairs that act at the positions last evaluated.
+
+        Returns whether the pattern changed; collective.
         """
         x, frozen = self._xs, self.active.frozen
         if not self.discretisation.has_near_elements:
-            self.touches = False
+            self.has_active_pairs = False
             return self.discretisation.update_pattern({})
         acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
         if acting:
-            number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
-            self.touches = any(self.points.global_max(number))
+            number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
+            self.has_active_pairs = any(self.points.global_max(number))
         return self.discretisation.update_pattern(acting)
 
     @property
-    def slips(self) -> bool:
-        """Whether there is anything of which one linear solve cannot tell whether it sticks or slides;
-        collective.
+    def has_friction_pairs(self) -> bool:
+        """Whether there are friction pairs: one linear solve cannot decide whether they stick or slide.
+
+        Collective.
         """
         number = sum(term.n_friction_pairs for term in self.active.changing)
         return self.discretisation.has_near_elements and any(self.points.global_max(number))
 
     @property
     def may_impact(self) -> bool:
-        """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
+        """Whether parts are near each other, and vertices move by a notable part of the gap in the step;
+        collective.
+        """
         limiting = self.active.limiting
         if not (limiting and self.discretisation.has_near_elements):
             return False
-        way = self.stage.c * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
-        return self.points.global_max(float(way))[0] > IMPACT * min(term.skin for term in limiting)
+        largest = self.stage.c * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
+        return self.points.global_max(float(largest))[0] > IMPACT_STEP * min(term.skin for term in limiting)
 
-    def collides(self, far: float) -> bool:
-        """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""
+    def may_collide(self, approach: float) -> bool:
+        """Whether parts may collide in the step, approaching by more than ``approach`` [m]; collective."""
         limiting = self.active.limiting
-        if not self.discretisation.has_near_elements or not self.integrator.dynamic or self._at_end:
+        if not self.discretisation.has_near_elements or not self.integrator.dynamic or self._solving_edges:
             return False
-        x, ahead, frozen = self.x, self._expected(), self.active.frozen
-        return any(self.points.global_max(any(t.may_collide(x, ahead, frozen[t], far) for t in limiting)))
+        x, displacement, frozen = self.x, self._expected_displacement(), self.active.frozen
+        found = any(t.may_collide(x, displacement, frozen[t], approach) for t in limiting)
+        return any(self.points.global_max(found))
 
-    def new_iterate(self, v: Array | None) -> None:
-        """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
+    def set_iterate(self, v: Array | None) -> None:
+        """Set Newton's iterate v; the Jacobian takes the stress predicted from the iterate before it.
 
-        Their stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
+        The predicted stress is the strain's linearisation at the iterate before, as in a mixed method: stiff
+        sheets then converge as fast as soft ones. None forgets the iterates.
         """
         before, self._predicted = self._iterate, None
         self._iterate = None if v is None else self.evaluate_at(v)[0].copy()
         if before is not None and self._iterate is not None:
-            there = self._iterate if self._uncorrected is None else self._uncorrected
-            self._predicted = before, before if self._leaps else there
+            reached = self._iterate if self._uncorrected is None else self._uncorrected
+            self._predicted = before, before if self._linearises_at_state else reached
         self._uncorrected = None
-        self._leaps = False
+        self._linearises_at_state = False
 
     def linearise_to(self, v: Array) -> None:
-        """Let the next Jacobian be linearised to velocities v (n_owned, 3), whatever corrected them."""
+        """Predict the stress of the next Jacobian at velocities v (n_owned, 3): the iterate uncorrected."""
         self._uncorrected = self.evaluate_at(v)[0].copy()
 
-    def leap(self) -> None:
-        """Newton's method starts far from the state, whose stress the first Jacobian takes."""
-        self._iterate, self._leaps = self.x.copy(), True
+    def linearise_at_state(self) -> None:
+        """Let the first Jacobian take the stress of the state, from which Newton's first iterate is far."""
+        self._iterate, self._linearises_at_state = self.x.copy(), True
 
     def forget_forces(self) -> None:
-        """Energies and forces remembered are no longer those at hand."""
+        """Discard the remembered energies and forces."""
         if isinstance(self._internal, Remembered):
             self._internal.forget()
         self.objective.forget()
 
     def forget_directors(self) -> None:
-        """Keep none while a linear system is solved, which needs the room: next they are elsewhere."""
+        """Discard the remembered directors, whose memory the linear solve needs."""
         for term in self.active.with_edges:
             term.forget()
 
     def forget_rows(self) -> None:
-        """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
+        """Drop all references to the rows that `jacobian` was given, so that their owner can free them."""
         self.damping.release_values()
 
     def jacobian(self, v: Array, blend: float, values: Array) -> None:
-        """Let block rows (n_blocks, 3, 3) be σ M + c K + D + ∇∇P, prescribed unknowns decoupled.
+        """Write σ M + c K + D + ∇∇P to block rows (n_blocks, 3, 3), prescribed unknowns decoupled.
 
-        ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
+        ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one.
         """
         x, vs = self.evaluate_at(v)
         rows, predicted = self.discretisation.rows, self._predicted
         if predicted is not None and len(predicted[0]) != len(x):
-            predicted = None  # of an iterate with other ghosts
+            predicted = None  # the iterate had other ghosts
         lagged = self.integrator.lagged_loads
-        for remembered in self._asked_once:  # the linear solve needs the room
+        for remembered in self._evaluated_once:  # the linear solve needs the memory
             remembered.forget()
         reach = self.stage.c
         inertia = self.stage.sigma * self.mass
         if self.active.with_edges:
-            inertia[self.points.n_vertices :] += reach * self._least
+            inertia[self.points.n_vertices :] += reach * self._min_stiffness
         beside = self.prescribed.beside
         changing = beside.changing
         if blend < 1.0 or not self.damping.assemble_with_stiffness(x, reach, inertia, values, changing):

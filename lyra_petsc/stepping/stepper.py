@@ -232,7 +232,7 @@ class Stepper:
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Before a Newton iteration; collective."""
         self._follow_stencils()
-        if iteration > 0 and self._equations.turn_frames():
+        if iteration > 0 and self._equations.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin()
 
@@ -284,18 +284,18 @@ class Stepper:
         with PETSc.Log.Event(FROZEN):
             equations.begin_step(t0, t1)
         number = self.ts.getStepNumber()
-        before = equations.x[: self._shape[0]].copy() if equations.edges_lag else None
+        before = equations.x[: self._shape[0]].copy() if equations.solves_edges_at_end else None
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
         stuck: FailedSolve | None = None
-        if equations.discretisation.limits_motion and not equations.may_move():
+        if equations.discretisation.limits_motion and not equations.find_start():
             self._trace.begin()
-            stuck = self._trace.stuck(equations.velocity_of_staying())
+            stuck = self._trace.stuck(equations.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=stuck)
         velocity, words = self._solve(t0)
         if (
             velocity is not None
             and equations.discretisation.limits_motion
-            and not equations.may_end(velocity)
+            and not equations.end_is_collision_free(velocity)
         ):
             velocity, words = None, MEETS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
@@ -307,7 +307,7 @@ class Stepper:
             equations.accept(velocity)
             if before is not None:
                 assert rate_before is not None
-                equations.begin_edges(before)
+                equations.begin_edge_solve(before)
                 rates, words = self._solve(t0)
                 newton, linear = (
                     newton + self.snes.getIterationNumber(),
@@ -315,7 +315,7 @@ class Stepper:
                 )
                 if rates is None:
                     stuck, velocity = self._trace.stuck(), None
-                equations.end_edges(rates)
+                equations.end_edge_solve(rates)
                 if rates is None:
                     equations.state.set(before, rate_before)
         else:
@@ -342,23 +342,23 @@ class Stepper:
     def _with_triangles(self, velocity: Array) -> Array:
         """Velocities (n_owned, 3) with directors that go far turned with their triangles; collective."""
         equations = self._equations
-        staying = equations.velocity_of_staying()
+        staying = equations.stationary_velocity()
         way = velocity - staying
-        if equations.follow_triangles(staying, way):
+        if equations.turn_directors(staying, way):
             velocity = staying + way
         equations.evaluate_at(velocity)
-        equations.turn_frames()
+        equations.update_frames()
         return velocity
 
     def settle_edges(self, floor: float) -> bool:
         """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
         equations, n = self._equations, self._shape[0]
         before = np.inf
-        while floor < (moments := equations.begin_at_rest()) < before:
+        while floor < (moments := equations.initial_edge_moments()) < before:
             before = moments if not self._iterates else 0.0
-            equations.begin_edges(equations.x[:n].copy())
+            equations.begin_edge_solve(equations.x[:n].copy())
             rates, _ = self._solve(equations.t0)
-            equations.end_edges(rates)
+            equations.end_edge_solve(rates)
             self.start(equations.t0, 0)
             if rates is None:
                 return False
@@ -483,7 +483,7 @@ class Stepper:
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
         if first_guess(self._equations, guess):
-            self._newton.bend_guess(self._equations.velocity_of_staying(), guess)
+            self._newton.bend_guess(self._equations.stationary_velocity(), guess)
         if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations

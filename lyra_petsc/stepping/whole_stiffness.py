@@ -64,7 +64,7 @@ class WholeStiffness:
             if iteration > 0 and self._balanced(force, last):
                 if not self._stands(factor):
                     break
-                system.stay()
+                system.evaluate_at_start()
                 system.moving_energy_before = anchored
                 return Attempt(True, iteration, 0, force)
             way = self._way(off, factor) if np.isfinite(force) else None

@@ -34,7 +34,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
         places = term.edge_indices
         own = places < way.size
         way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.tangent @ AXIS))[own]
-    return system.velocity_of_staying(), way / system.stage.c
+    return system.stationary_velocity(), way / system.stage.c
 
 
 @pytest.mark.parallel(2, 3)
@@ -45,7 +45,7 @@ def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
     arcs = Arcs(system)
     bent, straight = arcs.bend(staying, way)
     np.testing.assert_array_equal(straight, way)
-    start, there = system.x[:n].copy(), system.ahead(staying, bent)
+    start, there = system.x[:n].copy(), system.displacement(staying, bent)
     moved = (there[0] + there[1])[:n]
     turned = start @ rotation(AXIS, 0.9 * FARTHEST).T
 
@@ -57,7 +57,7 @@ def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
 
     np.testing.assert_allclose(moved - middle(moved), turned - middle(turned), atol=1e-7)
     energy = [sum(float(t.energies(x, system.active.frozen[t]).sum()) for t in system.active.elastic)
-              for x in (there[0] + there[1], there[0] + system.ahead(staying, way)[1])]  # fmt: skip
+              for x in (there[0] + there[1], there[0] + system.displacement(staying, way)[1])]  # fmt: skip
     bending, tangent = (comm.allreduce(each) for each in energy)
     assert bending < 1e-9 * tangent
     arcs.destroy()

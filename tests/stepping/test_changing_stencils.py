@@ -121,7 +121,7 @@ def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
     system.evaluate_at(v)
     assert comm.size == 1 or comm.allreduce(system.points.n_local > n_local, MPI.LOR)
     assert simulation.stepper.linear.renew()
-    system.stay()
+    system.evaluate_at_start()
     simulation.stepper.presets = ["multigrid", "direct"]
     assert simulation.stepper.next_preset() == "direct"
     simulation.step()

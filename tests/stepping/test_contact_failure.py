@@ -47,7 +47,7 @@ def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
     # between the floor and where the plate began
     assert -0.01 < failure.near.position[2] < 0.03
     assert 0.0 < failure.near.gap < 1e-3
-    assert f"{failure.near.words} {failure.near.gap:.3g} m apart" in text
+    assert f"{failure.near.text} {failure.near.gap:.3g} m apart" in text
     assert f"and the obstacle '{failure.near.obstacle}', around (" in text
     assert "try more room for the sheet: obstacles.plate.motion must leave it some" in text
     assert len(failure.advice) == 1  # no number is absurd where there is no room

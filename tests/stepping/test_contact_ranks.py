@@ -221,7 +221,7 @@ def test_only_what_is_near_and_fast_collides(comm: MPI.Comm) -> None:
         def collides(first: float, second: float) -> bool:
             system.state.set(system.x[:n], np.where(lower, first, second) * [0.0, 0.0, 1.0])
             system.begin_step(0.0, 0.004)
-            return system.collides(0.05)
+            return system.may_collide(0.05)
 
         assert collides(-15.0, -15.0)
         assert not collides(-11.0, -11.0)

@@ -66,11 +66,11 @@ def test_forces_at_the_end_of_a_linear_step_serve_the_next(monkeypatch: pytest.M
         asked.clear()
         simulation.step()
         assert len(asked) == 1
-        remembered = system.pull_of(system.active.sheet, system.x).copy()
+        remembered = system.gradient_of(system.active.sheet, system.x).copy()
         assert len(asked) == 1
         system.forget_forces()
         np.testing.assert_allclose(
-            remembered, system.pull_of(system.active.sheet, system.x), rtol=0.0, atol=1e-15
+            remembered, system.gradient_of(system.active.sheet, system.x), rtol=0.0, atol=1e-15
         )
         assert term.frames is system.active.frozen[term]
     assert simulation.guard is not None

@@ -270,7 +270,7 @@ def test_forces_balance_wherever_ranks_meet(comm: MPI.Comm) -> None:
 
     def at_first(on: MPI.Comm) -> tuple[int, Array]:
         with Watched(on, scene) as run:
-            run.system.begin(0.0)
+            run.system.set_references(0.0)
             run.system.begin_step(0.0, 0.01)
             x = run.system.x
             total, largest = run.forces(x)
