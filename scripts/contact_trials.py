@@ -43,7 +43,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Stepper
 from lyra_petsc.terms import contact, contact_pairs, registry
-from lyra_petsc.terms.contact import HALFWAY, Barrier, ContactBarrier, Places
+from lyra_petsc.terms.contact import HALFWAY_CURVATURE, Barrier, ContactBarrier, ObstaclePositions
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_TRIANGLE
 from lyra_petsc.terms.term import UpcomingStep
 
@@ -67,38 +67,38 @@ METHODS = {"barrier": 0.0} | {f"multipliers, r = {r:g} C": r for r in (1.0, 10.0
 
 
 @kernel()
-def nearest(x, others, kind, points, at, parallel, beta, felt, weight):  # type: ignore[no-untyped-def]
+def nearest(x, others, kind, points, at, parallel, beta, derivatives, weight):  # type: ignore[no-untyped-def]
     """Of pairs ``at`` (m,): β, the vector between their nearest points, and 1; 0 of parallel edges."""
     p, g = np.empty((4, 3)), np.empty(3)
     for n in range(len(at)):
         e = at[n]
-        contact_pairs._load(x, others, points, e, p)
-        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = contact_pairs._weights(kind[e], p)
-        contact_pairs._between(x, others, kind, points, beta, e, n, p, g)
-        weight[n] = 0.0 if kind[e] == EDGE_EDGE and contact_pairs._fades(p, parallel) else 1.0
+        contact_pairs._load_points(x, others, points, e, p)
+        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = contact_pairs._nearest_coefficients(kind[e], p)
+        contact_pairs._vector_between(x, others, kind, points, beta, e, n, p, g)
+        weight[n] = 0.0 if kind[e] == EDGE_EDGE and contact_pairs._is_mollified(p, parallel) else 1.0
         for k in range(3):
-            felt[n, k] = g[k]
+            derivatives[n, k] = g[k]
 
 
 class Multipliers(ContactBarrier):
-    """Contact by multipliers: what `contact_pairs.meeting` finds, with other forces."""
+    """Contact by multipliers: what `contact_pairs.find_active` finds, with other forces."""
 
     ratio = 1.0
     solving = False
     """Whether energies are those of a solve: between steps nothing is stored."""
 
-    def set_up(self, barrier: Barrier, obstacles: Sequence[Any], *, itself: bool, static: bool) -> None:
-        super().set_up(barrier, obstacles, itself=itself, static=static)
-        self.r = self.ratio * HALFWAY * barrier.stiffness
+    def set_up(self, barrier: Barrier, obstacles: Sequence[Any], *, self_contact: bool, static: bool) -> None:
+        super().set_up(barrier, obstacles, self_contact=self_contact, static=static)
+        self.r = self.ratio * HALFWAY_CURVATURE * barrier.stiffness
         self.keys, self.multipliers = np.empty(0, dtype=np.int64), np.empty(0)
 
-    def freeze(self, step: UpcomingStep) -> Places:
+    def freeze(self, step: UpcomingStep) -> ObstaclePositions:
         corners = step.x[self.surface]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._normals = np.zeros_like(step.x)
         for k in range(3):
             np.add.at(self._normals, self.surface[:, k], normals)
-        self._meeting.forget()
+        self._remembered.forget()
         return super().freeze(step)
 
     def _key(self, at: Ints, apart: Array) -> Ints:
@@ -127,51 +127,58 @@ class Multipliers(ContactBarrier):
         super().take(elements)
         self._alone = (self.kind == EDGE_EDGE) | (self.points[:, 0] < 0)
 
-    def _distance(self, at: Ints, felt: Array) -> Array:
+    def _distance(self, at: Ints, derivatives: Array) -> Array:
         """Distances (m,) [m] of pairs, below 0 of what is inside of an obstacle."""
         inside = self.kind[at] == VERTEX_INSIDE
-        return np.where(inside, -1.0, 1.0) * np.linalg.norm(felt[:, :3], axis=1)
+        return np.where(inside, -1.0, 1.0) * np.linalg.norm(derivatives[:, :3], axis=1)
 
-    def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
-        least, at, weight, _, beta, _, felt = super()._meet(points)
+    def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
+        least, at, weight, _, beta, _, derivatives = super()._find_active(points)
         # pairs of vertices are what they are; of others, each pair has its own multiplier
         vertices, pairs = ~self._alone[at], np.flatnonzero(self._alone & (least < self.gap))
         more = np.empty((len(pairs), 4)), np.zeros((len(pairs), 5)), np.empty(len(pairs))
-        x, places = np.split(points, [len(points) - self.obstacles.n_points])
-        nearest(x, places, self.kind, self.points, pairs, self.barrier.parallel, *more)
+        x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
+        nearest(x, obstacle_x, self.kind, self.points, pairs, self.barrier.parallel, *more)
         at = np.concatenate([at[vertices], pairs])
         weight = np.concatenate([weight[vertices], more[2]])
-        beta, felt = (np.concatenate([a[vertices], b]) for a, b in ((beta, more[0]), (felt, more[1])))
-        d = self._distance(at, felt)
+        beta, derivatives = (
+            np.concatenate([a[vertices], b]) for a, b in ((beta, more[0]), (derivatives, more[1]))
+        )
+        d = self._distance(at, derivatives)
         over = d - self.offset[at] - LEVEL * self.gap[at]
-        pull = np.maximum(self._kept(self._key(at, felt[:, :3])) - self.r * over, 0.0)
-        felt[:, 3], felt[:, 4] = -pull / d, np.where(pull > 0.0, self.r, 0.0) / (d * d)
-        return least, at, weight, weight.copy(), beta, 0.5 * pull * pull / self.r, felt
+        pull = np.maximum(self._kept(self._key(at, derivatives[:, :3])) - self.r * over, 0.0)
+        derivatives[:, 3], derivatives[:, 4] = -pull / d, np.where(pull > 0.0, self.r, 0.0) / (d * d)
+        return least, at, weight, weight.copy(), beta, 0.5 * pull * pull / self.r, derivatives
 
-    def energies(self, x: Array, frozen: Places) -> Array:
+    def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         return super().energies(x, frozen) if self.solving else np.zeros(self.n_owned)
 
-    def find_contacts(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
-        met = self.meeting(x, places)
-        rows = np.flatnonzero((met.weight > 0.0) & (met.felt[:, 3] != 0.0))
-        at, felt = met.at[rows], met.felt[rows]
-        d = self._distance(at, felt)
-        return met.beta[rows], felt[:, :3] / d[:, None], -met.weight[rows] * felt[:, 3] * d, at
+    def find_contacts(self, x: Array, obstacle_x: Array, n_counted: int) -> tuple[NDArray[Any], ...]:
+        active = self.active_pairs(x, obstacle_x)
+        rows = np.flatnonzero((active.weight > 0.0) & (active.derivatives[:, 3] != 0.0))
+        at, derivatives = active.pair[rows], active.derivatives[rows]
+        d = self._distance(at, derivatives)
+        return (
+            active.beta[rows],
+            derivatives[:, :3] / d[:, None],
+            -active.weight[rows] * derivatives[:, 3] * d,
+            at,
+        )
 
-    def renew(self, x: Array, frozen: Places) -> bool:
+    def renew(self, x: Array, frozen: ObstaclePositions) -> bool:
         """Take the multipliers that positions x (n, 3) give; whether they and the distances will do."""
-        met = self.meeting(x, frozen.now)
-        at = met.at
-        d = self._distance(at, met.felt)
-        level, pull = LEVEL * self.gap[at], -met.felt[:, 3] * d
-        delta = np.where(met.weight > 0.0, (d - self.offset[at]) / level, np.inf)
-        key = self._key(at, met.felt[:, :3])
+        active = self.active_pairs(x, frozen.stage)
+        at = active.pair
+        d = self._distance(at, active.derivatives)
+        level, pull = LEVEL * self.gap[at], -active.derivatives[:, 3] * d
+        delta = np.where(active.weight > 0.0, (d - self.offset[at]) / level, np.inf)
+        key = self._key(at, active.derivatives[:, :3])
         order = np.lexsort((-pull, key))
         order = order[np.concatenate([[True], key[order][1:] != key[order][:-1]])[: len(order)]]
         key, pull = key[order], pull[order]
         change = np.concatenate([pull - self._kept(key), self.multipliers[~np.isin(self.keys, key)]])
         self.keys, self.multipliers = key[pull > 0.0], pull[pull > 0.0]
-        self._meeting.forget()
+        self._remembered.forget()
         settled = np.abs(change).max(initial=0.0) <= SETTLED * pull.max(initial=0.0)
         return bool(settled and 1.0 - delta.min(initial=1.0) <= LEFT)
 

@@ -116,7 +116,7 @@ class ContactModel:
 
     def _split(self, values: Array) -> list[Array]:
         """Values of all springs by term."""
-        ends = np.cumsum([len(each.at) for each in self._springs.values()])
+        ends = np.cumsum([len(each.pair) for each in self._springs.values()])
         return np.split(values, ends[:-1])
 
     def _law(self, length: Array) -> tuple[Array, Array]:
@@ -130,7 +130,7 @@ class ContactModel:
         """Slopes [N/m] of the law from these lengths [m] to where forces [N] are those expected."""
         expected = np.maximum(expected, 0.0)
         parts = zip(self._springs.values(), *map(self._split, (length, force, expected)), strict=True)
-        return np.concatenate([np.empty(0), *(each.chords(*own) for each, *own in parts)])
+        return np.concatenate([np.empty(0), *(each.secant_stiffness(*own) for each, *own in parts)])
 
     def _apart(self, force: Array, expected: Array) -> float:
         """How far forces [N] of springs are from those expected, which do not pull; collective."""
@@ -153,7 +153,7 @@ class ContactModel:
         ahead = np.zeros((equations.points.n_local, 3))
         ahead[: equations.points.n_owned] = -equations.stage.c * y.getArray(readonly=True).reshape(-1, 3)
         equations.points.update_ghosts(ahead)
-        return np.concatenate([np.empty(0), *(each.longer(ahead) for each in self._springs.values())])
+        return np.concatenate([np.empty(0), *(each.elongations(ahead) for each in self._springs.values())])
 
     def _solve(self, left: PETSc.Vec, z: PETSc.Vec, slopes: Array, enough: float) -> bool:
         """Let z lead from where this is ``left`` [N] to the solution with springs of these slopes [N/m], to a

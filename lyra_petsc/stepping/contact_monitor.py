@@ -44,7 +44,7 @@ class ContactMonitor:
         sums = [here["contacts"]]
         if self._friction is not None:
             sums += self._friction.count_sticking(x, of.active.frozen[self._friction])
-            sums.append(float(contact.find_contacts(x, frozen.now, contact.n_owned)[2].sum()))
+            sums.append(float(contact.find_contacts(x, frozen.stage, contact.n_owned)[2].sum()))
         sums = of.points.global_sum(*sums).tolist()
         extremes = np.array([stiffest, -here["smallest_gap"]])
         of.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)

@@ -326,8 +326,8 @@ def _set_up_contact(
 
     obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
-    itself, static = scene.contact.self, scene.time.static
-    contact.set_up(outline.barrier, obstacles, itself=itself, static=static)
+    self_contact, static = scene.contact.self, scene.time.static
+    contact.set_up(outline.barrier, obstacles, self_contact=self_contact, static=static)
     if "friction" in terms:
         from lyra_petsc.terms.friction import CoulombFriction
 

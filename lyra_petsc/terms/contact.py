@@ -1,12 +1,12 @@
-"""Contact of sheets with themselves, each other and obstacles: a barrier on the distances of simplices.
+"""Contact of sheets with themselves, each other and obstacles by a barrier on the distances of simplices.
 
-Pairs of a vertex and a triangle and of two edges that have no vertex in common and are nearer than ``gap``
-(beside ``thickness`` and the radius of an obstacle) repel each other (``contact_pairs``). The barrier's
-stiffness k is such that halfway through the gap b″ is the sheet's membrane stiffness, that is about the
-diagonal of its Jacobian.
+Pairs of a vertex and a triangle, and of two edges, without a common vertex repel each other if their distance
+less ``thickness`` and less the radius of the obstacle is below ``gap`` (`contact_pairs`). The barrier's
+stiffness k is chosen such that b″ in the middle of the gap is the membrane stiffness of the sheet, which is
+about the diagonal of its Jacobian.
 
-Nothing passes through: no Newton iteration goes farther than continuous collision detection allows, and none
-moves points so far that pairs might meet which the last search did not see.
+Nothing can pass through anything else: Newton's increments are limited by continuous collision detection, and
+also such that pairs which the last search did not return cannot come into contact.
 """
 
 from __future__ import annotations
@@ -33,71 +33,73 @@ from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, StepInterval, UpcomingStep
 
-KEPT = 0.2
-"""Part of its distance, or of the gap where it is farther, that a pair keeps in a Newton iteration."""
+KEPT_FRACTION = 0.2
+"""Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
 
-TOUCHES = 0.7
-"""Part of the gap at which pairs that meet in a Newton iteration shall be after it."""
+TARGET_FRACTION = 0.7
+"""Part of the gap at which pairs that become active in a Newton iteration shall be after it."""
 
-SHORT = 0.05
-"""Part of the gap that they, and those which touch, may lack there."""
+TARGET_TOLERANCE = 0.05
+"""Part of the gap by which pairs may be nearer than their target distance after a Newton iteration."""
 
 PARALLEL = 1e-3
-"""Squared sine of the angle of two edges below which they count as nearly parallel."""
+"""Squared sine of the angle of two edges below which their energy is multiplied by the mollifier."""
 
-BULGE = 0.1
-"""How far, over the gap, what turns near a sheet may leave the straight way that it is taken to go."""
+MAX_DEVIATION = 0.1
+"""Largest deviation over the gap of an obstacle's paths from straight lines, where these are used instead."""
 
-HALFWAY = 14.0
+HALFWAY_CURVATURE = 14.0
 """b″ / k in the middle of the gap."""
 
-EDGES = 0.3
-"""Part of the gap below which two edges feel each other, but for sharp ones of obstacles. Sheets that lie on
-each other are held by pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to
-what these do not. On obstacles' triangles a sheet's vertices lie, alike wherever the edges of these are.
-"""
+EDGE_GAP = 0.3
+"""Part of the gap below which two edges repel each other, except for sharp edges of obstacles. Sheets that
+lie on each other are kept apart by pairs of vertices and triangles, two for each vertex; pairs of edges, of
+which there are ten times as many, are needed only for what these miss. The same holds for edges and points of
+obstacles' smooth surfaces, so that forces on the vertices of a sheet do not depend on the obstacle's mesh."""
 
-SHARP = 0.5
-"""Angle [rad] between triangles of an obstacle above which the edge between them is felt as they are."""
+SHARP_ANGLE = 0.5
+"""Angle [rad] between two triangles of an obstacle above which their common edge has the full gap."""
 
 SKIN = 0.5
-"""Over the gap, how far points may come nearer to each other between two searches."""
+"""Distance over the gap by which points may approach each other between two searches."""
 
 SAG = 0.01
-"""Part of the gap by which edges of a sheet sag, at most, over spheres and rods that its vertices feel, as
-they feel planes; triangles and edges do only as two edges feel each other. On what is nearly flat nearest
-points are anywhere."""
+"""Part of the gap by which a sheet's edges may sag between its vertices on a sphere or rod for the obstacle
+to count as nearly flat: there, as on planes, vertices carry the contact, and edges and triangles have the gap
+of two edges only, because their nearest points are not well defined."""
 
-MANY, MANY_PER_VERTEX = 500_000, 100
-"""Pairs above both of which shorter ways are looked at: a step of Newton's method may lead through all of a
-crumpled sheet, and none of that is gone at once. Not in a static analysis, whose first load step may lead far
-where nothing holds the sheet yet."""
+MAX_PAIRS, MAX_PAIRS_PER_VERTEX = 500_000, 100
+"""If a search finds more pairs than both (the second per vertex), it is repeated with shorter displacements:
+a Newton increment may lead through all of a crumpled sheet, but only a small part of it will be possible. Not
+in a static analysis, whose first load step may lead far while nothing holds the sheet."""
 
-STRAIN = 0.01
-"""Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
-which takes Newton's method many iterations."""
+MIN_STRAIN = 0.01
+"""Least strain of an edge under the force k · gap. With a softer barrier a small force would nearly close a
+small gap, which takes Newton's method many iterations."""
 
 
-PARTS = 1_000_000_000
-"""Vertices have so many parts of k as their area asks for: whole numbers, which go from rank to rank with the
-triangles."""
+TO_STAGE = StepInterval(0.0, 1.0)
 
-LEAST, MOST = 1e-3, 1e3
-"""Of the stiffness that pairs of a vertex have, for its area."""
+AREA_UNITS = 1_000_000_000
+"""Area factors of vertices are stored as multiples of 1 / `AREA_UNITS`: integers are sent to other ranks with
+the triangles."""
+
+MIN_AREA_FACTOR, MAX_AREA_FACTOR = 1e-3, 1e3
+"""Bounds of the area factors."""
 
 
 class Barrier(NamedTuple):
-    """Numbers of the barrier, the same on all ranks.
+    """Constants of the barrier, the same on all ranks.
 
     Attributes
     ----------
     gap, thickness : float [m]
     stiffness : float [N/m]
-        k inside of a regular mesh.
+        k in the interior of a regular mesh.
     parallel : float
-        Squared sine of the angle of edges below which their energy fades.
+        Squared sine of the angle of edges below which their energy is mollified.
     flat : float
-        Radius [m] of spheres and rods from which on a sheet's edges sag less than `SAG` over them.
+        Radius [m] of spheres and rods from which on they count as nearly flat (`SAG`).
     """
 
     gap: float
@@ -107,79 +109,87 @@ class Barrier(NamedTuple):
     flat: float = np.inf
 
 
-class Places(NamedTuple):
-    """Where the obstacles' points stand, and normals of planes after them.
+class ObstaclePositions(NamedTuple):
+    """Obstacles in one step.
 
     Attributes
     ----------
-    before, now, after : (m, 3)
-        At the start of a step, at its stage and at its end.
-    moved, moved_on : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle up to the stage, and to the end.
+    start, stage, end : (m, 3)
+        Their points [m], and normals of planes, at the start of the step, at its stage and at its end.
+    stage_motions, end_motions : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle from the start to the stage, and to the end.
     """
 
-    before: Array
-    now: Array
-    after: Array
-    moved: list[tuple[Array, Array]]
-    moved_on: list[tuple[Array, Array]]
+    start: Array
+    stage: Array
+    end: Array
+    stage_motions: list[tuple[Array, Array]]
+    end_motions: list[tuple[Array, Array]]
 
 
-class Meeting(NamedTuple):
-    """Pairs nearer than the gap, of those whose nearest points are on the same vertices one.
+class ActivePairs(NamedTuple):
+    """Pairs nearer than the gap; of those with the same nearest vertices only one.
 
     Attributes
     ----------
-    least : (E,)
-        What the distance of each pair less its offset [m] is not below.
-    at, weight, counted, beta, energy, felt : (m, …)
-        Of those found, as `contact_pairs.meeting` gives them.
+    lower_bound : (E,)
+        Lower bound of the distance less offset [m] of every pair, exact below the gap.
+    pair, weight, owned_weight, beta, energy, derivatives : (m, …)
+        Of the active pairs, as `contact_pairs.find_active` writes them.
     """
 
-    least: Array
-    at: Ints
+    lower_bound: Array
+    pair: Ints
     weight: Array
-    counted: Array
+    owned_weight: Array
     beta: Array
     energy: Array
-    felt: Array
+    derivatives: Array
 
     @property
     def square(self) -> Array:
         """|g|² [m²], (m,)."""
-        found: Array = np.einsum("mk,mk->m", self.felt[:, :3], self.felt[:, :3])
-        return found
+        g = self.derivatives[:, :3]
+        square: Array = np.einsum("mk,mk->m", g, g)
+        return square
 
     @property
     def stiffness(self) -> Array:
-        """b″ times the square of the distance's gradient [N/m], (m,)."""
-        return self.felt[:, 4] * self.square
+        """b″ [N/m], (m,)."""
+        return self.derivatives[:, 4] * self.square
+
+    @property
+    def forces(self) -> tuple[Ints, Array, Array, Array]:
+        """The arguments of kernels: pair, weight, β and derivatives."""
+        return self.pair, self.weight, self.beta, self.derivatives
 
 
-_NONE = np.empty(0)
-NOTHING = Meeting(
-    *unwritable(_NONE, np.empty(0, dtype=np.int64), _NONE, _NONE, np.empty((0, 4)), _NONE, np.empty((0, 5)))
+_EMPTY = np.empty(0)
+NO_PAIRS = ActivePairs(
+    *unwritable(
+        _EMPTY, np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 5))
+    )
 )
-"""Where there are no pairs."""
 
 
 class Obstacles:
-    """The points of all obstacles in one array, and the simplices that they make.
+    """The points of all obstacles in one array, and their simplices.
 
     Attributes
     ----------
     triangles, edges, points, planes, segments : (n, 5)
-        Numbers of the points, that of the obstacle, what is around a triangle (`surface_shares.rings`).
-        Planes are a point and a normal. Of spheres and rods that are nearly flat the axis is a triangle, too.
+        Numbers of three points, number of the obstacle, and for triangles the code of `surface_shares.rings`.
+        A plane is a point and a normal. The axis of a nearly flat sphere or rod is also a degenerate
+        triangle.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
     moving : bool
-        Whether any of them does.
+        Whether any obstacle moves.
     smooth_points : (n,) bool
-        Of all points: those at which triangles make no sharp edge.
+        Which points are vertices of triangles, but not of sharp edges.
     smooth_edges : (m,) int64
-        Edges at which they make none, in order: the lower number of a point times ``n_points``, and the
-        higher.
+        Edges of triangles that are not sharp, in ascending order: lower number × ``n_points`` + higher
+        number.
     """
 
     def __init__(self, obstacles: Sequence[Solid | Container], flat: float = np.inf) -> None:
@@ -193,14 +203,15 @@ class Obstacles:
             n = len(obstacle.points)
             begins.append(first)
 
-            def rows(of: Ints, number: int = number, first: int = first) -> Ints:
-                filled = np.concatenate([of, np.repeat(of[:, :1], 3 - of.shape[1], axis=1)], axis=1)
-                rings = surface_shares.rings(of) if of.shape[1] == 3 else np.zeros(len(of), dtype=np.int64)
-                return np.column_stack([filled + first, np.full(len(of), number), rings])
+            def rows(simplices: Ints, number: int = number, first: int = first) -> Ints:
+                n, m = simplices.shape
+                filled = np.concatenate([simplices, np.repeat(simplices[:, :1], 3 - m, axis=1)], axis=1)
+                rings = surface_shares.rings(simplices) if m == 3 else np.zeros(n, dtype=np.int64)
+                return np.column_stack([filled + first, np.full(n, number), rings])
 
             if isinstance(obstacle, Solid):
                 radius[number] = obstacle.radius
-                edges, sharp = _edges_of(obstacle)
+                edges, sharp = _triangle_edges(obstacle)
                 smooth_edges.append(first + edges[~sharp])
                 points = np.zeros(n, dtype=np.bool_)
                 points[obstacle.triangles] = True
@@ -233,9 +244,9 @@ class Obstacles:
         self.radius, self.n_points = radius, first
         self.moving = any(obstacle.motion is not None for obstacle in obstacles)
         self._first = np.array(begins, dtype=np.int64)
-        self._stays = [(np.eye(3), np.zeros(3))] * len(obstacles)
+        self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
 
-    def at(self, time: float) -> Array:
+    def positions(self, time: float) -> Array:
         """Points and normals (m, 3) at a time [s]."""
         rows = [np.empty((0, 3))]
         for obstacle in self.each:
@@ -244,55 +255,58 @@ class Obstacles:
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
 
-    def extents(self, places: Array) -> tuple[Array, Array]:
-        """Low and high corners (obstacles, 3) [m] of what is at places (k, m, 3) [m]."""
-        return np.minimum.reduceat(places.min(axis=0), self._first), np.maximum.reduceat(
-            places.max(axis=0), self._first
-        )
+    def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
+        """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
+        low, high = x.min(axis=0), x.max(axis=0)
+        return np.minimum.reduceat(low, self._first), np.maximum.reduceat(high, self._first)
 
-    def bulges(self, start: float, end: float) -> Array:
-        """How far [m] points of each leave their straight ways between two times [s], (obstacles,)."""
-        times, found = np.linspace(start, end, 9), np.zeros(len(self.each))
+    def path_deviations(self, start: float, end: float) -> Array:
+        """Largest deviation [m] of each obstacle's paths from straight lines between two times [s],
+        (obstacles,).
+        """
+        times, out = np.linspace(start, end, 9), np.zeros(len(self.each))
         for number, each in enumerate(self.each):
             if each.motion is not None:
                 first, *between, last = (each.positions(time) for time in times)
-                way = last - first
-                square = np.maximum(np.sum(way * way, axis=1, keepdims=True), np.finfo(float).tiny)
-                for at in between:
-                    part = np.clip(np.sum((at - first) * way, axis=1, keepdims=True) / square, 0.0, 1.0)
-                    off = np.linalg.norm(at - first - part * way, axis=1).max(initial=0.0)
-                    found[number] = max(found[number], float(off))
-        return found
+                chord = last - first
+                square = np.maximum(np.sum(chord * chord, axis=1, keepdims=True), np.finfo(float).tiny)
+                for x in between:
+                    t = np.clip(np.sum((x - first) * chord, axis=1, keepdims=True) / square, 0.0, 1.0)
+                    deviation = np.linalg.norm(x - first - t * chord, axis=1).max(initial=0.0)
+                    out[number] = max(out[number], float(deviation))
+        return out
 
-    def moved(self, start: float, end: float) -> list[tuple[Array, Array]]:
+    def rigid_motions(self, start: float, end: float) -> list[tuple[Array, Array]]:
         """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
         if not self.moving:
-            return self._stays
-        found = []
+            return self._at_rest
+        motions = []
         for each in self.each:
-            (turn, way), (later, there) = each.displacement(start), each.displacement(end)
-            rotation = later @ turn.T
-            found.append((rotation, there - rotation @ way))
-        return found
+            (r0, t0), (r1, t1) = each.displacement(start), each.displacement(end)
+            rotation = r1 @ r0.T
+            motions.append((rotation, t1 - rotation @ t0))
+        return motions
 
     def contact_displacements(
-        self, x: Array, points: Ints, beta: Array, obstacle: Ints, moved: list[tuple[Array, Array]]
+        self, x: Array, points: Ints, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
     ) -> Array:
-        """How far (m, 3) [m] obstacles moved where pairs with points and β (m, 4) touch them at positions x
-        (n_local, 3), times Σ β_i of the sheet's points; 0 of pairs between sheets, with an obstacle −1.
+        """Displacements (m, 3) [m] of obstacles at their contacts, times Σ β_i of the sheet's points.
+
+        ``points``, ``beta`` (m, 4) and ``obstacle`` (m,) are the pairs at positions x (n_local, 3) after the
+        ``motions``; 0 for pairs between sheets, whose obstacle is −1.
         """
         out = np.zeros((len(points), 3))
-        for number, (turn, way) in enumerate(moved if self.moving else []):
-            mine = np.flatnonzero(obstacle == number)
-            part = np.where(points[mine] >= 0, beta[mine], 0.0)
-            side = part.sum(axis=1, keepdims=True)
-            foot = np.einsum("ei,eik->ek", part, x[np.maximum(points[mine], 0)]) / side
-            out[mine] = side * (foot - (foot - way) @ turn)  # where it is now, less where it was
+        for number, (rotation, translation) in enumerate(motions if self.moving else []):
+            rows = np.flatnonzero(obstacle == number)
+            sheet_beta = np.where(points[rows] >= 0, beta[rows], 0.0)
+            side = sheet_beta.sum(axis=1, keepdims=True)
+            contact = np.einsum("ei,eik->ek", sheet_beta, x[np.maximum(points[rows], 0)]) / side
+            out[rows] = side * (contact - (contact - translation) @ rotation)
         return out
 
 
 class ContactBarrier(Elastic):
-    """The barrier between all near pairs.
+    """The barrier energy of all near pairs.
 
     Parameters
     ----------
@@ -301,39 +315,39 @@ class ContactBarrier(Elastic):
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
     marks : (F, 4)
-        What is around them, as `surface_shares.rings` has it, and `parts` of their corners.
+        Code of the triangles' surroundings (`surface_shares.rings`) and `area_factors` of their corners.
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
         empty = {"what": np.empty((0, 8)), "number": np.empty((0, 4))}
-        self.obstacles, self.itself, self.static = Obstacles([]), True, False
+        self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
-        self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
+        self._obstacle_x, self._deviations = np.empty((3, 0, 3)), np.zeros(1)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
         self.surface_marks = marks
-        self._room = 0
-        self._extents: tuple[Array, Array] | None = None  # of obstacles in ``_places``
-        self._sheets = SheetSearch(surface.astype(np.int64), uv)
-        self._taken: Ints | None = None  # triangles that the search has
-        self._parts = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
-        self._meeting = Remembered(self._meet)
+        self._capacity = 0
+        self._obstacle_boxes: tuple[Array, Array] | None = None  # of obstacles in ``_obstacle_x``
+        self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
+        self._searched: Ints | None = None  # triangles that the search has
+        self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
+        self._remembered = Remembered(self._find_active)
 
     def set_up(
-        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool, static: bool
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, self_contact: bool, static: bool
     ) -> None:
-        """Take what all ranks know alike; before anything else is asked.
+        """Take the data that are the same on all ranks; must be called first.
 
-        ``itself`` says whether sheets meet sheets, ``static`` whether an equilibrium is sought.
+        ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
         """
         self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat)
-        self.itself, self.static = itself, static
+        self.self_contact, self.static = self_contact, static
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
-        self.approach_limit = (EDGES if itself else 1.0) * barrier.gap + self.skin
-        self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
+        self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
+        self._obstacle_x = self._next_obstacle_x = np.stack([self.obstacles.positions(0.0)] * 3)
         self.stale = False
-        self._bulge, self._extents = np.zeros(1), None
+        self._deviations, self._obstacle_boxes = np.zeros(1), None
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
@@ -343,44 +357,48 @@ class ContactBarrier(Elastic):
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
-        self._k = self.barrier.stiffness / PARTS * what[:, 7]
-        self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
-        self._meeting = Remembered(self._meet)
-        self._foreseen = np.full(self.n_elements, np.nan)
-        farthest = np.append(np.abs(self._places).max(axis=(0, 2)), 0.0)
-        theirs = farthest[np.where(self.points < 0, ~self.points, -1)]
-        self._far = np.maximum(np.abs(self.offset), theirs.max(axis=1))
+        self._stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
+        self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
+        self._remembered = Remembered(self._find_active)
+        self._expected = np.full(self.n_elements, np.nan)
+        largest = np.append(np.abs(self._obstacle_x).max(axis=(0, 2)), 0.0)
+        of_points = largest[np.where(self.points < 0, ~self.points, -1)]
+        self._largest_coordinate = np.maximum(np.abs(self.offset), of_points.max(axis=1))
         self._springs: Springs | None = None
 
-    def _between_others(self) -> NDArray[np.bool_]:
-        """Pairs (E,) that see to what vertices of sheets and triangles do not: edges of sheets, and edges and
-        points of obstacles where their triangles are smooth.
+    def _are_secondary(self) -> NDArray[np.bool_]:
+        """Which pairs (E,) have the gap `EDGE_GAP`: two edges of sheets, and edges and points of obstacles
+        where their triangles are smooth.
         """
-        of, points = self.obstacles, self.points
+        obstacles, points = self.obstacles, self.points
         out: NDArray[np.bool_] = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
         corners = np.flatnonzero((self.kind == VERTEX_TRIANGLE) & (points[:, 0] < 0))
-        out[corners] = of.smooth_points[~points[corners, 0]]
+        out[corners] = obstacles.smooth_points[~points[corners, 0]]
         edges = np.flatnonzero((self.kind == EDGE_EDGE) & (self.obstacle >= 0))
         ends = np.sort(~points[edges, 2:], axis=1)
-        keys = ends[:, 0] * of.n_points + ends[:, 1]
-        places = np.searchsorted(of.smooth_edges, keys), np.searchsorted(of.smooth_edges, keys, side="right")
-        out[edges] = places[0] < places[1]
+        keys = ends[:, 0] * obstacles.n_points + ends[:, 1]
+        rows = (
+            np.searchsorted(obstacles.smooth_edges, keys),
+            np.searchsorted(obstacles.smooth_edges, keys, side="right"),
+        )
+        out[edges] = rows[0] < rows[1]
         return out
 
     # -- obstacles ---------------------------------------------------------------------------------
 
-    def freeze(self, step: UpcomingStep) -> Places:
+    def freeze(self, step: UpcomingStep) -> ObstaclePositions:
         if not self.moving:
-            before, now, after = self._places
-            moved = self.obstacles.moved(step.start, step.at)
-            return Places(before, now, after, moved, moved)
-        before, now, after = (self.obstacles.at(time) for time in (step.start, step.at, step.end))
-        self._swept = np.stack([before, now, after])
-        moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
-        self.stale = bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
-        self._bulge = self.obstacles.bulges(step.start, step.end)
-        ways = (self.obstacles.moved(step.start, time) for time in (step.at, step.end))
-        return Places(before, now, after, *ways)
+            start, stage, end = self._obstacle_x
+            at_rest = self.obstacles.rigid_motions(step.start, step.at)
+            return ObstaclePositions(start, stage, end, at_rest, at_rest)
+        times = step.start, step.at, step.end
+        self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in times])
+        largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
+        self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and len(self.obstacles.planes) > 0))
+        self._deviations = self.obstacles.path_deviations(step.start, step.end)
+        start, stage, end = self._next_obstacle_x
+        motions = (self.obstacles.rigid_motions(step.start, time) for time in times[1:])
+        return ObstaclePositions(start, stage, end, *motions)
 
     @property
     def moving(self) -> bool:
@@ -388,29 +406,35 @@ class ContactBarrier(Elastic):
 
     # -- search ------------------------------------------------------------------------------------
 
-    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
+    def neighbours(
+        self, x: Array, displacement: Array, numbers: Ints, triangles: Ints
+    ) -> tuple[Ints, Ints] | None:
         if self.moving:
-            self._places, self._extents = self._swept, None
+            self._obstacle_x, self._obstacle_boxes = self._next_obstacle_x, None
         self.stale = False
-        if triangles is not self._taken:
-            self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
-            self._parts = np.full(len(x) + 1, PARTS)  # the last one of what is no vertex
-            self._parts[triangles[:, :3]] = triangles[:, 4:]
-            self._taken = triangles
-        boxes = self._sheets.boxes(x, way)
-        most = max(MANY, MANY_PER_VERTEX * len(x)) if way.any() and not self.static else np.inf
+        if triangles is not self._searched:
+            self._sheet_search.take(x, numbers, triangles[:, :3], triangles[:, 3])
+            self._vertex_units = np.full(
+                len(x) + 1, AREA_UNITS
+            )  # the last one for pairs without such a vertex
+            self._vertex_units[triangles[:, :3]] = triangles[:, 4:]
+            self._searched = triangles
+        dx, limit = displacement, np.inf
+        if dx.any() and not self.static:
+            limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
+        boxes = self._sheet_search.boxes(x, dx)
         found = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.each:
-            found += self._at_obstacles(x, way, boxes)
-        if self.itself:
-            reach = self.search_distance
-            edges = reach - (1.0 - EDGES) * self.barrier.gap
-            of_sheets = self._sheets.pairs(x, way, numbers, reach, edges, boxes, most)
-            if of_sheets is None:
+            found += self._obstacle_pairs(x, dx, boxes)
+        if self.self_contact:
+            radius = self.search_distance
+            edge_radius = radius - (1.0 - EDGE_GAP) * self.barrier.gap
+            pairs = self._sheet_search.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
+            if pairs is None:
                 return None
-            found.append(of_sheets)
+            found.append(pairs)
         every = np.concatenate(found)
-        if len(every) > most:
+        if len(every) > limit:
             return None
         if not len(every):
             return every[:, :4], every
@@ -418,426 +442,471 @@ class ContactBarrier(Elastic):
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
         vertex = np.where((kind != EDGE_EDGE) & sheet[:, 0], points[:, 0], -1)
-        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], self._parts[vertex]])
+        units = self._vertex_units[vertex]
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units])
         return np.where(sheet, points, first[:, None]), what
 
-    def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints) -> Ints:
-        """Rows of those pairs that may come within the search distance on their ways."""
-        points, found = points.astype(np.int64), np.empty(len(points))
+    def _within_radius(
+        self, x: Array, dx: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints
+    ) -> Ints:
+        """Rows (m, 7) of the pairs that may come within the search distance on displacements dx (N, 3)."""
+        points, bounds = points.astype(np.int64), np.empty(len(points))
         kinds = np.full(len(points), kind)
-        reach = self.search_distance + self.obstacles.radius[obstacle] + self._bulge.max()
-        _, now, after = self._places - self._places[0]
-        farther = np.linalg.norm(after, axis=1) > np.linalg.norm(now, axis=1)
-        theirs = np.where(farther[:, None], after, now)
-        contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
-        return np.column_stack([kinds, obstacle, points, rings])[found < reach]
+        radius = self.search_distance + self.obstacles.radius[obstacle] + self._deviations.max()
+        start = self._obstacle_x[0]
+        _, to_stage, to_end = self._obstacle_x - start
+        farther = np.linalg.norm(to_end, axis=1) > np.linalg.norm(to_stage, axis=1)
+        longer = np.where(farther[:, None], to_end, to_stage)
+        contact_pairs.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
+        return np.column_stack([kinds, obstacle, points, rings])[bounds < radius]
 
-    def _at_obstacles(self, x: Array, way: Array, boxes: Array) -> list[Ints]:
-        """Pairs with obstacles, wherever on their way in the step these are near patches in ``boxes``."""
-        of, sheets = self.obstacles, self._sheets
+    def _obstacle_pairs(self, x: Array, dx: Array, boxes: Array) -> list[Ints]:
+        """Pairs of sheets and obstacles anywhere on their displacements in the step.
+
+        ``boxes`` are those of the patches of sheets (`SheetSearch.boxes`).
+        """
+        obstacles, sheets = self.obstacles, self._sheet_search
         patches = np.minimum(boxes[0], boxes[2]), np.maximum(boxes[1], boxes[3])
         if not len(patches[0]):
             return []
         low, high = patches[0].min(axis=0), patches[1].max(axis=0)
-        reach = self.search_distance + self._bulge.max()
-        places = self._places if self.moving else self._places[:1]
-        found = self._in_containers(x, way, patches, places, reach)
-        if self._extents is None:
-            self._extents = of.extents(places)
-        around = (reach + of.radius[:-1])[:, None]
-        least, most = self._extents
-        near_by = ((least - around <= high) & (most + around >= low)).all(axis=1)
-        if not near_by.any():
+        radius = self.search_distance + self._deviations.max()
+        obstacle_x = self._obstacle_x if self.moving else self._obstacle_x[:1]
+        found = self._container_pairs(x, dx, patches, obstacle_x, radius)
+        if self._obstacle_boxes is None:
+            self._obstacle_boxes = obstacles.bounding_boxes(obstacle_x)
+        margin = (radius + obstacles.radius[:-1])[:, None]
+        lowest, highest = self._obstacle_boxes
+        is_near = ((lowest - margin <= high) & (highest + margin >= low)).all(axis=1)
+        if not is_near.any():
             return found
 
-        def meet(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
-            others = others[near_by[others[:, 3]]]
+        def add_pairs(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
+            others = others[is_near[others[:, 3]]]
             if not len(others):
                 return
-            at = places[:, others[:, :size]]
-            around = (reach + of.radius[others[:, 3]])[:, None]
-            boxes = at.min(axis=(0, 2)) - around, at.max(axis=(0, 2)) + around
-            some = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
-            others, boxes = others[some], (boxes[0][some], boxes[1][some])
-            met = near(patches, boxes)
-            if not len(met):
+            swept = obstacle_x[:, others[:, :size]]
+            margin = (radius + obstacles.radius[others[:, 3]])[:, None]
+            boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
+            kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
+            others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
+            near_patches = near(patches, boxes)
+            if not len(near_patches):
                 return
-            corners = sheet.of(np.unique(met[:, 0]))
-            pairs = near(swept_boxes(x, way, corners), boxes)
-            mine, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
-            points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
+            corners = sheet.of(np.unique(near_patches[:, 0]))
+            pairs = near(swept_boxes(x, dx, corners), boxes)
+            own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
+            points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
             rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
-            found.append(self._nearer(x, way, kind, others[pairs[:, 1], 3], points, rings))
+            found.append(self._within_radius(x, dx, kind, others[pairs[:, 1], 3], points, rings))
 
-        meet(VERTEX_TRIANGLE, sheets.vertices, of.triangles, 3, sheet_first=True)
-        meet(VERTEX_TRIANGLE, sheets.triangles, of.points, 1, sheet_first=False)
-        meet(EDGE_EDGE, sheets.edges, of.edges, 2, sheet_first=True)
+        add_pairs(VERTEX_TRIANGLE, sheets.vertices, obstacles.triangles, 3, sheet_first=True)
+        add_pairs(VERTEX_TRIANGLE, sheets.triangles, obstacles.points, 1, sheet_first=False)
+        add_pairs(EDGE_EDGE, sheets.edges, obstacles.edges, 2, sheet_first=True)
         return found
 
-    def _in_containers(
-        self, x: Array, way: Array, patches: tuple[Array, Array], places: Array, reach: float
+    def _container_pairs(
+        self, x: Array, dx: Array, patches: tuple[Array, Array], obstacle_x: Array, radius: float
     ) -> list[Ints]:
-        """Pairs of vertices with planes, and of vertices inside with segments."""
+        """Pairs of vertices and planes, and of vertices in balls and capsules and the axis segments."""
         found = []
         for kind, others in ((VERTEX_PLANE, self.obstacles.planes), (VERTEX_INSIDE, self.obstacles.segments)):
             if not len(others):
                 continue
             low, high = patches[0].min(axis=0, keepdims=True), patches[1].max(axis=0, keepdims=True)
-            # distances differ no more than points are apart
-            for least, most in ((low, high), patches):
-                half = 0.5 * np.linalg.norm(most - least, axis=1)
-                close = self._close(0.5 * (least + most), kind, others, places, reach + half)
+            # distances of two points from a plane or segment differ at most by the points' distance
+            for lower, upper in ((low, high), patches):
+                half_diagonal = 0.5 * np.linalg.norm(upper - lower, axis=1)
+                close = self._is_close(
+                    0.5 * (lower + upper), kind, others, obstacle_x, radius + half_diagonal
+                )
                 others = others[close.any(axis=0)]
                 if not len(others):
                     break
             else:
-                single = self._sheets.vertices.of(np.flatnonzero(close.any(axis=1)))[:, 0]
+                single = self._sheet_search.vertices.of(np.flatnonzero(close.any(axis=1)))[:, 0]
                 close = np.zeros((len(single), len(others)), dtype=np.bool_)
-                for at in (x, x + way):  # along straight ways these distances are least at an end
-                    close |= self._close(at[single], kind, others, places, reach)
+                for end in (x, x + dx):  # along straight ways these distances are lower end an end
+                    close |= self._is_close(end[single], kind, others, obstacle_x, radius)
                 number, plane = np.nonzero(close)
                 points = np.column_stack([single[number], ~others[plane, :3]])
-                rest = np.zeros(len(points), dtype=np.int64)
-                found.append(np.column_stack([rest + kind, others[plane, 3], points, rest]))
+                zeros = np.zeros(len(points), dtype=np.int64)
+                found.append(np.column_stack([zeros + kind, others[plane, 3], points, zeros]))
         return found
 
-    def _close(
-        self, points: Array, kind: int, others: Ints, places: Array, reach: float | Array
+    def _is_close(
+        self, points: Array, kind: int, others: Ints, obstacle_x: Array, radius: float | Array
     ) -> NDArray[np.bool_]:
-        """Which of points (n, 3) [m] are within reach [m] of planes or segments (m, 5), (n, m)."""
+        """Whether points (n, 3) [m] are within radius [m] of planes or segments (m, 5), (n, m)."""
         n, m = len(points), len(others)
         pairs = np.column_stack([np.repeat(np.arange(n), m), np.tile(~others[:, :3], (n, 1))])
-        kinds, out, least = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
-        for at in places:
-            contact_pairs.distances(points, at, kinds, pairs, out)
-            least = np.minimum(least, out.reshape(n, m))
-        least -= self.obstacles.radius[others[:, 3]]
-        return least < np.reshape(reach, (-1, 1))
+        kinds, out, smallest = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
+        for positions in obstacle_x:
+            contact_pairs.distances(points, positions, kinds, pairs, out)
+            smallest = np.minimum(smallest, out.reshape(n, m))
+        smallest -= self.obstacles.radius[others[:, 3]]
+        return smallest < np.reshape(radius, (-1, 1))
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def meeting(self, x: Array, places: Array) -> Meeting:
-        """What is nearer than the gap at positions x (n_local, 3) [m] and obstacles' points (m, 3) [m]."""
+    def active_pairs(self, x: Array, obstacle_x: Array) -> ActivePairs:
+        """The pairs nearer than the gap for positions x (n_local, 3) [m] and obstacle_x (m, 3) [m]."""
         if not self.n_elements:
-            return NOTHING
-        return Meeting(*self._meeting(np.concatenate([x, places])))
+            return NO_PAIRS
+        return ActivePairs(*self._remembered(np.concatenate([x, obstacle_x])))
 
-    def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
-        x, places = np.split(points, [len(points) - self.obstacles.n_points])
-        least = np.empty(self.n_elements)
-        of = *self._of_pairs, self.shares, self.n_owned
+    def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
+        x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
+        lower_bound = np.empty(self.n_elements)
+        data = *self._pair_data, self.shares, self.n_owned
         while True:
-            room = self._room
-            numbers = np.empty(room, dtype=np.int64), *np.empty((2, room))
-            found = *numbers, np.empty((room, 4)), np.empty(room), np.empty((room, 5))
-            met = contact_pairs.meeting(x, places, *of, least, found)
-            if met <= room:
-                return least, *(part[:met] for part in found)
-            self._room = met + met // 4
+            capacity = self._capacity
+            integers = np.empty(capacity, dtype=np.int64), *np.empty((2, capacity))
+            found = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 5))
+            active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, found)
+            if active <= capacity:
+                return lower_bound, *(part[:active] for part in found)
+            self._capacity = active + active // 4
 
     @property
-    def _of_pairs(self) -> tuple[Any, ...]:
-        """Kinds, points, offsets, gaps, and constants of the barrier."""
-        return self.kind, self.points, self.offset, self.gap, self._k, self.barrier.parallel
+    def _geometry(self) -> tuple[Ints, Ints, Array, Array]:
+        """Kinds, points, offsets and gaps of the pairs: arguments of kernels."""
+        return self.kind, self.points, self.offset, self.gap
 
-    def energies(self, x: Array, frozen: Places) -> Array:
+    @property
+    def _pair_data(self) -> tuple[Any, ...]:
+        """Also their stiffness, and `Barrier.parallel`."""
+        return *self._geometry, self._stiffness, self.barrier.parallel
+
+    def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         if not self.n_elements:
-            return _NONE
-        met = self.meeting(x, frozen.now)
-        counts = met.counted != 0.0  # these are among the owned pairs, as they come first
-        energies = (met.counted * met.energy)[counts]
-        return np.bincount(met.at[counts], energies, minlength=self.n_owned).astype(np.float64)
+            return _EMPTY
+        active = self.active_pairs(x, frozen.stage)
+        counted = active.owned_weight != 0.0  # only owned pairs, which come first
+        energies = (active.owned_weight * active.energy)[counted]
+        return np.bincount(active.pair[counted], energies, minlength=self.n_owned).astype(np.float64)
 
-    def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: ObstaclePositions, out: Array) -> None:
         if not self.n_elements:
             return
-        met, pull = self.meeting(x, frozen.now), np.zeros_like(frozen.now)
-        given = met.at, met.weight, met.beta, met.felt
-        contact_pairs.add_gradient(x, frozen.now, *self._of_pairs, given, out, pull)
+        active, on_obstacles = self.active_pairs(x, frozen.stage).forces, np.zeros_like(frozen.stage)
+        contact_pairs.add_gradient(x, frozen.stage, *self._pair_data, active, out, on_obstacles)
 
-    def active_elements(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
+    def active_elements(self, x: Array, frozen: ObstaclePositions) -> NDArray[np.bool_]:
         out = np.zeros(self.n_elements, dtype=np.bool_)
         if self.n_elements:
-            out[self.meeting(x, frozen.now).at] = True
+            out[self.active_pairs(x, frozen.stage).pair] = True
             if self._springs is not None:
-                out[self._springs.at] = True
+                out[self._springs.pair] = True
         return out
 
     def add_hessian(
         self,
         x: Array,
-        frozen: Places,
+        frozen: ObstaclePositions,
         blend: float,
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        met, at = self.meeting(x, frozen.now), offsets[self.name]
-        given = met.at, weight[met.at] * met.weight, met.beta, met.felt
-        contact_pairs.add_hessians(x, frozen.now, *self._of_pairs, given, blend, at, values)
+        pair, pair_weight, beta, derivatives = self.active_pairs(x, frozen.stage).forces
+        active = pair, weight[pair] * pair_weight, beta, derivatives
+        own = offsets[self.name]
+        contact_pairs.add_hessians(x, frozen.stage, *self._pair_data, active, blend, own, values)
 
-    def largest_stiffness(self, x: Array, frozen: Places) -> float:
-        """Largest stiffness b″ [N/m] of a counted contact, by as many pairs as it counts for."""
-        met = self.meeting(x, frozen.now)
-        return float((met.counted * met.stiffness).max(initial=0.0))
+    def largest_stiffness(self, x: Array, frozen: ObstaclePositions) -> float:
+        """Largest b″ [N/m] of an active pair times its weight on this rank."""
+        active = self.active_pairs(x, frozen.stage)
+        return float((active.owned_weight * active.stiffness).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        return HALFWAY * self._k * size
+        return HALFWAY_CURVATURE * self._stiffness * size
 
-    def stiffness(self, x: Array, frozen: Places) -> Array:
-        met, out = self.meeting(x, frozen.now), np.zeros(self.n_elements)
-        pressed = np.maximum(met.weight, met.counted) * met.stiffness
-        out[met.at] = np.maximum(pressed, HALFWAY * self._k[met.at])
+    def stiffness(self, x: Array, frozen: ObstaclePositions) -> Array:
+        active, out = self.active_pairs(x, frozen.stage), np.zeros(self.n_elements)
+        stiffness = np.maximum(active.weight, active.owned_weight) * active.stiffness
+        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self._stiffness[active.pair])
         return out
 
     def sizes(self, size: float) -> Array:
-        return np.maximum(size, self._far)
+        return np.maximum(size, self._largest_coordinate)
 
-    def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
+    # -- limits and corrections of Newton's increments ---------------------------------------------
+
+    def largest_step(self, x: Array, increment: Array, frozen: ObstaclePositions) -> float:
         if not self.n_elements:
             return 1.0
-        still = np.zeros_like(frozen.now)
-        left, nearer = self.meeting(x, frozen.now).least, contact_pairs.approach(way, still)
-        at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
-        pairs = self.kind[at], self.points[at], self.offset[at], self.gap[at]
-        return float(contact_pairs.free_fraction(x, frozen.now, way, still, *pairs, KEPT, 1.0))
+        at_rest = np.zeros_like(frozen.stage)
+        approach = contact_pairs.largest_approach(increment, at_rest)
+        near = np.flatnonzero(
+            approach > (1.0 - KEPT_FRACTION) * self.active_pairs(x, frozen.stage).lower_bound
+        )
+        pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
+        return float(contact_pairs.free_fraction(x, frozen.stage, increment, at_rest, *pairs))
 
-    def springs(self, x: Array, way: Array, frozen: Places) -> Springs:
-        met, room = self.meeting(x, frozen.now), self._room
-        given = met.at, met.weight, met.counted, met.beta, met.felt
+    def springs(self, x: Array, increment: Array, frozen: ObstaclePositions) -> Springs:
+        active, capacity = self.active_pairs(x, frozen.stage), self._capacity
+        given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
-            numbers = np.empty(room, dtype=np.int64)
-            found = numbers, np.empty((room, 4)), np.empty((room, 3)), *np.empty((3, room))
-            pairs = *self._of_pairs, given, self.n_owned
-            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, found)
-            if n <= room:
+            integers = np.empty(capacity, dtype=np.int64)
+            found = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
+            pairs = *self._pair_data, given, self.n_owned
+            n_active, n = contact_pairs.find_springs(x, frozen.stage, increment, *pairs, found)
+            if n <= capacity:
                 break
-            room = n
-        at, beta, normal, scale, length, counts = (part[:n] for part in found)
-        acts = np.arange(n) < touch
-        self._springs = Springs(at, self.points[at], beta, normal, scale, self.gap[at], length, counts, acts)
+            capacity = n
+        pair, beta, normal, scale, length, counted = (part[:n] for part in found)
+        springs = self.points[pair], beta, normal, scale, self.gap[pair], length, counted
+        self._springs = Springs(pair, *springs, np.arange(n) < n_active)
         return self._springs
 
     def release_springs(self, length: Array | None) -> None:
-        self._foreseen[:] = np.nan
+        self._expected[:] = np.nan
         if length is not None and self._springs is not None:
-            self._foreseen[self._springs.at] = self._springs.law(length)[0] / self._springs.scale
+            self._expected[self._springs.pair] = self._springs.law(length)[0] / self._springs.scale
         self._springs = None
 
-    def target_distances(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:
-        aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
-        pairs, presses = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements, np.bool_)
-        contact_pairs.target_distances(
-            x, frozen.now, way, *pairs, TOUCHES, self._foreseen, aim, before, presses
-        )
-        return aim, before, presses
+    def target_distances(
+        self, x: Array, increment: Array, frozen: ObstaclePositions
+    ) -> tuple[NDArray[Any], ...]:
+        n, pairs = self.n_elements, (*self._geometry, TARGET_FRACTION, self._expected)
+        targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
+        contact_pairs.target_distances(x, frozen.stage, increment, *pairs, *targets)
+        return targets
 
     def add_corrections(
         self,
         x: Array,
-        way: Array,
-        frozen: Places,
+        increment: Array,
+        frozen: ObstaclePositions,
         targets: tuple[NDArray[Any], ...],
         out: Array,
-        count: Array,
+        weight: Array,
     ) -> bool:
-        pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.add_corrections(x, frozen.now, way, *pairs, *targets, SHORT, out, count))
+        pairs = *self._geometry, *targets, TARGET_TOLERANCE
+        return bool(contact_pairs.add_corrections(x, frozen.stage, increment, *pairs, out, weight))
 
-    def is_collision_free(self, x: Array, way: Array, frozen: Places, part: StepInterval) -> bool:
+    # -- collisions --------------------------------------------------------------------------------
+
+    def is_collision_free(
+        self, x: Array, displacement: Array, frozen: ObstaclePositions, interval: StepInterval
+    ) -> bool:
         if not self.n_elements:
             return True
-        bent = np.flatnonzero(self._bulge > BULGE * self.barrier.gap)
-        if len(bent) and np.isin(self.obstacle, bent).any():
+        curved = np.flatnonzero(self._deviations > MAX_DEVIATION * self.barrier.gap)
+        if len(curved) and np.isin(self.obstacle, curved).any():
             return False
-        pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.free_fraction(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
+        motion = _displacements(frozen, interval, displacement)
+        return bool(contact_pairs.free_fraction(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
 
-    def distances(self, x: Array, others: Array) -> Array:
-        """Distance less thickness and radius [m] of all pairs, (E,)."""
+    def distances(self, x: Array, obstacle_x: Array) -> Array:
+        """Distance less offset [m] of all pairs, (E,), with points of obstacles at obstacle_x (m, 3)."""
         out = np.empty(self.n_elements)
-        contact_pairs.distances(x, others, self.kind, self.points, out)
+        contact_pairs.distances(x, obstacle_x, self.kind, self.points, out)
         return out - self.offset
 
-    def gaps(self, x: Array, frozen: Places) -> Array:
-        return self.distances(x, frozen.now)[: self.n_owned]
+    def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
+        return self.distances(x, frozen.stage)[: self.n_owned]
 
-    def collision_free_fractions(self, x: Array, way: Array, frozen: Places, part: StepInterval) -> Array:
-        pairs, out = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_owned)
-        contact_pairs.free_fractions(x, *_during(frozen, part, way), *pairs, KEPT, out)
+    def _free_fractions(
+        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval, n: int
+    ) -> Array:
+        """The collision-free fractions (n,) of the first pairs alone."""
+        out = np.empty(n)
+        motion = _displacements(frozen, interval, dx)
+        contact_pairs.free_fractions(x, *motion, *self._geometry, KEPT_FRACTION, out)
         return out
 
-    def may_collide(self, x: Array, way: Array, frozen: Places, far: float) -> bool:
-        pairs = self.kind, self.points, self.offset, self.gap
-        return bool(contact_pairs.may_collide(x, *_during(frozen, StepInterval(0.0, 1.0), way), *pairs, far))
+    def collision_free_fractions(
+        self, x: Array, displacement: Array, frozen: ObstaclePositions, interval: StepInterval
+    ) -> Array:
+        return self._free_fractions(x, displacement, frozen, interval, self.n_owned)
+
+    def may_collide(self, x: Array, displacement: Array, frozen: ObstaclePositions, threshold: float) -> bool:
+        motion = _displacements(frozen, TO_STAGE, displacement)
+        return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
 
     def pair(self, element: int) -> Pair:
-        points, begins = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
-        parts = (tuple(points[:begins]), tuple(points[begins:]))
+        points, n_first = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
+        parts = (tuple(points[:n_first]), tuple(points[n_first:]))
         number = int(self.obstacle[element])
         name = self.obstacles.each[number].name if number >= 0 else ""
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
 
-    def _pushed(self, x: Array, places: Array) -> Iterator[tuple[int, Array]]:
-        """Obstacles, and the forces (n_local, 3) [N] of the sheets on each by the counted pairs."""
-        met = self.meeting(x, places)
-        number = self.obstacle[met.at]
+    # -- obstacles that move, and forces on them ---------------------------------------------------
+
+    def _obstacle_gradients(self, x: Array, obstacle_x: Array) -> Iterator[tuple[int, Array]]:
+        """Numbers of obstacles in contact, and for each the forces (n_local, 3) [N] of this rank's pairs on
+        it.
+        """
+        active = self.active_pairs(x, obstacle_x)
+        number = self.obstacle[active.pair]
         for obstacle in np.unique(number[number >= 0]):
-            of = np.flatnonzero((number == obstacle) & (met.counted != 0.0))
-            gradient, pull = np.zeros_like(x), np.zeros_like(places)
-            given = unwritable(met.at[of], met.counted[of], met.beta[of], met.felt[of])
-            contact_pairs.add_gradient(x, places, *self._of_pairs, given, gradient, pull)
+            rows = np.flatnonzero((number == obstacle) & (active.owned_weight != 0.0))
+            gradient, on_obstacles = np.zeros_like(x), np.zeros_like(obstacle_x)
+            arrays = active.pair, active.owned_weight, active.beta, active.derivatives
+            given = unwritable(*(array[rows] for array in arrays))
+            contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, given, gradient, on_obstacles)
             yield int(obstacle), gradient
 
-    def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
+    def obstacle_forces(self, x: Array, frozen: ObstaclePositions, count: int) -> Array:
         out = np.zeros((count, 6))
-        for obstacle, force in self._pushed(x, frozen.now):
+        for obstacle, force in self._obstacle_gradients(x, frozen.stage):
             out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         return out
 
     pushes = True
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
-        back, on, done = self.obstacles.moved(at, start), self.obstacles.moved(at, end), 0.0
-        for obstacle, force in self._pushed(x, self.obstacles.at(at)):
-            (turn, way), (further, there) = back[obstacle], on[obstacle]
-            done -= float(np.vdot(force, x @ (further - turn).T + there - way))
-        return done
+        to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
+        work = 0.0
+        for obstacle, force in self._obstacle_gradients(x, self.obstacles.positions(at)):
+            (r0, t0), (r1, t1) = to_start[obstacle], to_end[obstacle]
+            work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
+        return work
 
-    def moved_with_obstacles(self, x: Array, way: Array, frozen: Places) -> Array:
+    def moved_with_obstacles(self, x: Array, displacement: Array, frozen: ObstaclePositions) -> Array:
         if not self.moving:
-            return way
-        pairs, free = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements)
-        contact_pairs.free_fractions(x, *_during(frozen, StepInterval(0.0, 1.0), way), *pairs, KEPT, free)
-        taken = way.copy()
-        for number, (turn, there) in enumerate(frozen.moved):
-            with_it = x @ turn.T + there - x
-            points = self.points[(free < 1.0) & (self.obstacle == number)]
+            return displacement
+        blocked = self._free_fractions(x, displacement, frozen, TO_STAGE, self.n_elements) < 1.0
+        moved = displacement.copy()
+        for number, (rotation, translation) in enumerate(frozen.stage_motions):
+            points = self.points[blocked & (self.obstacle == number)]
             points = np.unique(points[points >= 0])
-            taken[points] = with_it[points]
-        blocked = (free < 1.0) & (self.obstacle < 0)
-        for points in self.points[blocked]:  # sheets push each other
-            pushed = (taken[points] != way[points]).any(axis=1)
-            if pushed.any():
-                taken[points[~pushed]] = taken[points[pushed]][0]
-        return taken
+            moved[points] = (x @ rotation.T + translation - x)[points]
+        for points in self.points[blocked & (self.obstacle < 0)]:  # a moved sheet moves the next one
+            changed = (moved[points] != displacement[points]).any(axis=1)
+            if changed.any():
+                moved[points[~changed]] = moved[points[changed]][0]
+        return moved
 
-    def find_contacts(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
-        """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of what touches among the
-        first ``counted`` pairs; none that is as near as another, of a vertex of a sheet, and of others all.
+    # -- contact forces ----------------------------------------------------------------------------
+
+    def find_contacts(self, x: Array, obstacle_x: Array, n_counted: int) -> tuple[NDArray[Any], ...]:
+        """The pairs with a contact force among the first ``n_counted``.
+
+        Returns β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers of the pairs (m,). For a
+        vertex of a sheet, pairs with the same nearest vertices occur once; all other pairs are returned
+        singly.
         """
-        met = self.meeting(x, places)
-        room = len(met.at) + counted
-        found = np.empty((room, 4)), np.empty((room, 3)), np.empty(room), np.empty(room, dtype=np.int64)
-        given = met.at, met.weight, met.beta, met.felt
-        n = contact_pairs.find_contacts(x, places, *self._of_pairs, met.least, given, counted, found)
-        beta, normal, force, at = (part[:n] for part in found)
+        active = self.active_pairs(x, obstacle_x)
+        n = len(active.pair) + n_counted
+        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
+        given = active.lower_bound, active.forces, n_counted
+        n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
+        beta, normal, force, pair = (part[:n] for part in found)
         if (force < 0.0).any():
-            contact_pairs.share_negative(self.kind[at], self.points[at, 0], normal, force)
-        keeps = force > 0.0
-        return beta[keeps], normal[keeps], force[keeps], at[keeps]
+            contact_pairs.cancel_negative_forces(self.kind[pair], self.points[pair, 0], normal, force)
+        kept = force > 0.0
+        return beta[kept], normal[kept], force[kept], pair[kept]
 
-    def vertex_of(self, at: Ints) -> Ints:
-        """The vertex of a sheet that each of pairs (m,) is of, −1 of edges and of points of obstacles."""
-        of_vertex = (self.kind[at] != EDGE_EDGE) & (self.points[at, 0] >= 0)
-        return np.where(of_vertex, self.points[at, 0], -1)
+    def vertex_of(self, pair: Ints) -> Ints:
+        """The vertex of a sheet in each of pairs (m,), −1 for pairs of edges and of points of obstacles."""
+        has_vertex = (self.kind[pair] != EDGE_EDGE) & (self.points[pair, 0] >= 0)
+        return np.where(has_vertex, self.points[pair, 0], -1)
 
-    def contact_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
-        beta, normal, force, at = self.find_contacts(x, frozen.now, self.n_owned)
-        return self.points[at], beta, normal, force, self.vertex_of(at)
+    def contact_points(self, x: Array, frozen: ObstaclePositions) -> tuple[Ints, Array, Array, Array, Ints]:
+        beta, normal, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        return self.points[pair], beta, normal, force, self.vertex_of(pair)
 
-    def dashpots(self, x: Array, frozen: Places) -> Dashpots:
-        met = self.meeting(x, frozen.after)
-        square = met.square
-        of = np.flatnonzero((met.weight > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
-        at, square, beta = met.at[of], square[of], met.beta[of]
-        normal = met.felt[of, :3] / np.sqrt(square)[:, None]
-        stiffness = met.weight[of] * met.felt[of, 4] * square
-        points, obstacle = self.points[at], self.obstacle[at]
-        moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.moved_on)
+    def dashpots(self, x: Array, frozen: ObstaclePositions) -> Dashpots:
+        active = self.active_pairs(x, frozen.end)
+        square = active.square
+        rows = np.flatnonzero((active.weight > 0.0) & (square > 0.0) & np.isfinite(active.derivatives[:, 4]))
+        pair, square, beta = active.pair[rows], square[rows], active.beta[rows]
+        normal = active.derivatives[rows, :3] / np.sqrt(square)[:, None]
+        stiffness = active.weight[rows] * active.derivatives[rows, 4] * square
+        points, obstacle = self.points[pair], self.obstacle[pair]
+        moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
         pushed = np.einsum("ek,ek->e", moved, normal)
-        return Dashpots(points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed)
+        return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, pushed)
 
-    def normal_forces(self, x: Array, frozen: Places) -> Array:
-        """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this
-        rank counts: only the owner of a vertex knows all that it is shared between.
+    def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
+        """Sum of the normal forces [N] at each local vertex, (n_local,), of the pairs that this rank counts.
+
+        Only the owner of a vertex knows all pairs between which its force is divided.
         """
         out = np.zeros(len(x))
-        beta, _, force, at = self.find_contacts(x, frozen.now, self.n_owned)
-        contact_pairs.add_normal_forces(self.points[at], beta, force, out)
+        beta, _, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        contact_pairs.add_normal_forces(self.points[pair], beta, force, out)
         return out
 
-    def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
-        met, n = self.meeting(x, frozen.now), self.n_owned
-        exact = met.least[:n] < self.gap[:n]
-        smallest = met.least[:n][exact].min(initial=np.inf)
-        may = np.flatnonzero(~exact & (met.least[:n] < smallest))  # it may be more
-        if len(may):
-            left = np.empty(len(may))
-            contact_pairs.distances(x, frozen.now, self.kind[may], self.points[may], left)
-            smallest = min(smallest, (left - self.offset[may]).min())
-        # without friction; else that term's takes its place
-        work = {"friction_work": 0.0}
-        return work | {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
+    def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
+        active, n = self.active_pairs(x, frozen.stage), self.n_owned
+        bound = active.lower_bound[:n]
+        exact = bound < self.gap[:n]
+        smallest = bound[exact].min(initial=np.inf)
+        rows = np.flatnonzero(~exact & (bound < smallest))
+        if len(rows):
+            distance = np.empty(len(rows))
+            contact_pairs.distances(x, frozen.stage, self.kind[rows], self.points[rows], distance)
+            smallest = min(smallest, (distance - self.offset[rows]).min())
+        work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
+        return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
 
 
-def _edges_of(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
-    """Edges (n, 2) of an obstacle's triangles, lower numbers first, and which are sharp: borders, and those
-    with an angle of more than `SHARP`.
+def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
+    """Edges (n, 2) of an obstacle's triangles, lower numbers first, and whether they are sharp: at the
+    boundary, or with an angle above `SHARP_ANGLE`.
     """
     triangles = obstacle.triangles.astype(np.int64).reshape(-1, 3)
     a, b, c = (obstacle.points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    way = np.where(sides[:, :1] < sides[:, 1:], 1.0, -1.0) * np.tile(normal, (3, 1))
+    sign = np.where(sides[:, :1] < sides[:, 1:], 1.0, -1.0)
     edges, number, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
     sums = np.zeros((len(edges), 3))
-    np.add.at(sums, number.ravel(), way)  # of two triangles turned alike: n − n'
-    apart = np.linalg.norm(sums, axis=1)
-    return edges, (count != 2) | (apart > 2.0 * np.sin(0.5 * SHARP))
+    np.add.at(sums, number.ravel(), sign * np.tile(normal, (3, 1)))  # n − n′ of equally oriented triangles
+    difference = np.linalg.norm(sums, axis=1)
+    return edges, (count != 2) | (difference > 2.0 * np.sin(0.5 * SHARP_ANGLE))
 
 
-def _during(frozen: Places, part: StepInterval, way: Array) -> tuple[Array, Array, Array]:
-    """Where obstacles' points stand at the start of a part of the step, the sheets' way, and theirs in it."""
-    begin, end = part
+def _displacements(
+    frozen: ObstaclePositions, interval: StepInterval, displacement: Array
+) -> tuple[Array, Array, Array]:
+    """Positions of obstacles' points at the start of an interval of the step, and the displacements of sheets
+    and of obstacles in it.
+    """
+    begin, end = interval
     if begin >= 1.0:
-        moved = frozen.after - frozen.now
-        return frozen.now + (begin - 1.0) * moved, way, (end - begin) * moved
-    moved = frozen.now - frozen.before
-    return frozen.before + begin * moved, way, (end - begin) * moved
+        moved = frozen.end - frozen.stage
+        return frozen.stage + (begin - 1.0) * moved, displacement, (end - begin) * moved
+    moved = frozen.stage - frozen.start
+    return frozen.start + begin * moved, displacement, (end - begin) * moved
 
 
 def elements(rest: RestShape) -> Elements:
-    """The triangles of the sheets."""
+    """The triangles of the sheets (rank 0)."""
     triangles = rest.mesh.triangles.astype(np.int64)
-    marks = np.column_stack([surface_shares.rings(triangles), parts(triangles, rest.area)])
+    marks = np.column_stack([surface_shares.rings(triangles), area_factors(triangles, rest.area)])
     uv = rest.mesh.triangle_uv.reshape(-1, 6)
     return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
 
 
-def parts(triangles: Ints, area: Array) -> Ints:
-    """Which part of k, in units of 1 / `PARTS`, pairs of the corners of triangles (F, 3) have: their area
-    over that of a vertex inside of a regular mesh with as many triangles as their sheet.
+def area_factors(triangles: Ints, area: Array) -> Ints:
+    """Factors of k, in units of 1 / `AREA_UNITS`, for pairs of the corners of triangles (F, 3): the area of a
+    vertex over its mean in a regular mesh with as many triangles as the sheet.
 
-    So what presses evenly has everywhere the same distance, whatever the size of the triangles. With the mean
-    of all sheets the few vertices of a coarse one would bear most of what lies on it, and friction tremble.
+    An even pressure so leads to the same distance everywhere, whatever the size of the triangles. With the
+    mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
+    and friction would oscillate.
     """
     sheet = np.unique(patches.connected(triangles), return_inverse=True)[1]
     mean = np.bincount(sheet, area) / np.bincount(sheet)
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
-    part = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], LEAST, MOST)
-    return np.rint(PARTS * part).astype(np.int64)
+    factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)
+    return np.rint(AREA_UNITS * factor).astype(np.int64)
 
 
 def barrier(rest: RestShape) -> Barrier:
-    """The numbers of a scene's barrier (rank 0).
+    """The constants of a scene's barrier (rank 0).
 
     Raises
     ------
     InputError
-        A gap that neighbours in the mesh would feel.
+        If the gap is so large that neighbours in the mesh would repel each other.
     """
     scene = rest.scene
     assert scene.contact is not None
@@ -852,11 +921,11 @@ def barrier(rest: RestShape) -> Barrier:
             key="contact",
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
-    stiffness *= max(1.0 / HALFWAY, STRAIN * float(length.mean()) / gap)
+    stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
     return Barrier(gap, thickness, stiffness, PARALLEL, float(length.max()) ** 2 / (8.0 * SAG * gap))
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
-    """The term on one rank; `ContactBarrier.set_up` must follow."""
+    """The term on one rank; `ContactBarrier.set_up` must be called next."""
     uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 4)
     return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))

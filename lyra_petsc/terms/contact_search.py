@@ -13,7 +13,7 @@ from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.near import near_in_order
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.terms.contact_margins import Margins
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distance, speed
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
 
 SPARE = 0.7
 """Over the reach, how much farther simplices of neighbouring patches are looked for: as long as they do not
@@ -315,7 +315,7 @@ def _pairs(  # type: ignore[no-untyped-def]
                     for m in range(4):
                         for k in range(3):
                             w[m, k] = way[points[m], k]
-                    nearer_by = speed(kind, w)
+                    nearer_by = approach_bound(kind, w)
                     longest = ample + nearer_by
                     if (nearer + others[6, b]) ** 2 - left[b - start] >= longest * longest:
                         continue

@@ -26,7 +26,7 @@ from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import friction_pairs
-from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
+from lyra_petsc.terms.contact import HALFWAY_CURVATURE, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, GRIP, SLID
 from lyra_petsc.terms.rest import RestShape
@@ -138,7 +138,7 @@ class CoulombFriction(Elastic):
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._common]
         self._coefficients = np.array(each)
         self._on_obstacles = np.zeros((len(contact.obstacles.each), 6))  # in the last step
-        self._stiffest = HALFWAY * contact.barrier.stiffness
+        self._stiffest = HALFWAY_CURVATURE * contact.barrier.stiffness
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
@@ -220,13 +220,13 @@ class CoulombFriction(Elastic):
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles, part = self._contact.obstacles, 1.0
         start = step.start if self._taken_at is None else self._taken_at
-        end = stage = obstacles.moved(start, step.end)
+        end = stage = obstacles.rigid_motions(start, step.end)
         if step.start < step.at < step.end:
             part = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
-            stage = obstacles.moved(start, step.at)
-        places = obstacles.at(step.end)
-        now = obstacles.at(step.at) if obstacles.moving else places
+            stage = obstacles.rigid_motions(start, step.at)
+        places = obstacles.positions(step.end)
+        now = obstacles.positions(step.at) if obstacles.moving else places
         return ObstacleMoves(step.end, part, stage, end, now, places)
 
     def _along(self, vectors: Array, of: Any = slice(None)) -> Array:

@@ -1,7 +1,7 @@
-"""Springs with the law of a barrier on distances linear in a Newton step: what touches, or may on its way.
+"""One-sided springs with the barrier's force on distances that are linear in a Newton increment.
 
-A spring is δ = δ_0 + Σ_i β_i n · w_i long for ways w_i of its four points, and pushes as the barrier does;
-those of obstacles, with numbers below 0, stand still.
+A spring has the length δ = δ_0 + Σ_i β_i n · w_i for increments w_i of its four points, and pushes with the
+barrier's force at δ. Points of obstacles, whose numbers are negative, do not move.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.terms import contact_pairs
+from lyra_petsc.terms.hinge import scaled
 from lyra_petsc.terms.term import Offsets
 
-BELOW = 0.5
-"""Part of the gap, or of the distance that there is where that is less, below which the law goes on along its
-tangent: linear systems are then no stiffer than the sheet. Forces, and distances for them, are found again by
-what is expected of them."""
+TANGENT_BELOW = 0.5
+"""Part of the gap, or of the present distance if that is less, below which the law is continued by its
+tangent, so that linear systems are not stiffer than the sheet. The barrier's distances follow afterwards from
+the expected forces (`contact_pairs.target_distances`)."""
 
 
 class Springs(NamedTuple):
@@ -29,21 +30,21 @@ class Springs(NamedTuple):
 
     Attributes
     ----------
-    at : (m,) int64
-        Numbers of its elements, one of which may be there several times.
+    pair : (m,) int64
+        Numbers of the term's elements; one may occur several times.
     points : (m, 4) int64
-        Local rows; below 0 of obstacles.
+        Local rows, or points of obstacles (negative).
     beta, normal : (m, 4), (m, 3)
         β and unit normals n.
     scale, gap, length : (m,)
-        How often each counts times the barrier's k [N/m], gap [m] and distance less offset δ [m].
+        Weight times the barrier's k [N/m], gap [m] and distance less offset δ_0 [m].
     counted : (m,)
-        How often each counts for this rank.
+        Weight on this rank over the weight.
     acts : (m,) bool
-        Which are in the term's gradient and Hessian already.
+        Whether the pair is already part of the term's gradient and Hessian.
     """
 
-    at: NDArray[np.int64]
+    pair: NDArray[np.int64]
     points: NDArray[np.int64]
     beta: Array
     normal: Array
@@ -53,51 +54,51 @@ class Springs(NamedTuple):
     counted: Array
     acts: NDArray[np.bool_]
 
-    def longer(self, way: Array) -> Array:
-        """By how much they become longer (m,) [m] on a way (n_local, 3) [m]."""
-        out = np.empty(len(self.at))
-        _lengthen(self.points, self.beta, self.normal, way, out)
+    def elongations(self, increment: Array) -> Array:
+        """Changes of length (m,) [m] for an increment (n_local, 3) [m]."""
+        out = np.empty(len(self.pair))
+        _elongations(self.points, self.beta, self.normal, increment, out)
         return out
 
     @property
-    def _least(self) -> Array:
-        """Lengths (m,) [m] below which the law goes on along its tangent."""
-        return BELOW * np.minimum(self.gap, self.length)
+    def _lower_bound(self) -> Array:
+        """Lengths (m,) [m] below which the law is continued by its tangent."""
+        return TANGENT_BELOW * np.minimum(self.gap, self.length)
 
     def law(self, length: Array) -> tuple[Array, Array]:
-        """Forces (m,) [N] and stiffness (m,) [N/m] at these lengths (m,) [m]."""
-        force, stiffness = np.empty((2, len(self.at)))
-        contact_pairs.law(length, self.gap, self._least, force, stiffness)
+        """Forces (m,) [N] and stiffness (m,) [N/m] at lengths (m,) [m]."""
+        force, stiffness = np.empty((2, len(self.pair)))
+        contact_pairs.spring_forces(length, self.gap, self._lower_bound, force, stiffness)
         return self.scale * force, self.scale * stiffness
 
-    def chords(self, length: Array, force: Array, expected: Array) -> Array:
-        """Slopes (m,) [N/m] of the law from lengths (m,) [m], where it is ``force`` (m,) [N], to where it is
-        what is expected (m,) [N].
+    def secant_stiffness(self, length: Array, force: Array, expected: Array) -> Array:
+        """Slopes (m,) [N/m] of the law from ``force`` (m,) [N] at ``length`` (m,) [m] to the ``expected``
+        force (m,) [N].
         """
-        out = np.empty(len(self.at))
-        contact_pairs.chords(length, self.gap, self._least, force / self.scale, expected / self.scale, out)
+        out, bound, forces = np.empty(len(self.pair)), self._lower_bound, (force, expected)
+        contact_pairs.secant_stiffness(length, self.gap, bound, *(f / self.scale for f in forces), out)
         return self.scale * out
 
     def add_forces(self, size: Array, out: Array) -> None:
-        """Add ``size`` (m,) [N] times the gradients of their lengths to rows of out (n_local, 3)."""
+        """Add ``size`` (m,) [N] times the gradients of the lengths to rows of out (n_local, 3)."""
         _add_forces(self.points, self.beta, self.normal, size, out)
 
     def add_stiffness(self, stiffness: Array, offsets: Offsets, values: Array) -> None:
-        """Add Hessians of springs of a ``stiffness`` (m,) that push and pull to block rows (n_blocks, 3, 3).
+        """Add Hessians of two-sided springs of a ``stiffness`` (m,) [N/m] to block rows (n_blocks, 3, 3).
 
         ``offsets`` (E, 10) are those of the term's elements.
         """
-        _add_stiffness(self.at, self.points, self.beta, self.normal, stiffness, offsets, values)
+        _add_stiffness(self.pair, self.points, self.beta, self.normal, stiffness, offsets, values)
 
 
 @kernel()
-def _lengthen(points, beta, normal, way, out):  # type: ignore[no-untyped-def]
+def _elongations(points, beta, normal, increment, out):  # type: ignore[no-untyped-def]
     for m in range(len(out)):
         out[m] = 0.0
         for i in range(4):
             if points[m, i] >= 0:
                 for k in range(3):
-                    out[m] += beta[m, i] * normal[m, k] * way[Index(points[m, i]), k]
+                    out[m] += beta[m, i] * normal[m, k] * increment[Index(points[m, i]), k]
 
 
 @kernel()
@@ -110,12 +111,12 @@ def _add_forces(points, beta, normal, size, out):  # type: ignore[no-untyped-def
 
 
 @kernel()
-def _add_stiffness(at, points, beta, normal, stiffness, offsets, values):  # type: ignore[no-untyped-def]
+def _add_stiffness(pair, points, beta, normal, stiffness, offsets, values):  # type: ignore[no-untyped-def]
     blocks = values.reshape(-1, 9)
-    for m in range(len(at)):
+    for m in range(len(pair)):
         n = normal[m, 0], normal[m, 1], normal[m, 2]
         for a in range(4):
             for b in range(a, 4):
-                own, to = stiffness[m] * beta[m, a] * beta[m, b], offsets[at[m], (7 - a) * a // 2 + b]
-                if own != 0.0 and points[m, a] >= 0 and points[m, b] >= 0 and to >= 0:
-                    add_outers(blocks, to, 0.0, (((own * n[0], own * n[1], own * n[2]), n),))
+                factor, block = stiffness[m] * beta[m, a] * beta[m, b], offsets[pair[m], (7 - a) * a // 2 + b]
+                if factor != 0.0 and points[m, a] >= 0 and points[m, b] >= 0 and block >= 0:
+                    add_outers(blocks, block, 0.0, ((scaled(factor, n), n),))

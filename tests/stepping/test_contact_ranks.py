@@ -249,7 +249,7 @@ def test_of_ways_through_everything_the_beginning_is_searched(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A step of Newton's method may lead all vertices of a crumpled sheet through each other."""
-    monkeypatch.setattr(contact, "MANY", 0)
+    monkeypatch.setattr(contact, "MAX_PAIRS", 0)
     layers = [grid(0.3, 0.3, 8, 8) | {"transform": {"translate": [0.0, 0.0, 0.02 * n]}} for n in range(12)]
     with Simulation({"mesh": layers, "contact": {"gap": 1e-3}}, comm) as simulation:
         barrier = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))

@@ -150,7 +150,7 @@ def test_a_strip_is_held_by_what_its_normal_forces_allow(
     allowed = (
         MU
         * RADIUS
-        * float(term.find_contacts(system.x, system.active.frozen[term].now, term.n_owned)[2].sum())
+        * float(term.find_contacts(system.x, system.active.frozen[term].stage, term.n_owned)[2].sum())
     )
     simulation.destroy()
     assert newton < 250

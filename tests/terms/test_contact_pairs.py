@@ -11,7 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.terms import contact_pairs, surface_shares
-from lyra_petsc.terms.contact_pairs import CLOSE, EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact_pairs import (
+    CCD_TOLERANCE,
+    EDGE_EDGE,
+    VERTEX_INSIDE,
+    VERTEX_PLANE,
+    VERTEX_TRIANGLE,
+)
 from lyra_petsc.terms.remembered import unwritable
 
 Array = NDArray[np.float64]
@@ -24,12 +30,12 @@ NOWHERE = 1e-9
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of one kind, whose points are in ``x`` or, for obstacles, in ``others``."""
+    """Pairs of one kind, whose points are in ``x`` or, for obstacles, in ``obstacle_x``."""
 
     kind: Ints
     points: Ints
     x: Array
-    others: Array
+    obstacle_x: Array
     offset: Array
 
     def __len__(self) -> int:
@@ -39,25 +45,25 @@ class Pairs:
     def places(self) -> Array:
         """(n, 4, 3)"""
         at = self.points
-        if not len(self.others):
+        if not len(self.obstacle_x):
             return np.asarray(self.x[at])
-        return np.where((at >= 0)[:, :, None], self.x[np.maximum(at, 0)], self.others[np.maximum(~at, 0)])
+        return np.where((at >= 0)[:, :, None], self.x[np.maximum(at, 0)], self.obstacle_x[np.maximum(~at, 0)])
 
     def part(self, at: NDArray[np.bool_] | slice) -> Pairs:
         """Some of them."""
         return replace(self, kind=self.kind[at], points=self.points[at], offset=self.offset[at])
 
-    def distances(self, x: Array | None = None, others: Array | None = None) -> Array:
+    def distances(self, x: Array | None = None, obstacle_x: Array | None = None) -> Array:
         out = np.empty(len(self))
-        x, others = self.x if x is None else x, self.others if others is None else others
-        contact_pairs.distances(x, others, self.kind, self.points, out)
+        x, obstacle_x = self.x if x is None else x, self.obstacle_x if obstacle_x is None else obstacle_x
+        contact_pairs.distances(x, obstacle_x, self.kind, self.points, out)
         return out
 
-    def meeting(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which of them are nearer than the gap; β and the energy of all, 0 of others."""
+    def find_active(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which of them are nearer than the gap; β and the energy of all, 0 of the rest."""
         n = len(self)
         numbers = self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel, np.zeros((n, 6))
-        found = met_of(x, self.others, self.kind, self.points, *numbers, counted=n)
+        found = found_active(x, self.obstacle_x, self.kind, self.points, *numbers, counted=n)
         assert (found["weight"] == 1.0).all()
         near, beta, energy = np.zeros(n, dtype=np.bool_), np.zeros((n, 4)), np.zeros(n)
         at = found["at"]
@@ -65,60 +71,64 @@ class Pairs:
         return near, beta, energy
 
     def energies(self, x: Array, parallel: float = NOWHERE) -> Array:
-        return self.meeting(x, parallel)[2]
+        return self.find_active(x, parallel)[2]
 
-    def _met(self, x: Array, parallel: float) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """What the kernels take of pairs and of what is met."""
+    def _active(self, x: Array, parallel: float) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """What the kernels take of pairs and of what is active."""
         n = len(self)
         of = self.kind, self.points, self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel
-        found = met_of(x, self.others, *of, np.zeros((n, 6)), counted=n)
-        return of, tuple(found[name] for name in MET)
+        found = found_active(x, self.obstacle_x, *of, np.zeros((n, 6)), counted=n)
+        return of, tuple(found[name] for name in ACTIVE_COLUMNS)
 
     def gradient(self, x: Array, parallel: float = NOWHERE) -> tuple[Array, Array]:
-        out, pull = np.zeros_like(x), np.zeros_like(self.others)
-        of, met = self._met(x, parallel)
-        contact_pairs.add_gradient(x, self.others, *of, met, out, pull)
-        return out, pull
+        out, obstacle_gradient = np.zeros_like(x), np.zeros_like(self.obstacle_x)
+        of, active = self._active(x, parallel)
+        contact_pairs.add_gradient(x, self.obstacle_x, *of, active, out, obstacle_gradient)
+        return out, obstacle_gradient
 
     def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
         """(n, 12, 12)"""
-        of, met = self._met(self.x, parallel)
-        each = blocks_of(self.x, self.others, of, met, blend)
+        of, active = self._active(self.x, parallel)
+        each = blocks_of(self.x, self.obstacle_x, of, active, blend)
         return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
-    def free_fraction(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
+    def free_fraction(self, dx: Array, obstacle_dx: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
         pairs = self.kind[at], self.points[at], self.offset[at], np.full(len(self), GAP)[at]
-        return float(contact_pairs.free_fraction(self.x, self.others, way, others_way, *pairs, KEPT, most))
+        return float(
+            contact_pairs.free_fraction(self.x, self.obstacle_x, dx, obstacle_dx, *pairs, KEPT, most)
+        )
 
 
-MET = ["at", "weight", "beta", "felt"]
-"""What the kernels take of what `met_of` gives."""
+ACTIVE_COLUMNS = ["at", "weight", "beta", "derivatives"]
+"""What the kernels take of what `found_active` gives."""
 
 
-def blocks_of(x: Array, others: Array, of: tuple[Any, ...], met: tuple[Any, ...], blend: float) -> Array:
+def blocks_of(
+    x: Array, obstacle_x: Array, of: tuple[Any, ...], active: tuple[Any, ...], blend: float
+) -> Array:
     """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other one turned."""
     n, (one, other) = len(of[0]), np.triu_indices(4)
     number = np.arange(10 * n, dtype=np.int32).reshape(n, 10)
     turned = number % 2
     values, out = np.zeros((10 * n, 3, 3)), np.empty((n, 4, 4, 3, 3))
-    (at, weight, *rest), places = met, 2 * number + turned
-    contact_pairs.add_hessians(x, others, *of, (at, 1.0 * weight, *rest), blend, places, values)
+    (at, weight, *rest), places = active, 2 * number + turned
+    contact_pairs.add_hessians(x, obstacle_x, *of, (at, 1.0 * weight, *rest), blend, places, values)
     values = values.reshape(n, 10, 3, 3)
     values = np.where(turned[:, :, None, None] == 1, values.transpose(0, 1, 3, 2), values)
     out[:, one, other], out[:, other, one] = values, values.transpose(0, 1, 3, 2)
     return out
 
 
-def met_of(*given: Any, counted: int, room: int | None = None) -> dict[str, NDArray[Any]]:
-    """What `contact_pairs.meeting` finds, by name, as remembered: it cannot be written to."""
+def found_active(*given: Any, counted: int, capacity: int | None = None) -> dict[str, NDArray[Any]]:
+    """What `contact_pairs.find_active` finds, by name, as remembered: it cannot be written to."""
     n = len(given[2])
-    room = n if room is None else room
-    least, found = np.empty(n), {"at": np.empty(room, dtype=np.int64), "weight": np.empty(room)}
-    found |= {"counted": np.empty(room), "beta": np.empty((room, 4)), "energy": np.empty(room)}
-    found["felt"] = np.empty((room, 5))
-    met = contact_pairs.meeting(*given, counted, least, tuple(found.values()))
-    return dict(zip(found, unwritable(*(part[:met] for part in found.values())), strict=True))
+    capacity = n if capacity is None else capacity
+    least, found = np.empty(n), {"at": np.empty(capacity, dtype=np.int64), "weight": np.empty(capacity)}
+    found |= {"counted": np.empty(capacity), "beta": np.empty((capacity, 4)), "energy": np.empty(capacity)}
+    found["derivatives"] = np.empty((capacity, 5))
+    active = contact_pairs.find_active(*given, counted, least, tuple(found.values()))
+    return dict(zip(found, unwritable(*(part[:active] for part in found.values())), strict=True))
 
 
 def units(rng: np.random.Generator, n: int) -> Array:
@@ -152,8 +162,8 @@ def planes(n: int) -> Pairs:
     points = x - rng.uniform(0.1, 2.0 * GAP, size=n)[:, None] * normals + 3.0 * across
     number = np.arange(n)
     stencil = np.column_stack([number, ~(2 * number), ~(2 * number + 1), ~(2 * number)])
-    others = np.stack([points, normals], axis=1).reshape(-1, 3)
-    return Pairs(np.full(n, VERTEX_PLANE), stencil, x, others, np.full(n, 0.05))
+    obstacle_x = np.stack([points, normals], axis=1).reshape(-1, 3)
+    return Pairs(np.full(n, VERTEX_PLANE), stencil, x, obstacle_x, np.full(n, 0.05))
 
 
 def balls(n: int) -> Pairs:
@@ -294,15 +304,15 @@ def test_forces_of_both_sides_balance(name: str) -> None:
     make, parallel = KINDS[name]
     pairs = make()
     pairs = pairs.part(pairs.distances() > pairs.offset)
-    out, pull = pairs.gradient(pairs.x, parallel)
-    total = np.abs(out.sum(axis=0) + pull.sum(axis=0)).max()
-    assert total <= 1e-13 * (np.abs(out).sum() + np.abs(pull).sum())
+    out, obstacle_gradient = pairs.gradient(pairs.x, parallel)
+    total = np.abs(out.sum(axis=0) + obstacle_gradient.sum(axis=0)).max()
+    assert total <= 1e-13 * (np.abs(out).sum() + np.abs(obstacle_gradient).sum())
     assert np.abs(out).sum() > 0.0
 
 
 def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> None:
     pairs = planes(2)
-    normal, foot = pairs.others[1], pairs.others[0]
+    normal, foot = pairs.obstacle_x[1], pairs.obstacle_x[0]
     for beyond, energy, force in ((1e-3, 0.0, 0.0), (-1e-3, 1e-8, 1e-5)):
         x = pairs.x.copy()
         x[0] = foot + (GAP + 0.05 + beyond) * normal
@@ -310,12 +320,12 @@ def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> Non
         assert np.linalg.norm(pairs.gradient(x)[0][0]) == pytest.approx(force, abs=1e-5)
 
 
-def closest(pairs: Pairs, e: int, way: Array, others_way: Array, end: float) -> tuple[float, float]:
+def closest(pairs: Pairs, e: int, dx: Array, obstacle_dx: Array, end: float) -> tuple[float, float]:
     """Least of what is left on the way to a fraction of it, over what is left at first or the gap if that is
     less; that at the end.
     """
     left = [
-        pairs.distances(pairs.x + t * way, pairs.others + t * others_way)[e] - pairs.offset[e]
+        pairs.distances(pairs.x + t * dx, pairs.obstacle_x + t * obstacle_dx)[e] - pairs.offset[e]
         for t in np.linspace(0.0, end, 100)
     ]
     counts = min(left[0], GAP)
@@ -328,38 +338,38 @@ def test_free_ways(name: str, speed: float) -> None:
     pairs = KINDS[name][0]()
     pairs = pairs.part(pairs.distances() > pairs.offset).part(slice(0, 120))
     rng = np.random.default_rng(11)
-    way, others_way = speed * rng.normal(size=pairs.x.shape), speed * rng.normal(size=pairs.others.shape)
+    dx, obstacle_dx = speed * rng.normal(size=pairs.x.shape), speed * rng.normal(size=pairs.obstacle_x.shape)
     if pairs.kind[0] == VERTEX_PLANE:
-        others_way[1::2] = 0.0  # planes that do not turn
+        obstacle_dx[1::2] = 0.0  # planes that do not turn
     limited, found = 0, []
     for e in range(len(pairs)):
-        found.append(fraction := pairs.free_fraction(way, others_way, e))
+        found.append(fraction := pairs.free_fraction(dx, obstacle_dx, e))
         assert 0.0 < fraction <= 1.0
-        least, last = closest(pairs, e, way, others_way, fraction)
+        least, last = closest(pairs, e, dx, obstacle_dx, fraction)
         assert least >= KEPT - 1e-12
         if fraction < 1.0:
             limited += 1
-            assert last <= KEPT + (1.0 - KEPT) * CLOSE + 1e-12
+            assert last <= KEPT + (1.0 - KEPT) * CCD_TOLERANCE + 1e-12
     assert limited > 5 or speed < 1.0
-    assert pairs.free_fraction(way, others_way) == min(found)
-    assert pairs.free_fraction(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
+    assert pairs.free_fraction(dx, obstacle_dx) == min(found)
+    assert pairs.free_fraction(dx, obstacle_dx, most=0.5 * min(found)) == 0.5 * min(found)
 
 
 def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
     pairs = KINDS["vertex and triangle"][0]()
     n, gap, force = len(pairs), np.full(len(pairs), GAP), 3.0 * GAP
-    aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
+    target, before, loaded = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
     still = np.zeros_like(pairs.x)
     contact_pairs.target_distances(
-        pairs.x, pairs.others, still, *numbers, 0.7, np.full(n, force), aim, before, presses
+        pairs.x, pairs.obstacle_x, still, *numbers, 0.7, np.full(n, force), target, before, loaded
     )
     left = pairs.distances() - pairs.offset
     touch = (left > 0.0) & (left < GAP)
     assert touch.any()
-    assert presses[touch].all()
+    assert loaded[touch].all()
     np.testing.assert_allclose(
-        [-contact_pairs.barrier(each, GAP)[1] for each in aim[touch]], force, rtol=1e-6
+        [-contact_pairs.barrier(each, GAP)[1] for each in target[touch]], force, rtol=1e-6
     )
 
 
@@ -368,7 +378,7 @@ def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
     delta = GAP * np.linspace(-2.0, 1.2, 65)
     gap, below = np.full(len(delta), GAP), np.full(len(delta), least)
     force, stiffness = np.empty((2, len(delta)))
-    contact_pairs.law(delta, gap, below, force, stiffness)
+    contact_pairs.spring_forces(delta, gap, below, force, stiffness)
     inside, straight = (delta > least) & (delta < GAP), delta < least
     _, slope, second = contact_pairs.barrier(delta[inside], GAP)
     np.testing.assert_allclose(force[inside], -slope)
@@ -379,11 +389,11 @@ def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
     # chords lead from any of these distances to where the force is what is expected
     for expected in (0.0, 0.1 * GAP, 2.0 * GAP, 40.0 * GAP):
         slopes, there, of = np.empty((3, len(delta)))
-        contact_pairs.chords(delta, gap, below, force, np.full(len(delta), expected), slopes)
+        contact_pairs.secant_stiffness(delta, gap, below, force, np.full(len(delta), expected), slopes)
         some = (np.abs(force - expected) > 0.05 * GAP) & (slopes > 0.0)
         assert some.sum() > len(delta) // 3
         there = delta + (force - expected) / np.where(some, slopes, 1.0)
-        contact_pairs.law(there, gap, below, of, stiffness)
+        contact_pairs.spring_forces(there, gap, below, of, stiffness)
         np.testing.assert_allclose(of[some], expected, atol=1e-6 * GAP)
         assert (slopes >= 0.0).all()
 
@@ -392,11 +402,11 @@ def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
 def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: str) -> None:
     pairs = KINDS[name][0]()
     n, gap, most = len(pairs), np.full(len(pairs), GAP), 0.7
-    way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
+    dx = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
-    aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
+    target, before, loaded = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
     contact_pairs.target_distances(
-        pairs.x, pairs.others, way, *numbers, most, np.full(n, np.nan), aim, before, presses
+        pairs.x, pairs.obstacle_x, dx, *numbers, most, np.full(n, np.nan), target, before, loaded
     )
 
     def slopes(delta: Array) -> Array:
@@ -404,67 +414,67 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
 
     left, step = pairs.distances() - pairs.offset, 1e-6
     touch = (left > 0.0) & (left < GAP)
-    rate = (pairs.distances(pairs.x + step * way) - pairs.distances(pairs.x - step * way)) / (2.0 * step)
+    rate = (pairs.distances(pairs.x + step * dx) - pairs.distances(pairs.x - step * dx)) / (2.0 * step)
     second = np.array([contact_pairs.barrier(each, GAP)[2] for each in left[touch]])
     linear = slopes(left[touch]) + second * rate[touch]
     pressed = linear < slopes(np.array([most * GAP]))
     assert pressed.any()
-    alike = np.isclose(slopes(aim[touch][pressed]), linear[pressed], rtol=1e-4)
+    alike = np.isclose(slopes(target[touch][pressed]), linear[pressed], rtol=1e-4)
     assert alike.mean() > 0.99  # nearest points of a few jump within the difference
-    assert (aim[touch][~pressed] == most * GAP).all()
-    assert (presses[touch] == (linear < 0.0)).mean() > 0.99
-    assert not presses[~touch].any()
-    assert presses.any()
-    # each pair alone, by as much as it lacks, and back what presses and would leave
-    x, others = pairs.x, pairs.others
+    assert (target[touch][~pressed] == most * GAP).all()
+    assert (loaded[touch] == (linear < 0.0)).mean() > 0.99
+    assert not loaded[~touch].any()
+    assert loaded.any()
+    # each pair alone, by as much as it lacks, and back if it is loaded and would leave
+    x, obstacle_x = pairs.x, pairs.obstacle_x
     room = pairs.kind != VERTEX_INSIDE
-    for e in np.flatnonzero(room | (aim + pairs.offset < 0.0))[::7]:
+    for e in np.flatnonzero(room | (target + pairs.offset < 0.0))[::7]:
         one, at = slice(e, e + 1), np.unique(pairs.points[e][pairs.points[e] >= 0])
-        of = tuple(part[one] for part in (*numbers, aim, before, presses))
-        moved = way.copy()
+        of = tuple(part[one] for part in (*numbers, target, before, loaded))
+        moved = dx.copy()
         for _ in range(50):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
-            if not contact_pairs.add_corrections(x, others, moved, *of, 1e-3, out, count):
+            if not contact_pairs.add_corrections(x, obstacle_x, moved, *of, 1e-3, out, count):
                 break
             moved[at] += out[at] / np.maximum(count[at], 1e-9)
         else:
             raise AssertionError("is not apart")
-        assert not presses[e] or pairs.distances(x + moved)[e] - pairs.offset[e] < GAP
+        assert not loaded[e] or pairs.distances(x + moved)[e] - pairs.offset[e] < GAP
 
 
 def test_a_common_motion_of_both_is_free() -> None:
     for make in (lambda: among_sheets(VERTEX_TRIANGLE, 50), lambda: planes(50), lambda: balls(50)):
         pairs = make()
         pairs = pairs.part(pairs.distances() > pairs.offset)
-        way = np.tile([30.0, -20.0, 50.0], (len(pairs.x), 1))
-        others_way = np.tile([30.0, -20.0, 50.0], (len(pairs.others), 1))
-        if len(pairs.others) and pairs.kind[0] == VERTEX_PLANE:
-            others_way[1::2] = 0.0
-        assert pairs.free_fraction(way, others_way) == 1.0
+        dx = np.tile([30.0, -20.0, 50.0], (len(pairs.x), 1))
+        obstacle_dx = np.tile([30.0, -20.0, 50.0], (len(pairs.obstacle_x), 1))
+        if len(pairs.obstacle_x) and pairs.kind[0] == VERTEX_PLANE:
+            obstacle_dx[1::2] = 0.0
+        assert pairs.free_fraction(dx, obstacle_dx) == 1.0
 
 
 def test_long_ways_past_each_other_are_judged_at_once() -> None:
     pairs = among_sheets(VERTEX_TRIANGLE, 50)
     pairs = pairs.part(pairs.distances() > pairs.offset)
-    way = np.zeros_like(pairs.x)
-    way[:, 0] = 1e12 * (1.0 + np.arange(len(way)) % 2)
-    assert 0.0 <= pairs.free_fraction(way, np.zeros_like(pairs.others)) < 1.0
+    dx = np.zeros_like(pairs.x)
+    dx[:, 0] = 1e12 * (1.0 + np.arange(len(dx)) % 2)
+    assert 0.0 <= pairs.free_fraction(dx, np.zeros_like(pairs.obstacle_x)) < 1.0
 
 
 def test_planes_that_turn() -> None:
     """The normal at a fraction of the way is that of straight ways of both its ends."""
     pairs = planes(200)
     rng = np.random.default_rng(12)
-    others_way = np.zeros_like(pairs.others)
-    others_way[1::2] = units(rng, len(pairs)) - pairs.others[1::2]
-    way = rng.normal(size=pairs.x.shape)
+    obstacle_dx = np.zeros_like(pairs.obstacle_x)
+    obstacle_dx[1::2] = units(rng, len(pairs)) - pairs.obstacle_x[1::2]
+    dx = rng.normal(size=pairs.x.shape)
     limited = 0
     for e in range(len(pairs)):
-        fraction = pairs.free_fraction(way, others_way, e)
+        fraction = pairs.free_fraction(dx, obstacle_dx, e)
         limited += fraction < 1.0
         for t in np.linspace(0.0, fraction, 50):
-            point, normal = pairs.others[2 * e], pairs.others[2 * e + 1] + t * others_way[2 * e + 1]
-            height = (pairs.x[e] + t * way[e] - point) @ normal / np.linalg.norm(normal)
+            point, normal = pairs.obstacle_x[2 * e], pairs.obstacle_x[2 * e + 1] + t * obstacle_dx[2 * e + 1]
+            height = (pairs.x[e] + t * dx[e] - point) @ normal / np.linalg.norm(normal)
             assert height > pairs.offset[e]
     assert limited > 20
 
@@ -494,11 +504,11 @@ def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel
     def summed(of: Pairs, counted: int, shares: Array) -> tuple[dict[str, NDArray[Any]], list[Any]]:
         barriers = np.full(len(of), gap), np.full(len(of), STIFFNESS)
         constants = of.kind, of.points, of.offset, *barriers, parallel
-        found = met_of(of.x, of.others, *constants, shares, counted=counted)
-        met = tuple(found[name] for name in MET)
+        found = found_active(of.x, of.obstacle_x, *constants, shares, counted=counted)
+        active = tuple(found[name] for name in ACTIVE_COLUMNS)
         out, hessian = np.zeros_like(of.x), np.zeros((len(of.x), len(of.x), 3, 3))
-        contact_pairs.add_gradient(of.x, of.others, *constants, met, out, out)
-        each = blocks_of(of.x, of.others, constants, met, 0.0)
+        contact_pairs.add_gradient(of.x, of.obstacle_x, *constants, active, out, out)
+        each = blocks_of(of.x, of.obstacle_x, constants, active, 0.0)
         np.add.at(hessian, (of.points[:, :, None], of.points[:, None, :]), each)
         return found, [float(found["weight"] @ found["energy"]), out, hessian]
 
@@ -530,13 +540,13 @@ def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
     return pairs, np.concatenate([flat, over]), triangles, np.tile(shares, (5, 1))
 
 
-def felt_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray[Any]], Array, Array]:
-    """What is met, its gradient, and its Hessian."""
+def active_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray[Any]], Array, Array]:
+    """What is active, its gradient, and its Hessian."""
     n, none = len(pairs), np.empty((0, 3))
     of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
-    found = met_of(x, none, *of, shares, counted=n, room=999)
+    found = found_active(x, none, *of, shares, counted=n, capacity=999)
     out, hessian = np.zeros_like(x), np.zeros((len(x), len(x), 3, 3))
-    taken = tuple(found[name] for name in MET)
+    taken = tuple(found[name] for name in ACTIVE_COLUMNS)
     contact_pairs.add_gradient(x, none, *of, taken, out, none)
     np.add.at(hessian, (pairs[:, :, None], pairs[:, None, :]), blocks_of(x, none, of, taken, 0.0))
     return found, out, hessian
@@ -545,7 +555,7 @@ def felt_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray
 def test_a_vertex_feels_a_flat_surface_once() -> None:
     """Also over an edge, and over a vertex."""
     pairs, x, _, shares = before_a_surface(0.0)
-    found, gradient, _ = felt_before(x, pairs, shares)
+    found, gradient, _ = active_before(x, pairs, shares)
     height = x[25:, 2]
     expected = STIFFNESS * (0.5 - height) ** 3 / height
     of = pairs[found["at"], 0] - 25
@@ -558,21 +568,21 @@ def test_a_vertex_feels_a_flat_surface_once() -> None:
 def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
     pairs, x, _, shares = before_a_surface(0.04)
     rng = np.random.default_rng(3)
-    found, gradient, hessian = felt_before(x, pairs, shares)
+    found, gradient, hessian = active_before(x, pairs, shares)
     assert (found["weight"] < 0.0).any()  # somewhere it is hollow
-    h, way = 1e-6, rng.normal(size=x.shape)
+    h, dx = 1e-6, rng.normal(size=x.shape)
 
     def energy(at: Array) -> float:
-        met = felt_before(at, pairs, shares)[0]
-        return float(met["weight"] @ met["energy"])
+        active = active_before(at, pairs, shares)[0]
+        return float(active["weight"] @ active["energy"])
 
-    slope = (energy(x + h * way) - energy(x - h * way)) / (2 * h)
-    assert np.vdot(gradient, way) == pytest.approx(slope, rel=1e-6)
-    change = (felt_before(x + h * way, pairs, shares)[1] - felt_before(x - h * way, pairs, shares)[1]) / (
+    slope = (energy(x + h * dx) - energy(x - h * dx)) / (2 * h)
+    assert np.vdot(gradient, dx) == pytest.approx(slope, rel=1e-6)
+    change = (active_before(x + h * dx, pairs, shares)[1] - active_before(x - h * dx, pairs, shares)[1]) / (
         2 * h
     )
     np.testing.assert_allclose(
-        np.einsum("abij,bj->ai", hessian, way), change, atol=1e-5 * np.abs(change).max()
+        np.einsum("abij,bj->ai", hessian, dx), change, atol=1e-5 * np.abs(change).max()
     )
     # along a way over vertices and edges it does not jump
     ahead = np.zeros_like(x)
@@ -586,16 +596,16 @@ def test_a_vertex_feels_an_obstacle_as_it_feels_a_sheet() -> None:
     """Whose points have numbers below 0, so that edges are told apart in another way."""
     pairs, x, _, shares = before_a_surface(0.1)
     x[25:, :2], x[25:, 2] = [[2, 2], [2.01, 2.02], [1.98, 2], [1.99, 1.99], [3.01, 2.01]], 0.2
-    found, _, _ = felt_before(x, pairs, shares)
+    found, _, _ = active_before(x, pairs, shares)
     places = np.column_stack([pairs[:, :1] - 25, ~pairs[:, 1:]])
     n = len(pairs)
     of = np.full(n, VERTEX_TRIANGLE), places, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
-    met = met_of(x[25:].copy(), x[:25].copy(), *of, shares, counted=n, room=999)
-    assert len(met["at"]) == len(found["at"])
+    active = found_active(x[25:].copy(), x[:25].copy(), *of, shares, counted=n, capacity=999)
+    assert len(active["at"]) == len(found["at"])
     for vertex in range(5):
-        here, there = (each["weight"][pairs[each["at"], 0] == 25 + vertex] for each in (met, found))
+        here, there = (each["weight"][pairs[each["at"], 0] == 25 + vertex] for each in (active, found))
         np.testing.assert_allclose(np.sort(here), np.sort(there), atol=1e-12)
-    assert met["weight"] @ met["energy"] == pytest.approx(found["weight"] @ found["energy"], rel=1e-12)
+    assert active["weight"] @ active["energy"] == pytest.approx(found["weight"] @ found["energy"], rel=1e-12)
 
 
 def test_negative_normal_forces_are_taken_off_those_of_the_same_side() -> None:
@@ -604,5 +614,5 @@ def test_negative_normal_forces_are_taken_off_those_of_the_same_side() -> None:
     normal = np.array([up, up, [0.1, 0.0, 1.0], down, down, up, down])
     force = np.array([0.9, -0.4, 0.6, 0.5, -0.1, 2.0, -3.0])
     vertex, kind = np.array([4, 4, 4, 4, 4, 7, 7]), np.full(7, VERTEX_TRIANGLE)
-    contact_pairs.share_negative(kind, vertex, normal, force)
+    contact_pairs.cancel_negative_forces(kind, vertex, normal, force)
     np.testing.assert_allclose(force, [0.9 * 11 / 15, 0.0, 0.6 * 11 / 15, 0.4, 0.0, 2.0, 0.0], rtol=1e-14)

@@ -11,7 +11,7 @@ from numba import typeof
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.terms.contact import NOTHING, ContactBarrier
+from lyra_petsc.terms.contact import NO_PAIRS, ContactBarrier
 from lyra_petsc.terms.midedge import NO_FRICTION
 from lyra_petsc.terms.remembered import Remembered, unwritable
 
@@ -46,9 +46,9 @@ def test_kernels_are_compiled_for_what_is_remembered_alone() -> None:
         simulation.step(1e-4)
         contact, system = simulation.problem.terms["contact"], simulation.system
         assert isinstance(contact, ContactBarrier)
-        met = contact.meeting(system.x, system.active.frozen[contact].now)
-        assert len(met.at)
-    assert typeof(NOTHING) == typeof(met)
+        active = contact.active_pairs(system.x, system.active.frozen[contact].stage)
+        assert len(active.pair)
+    assert typeof(NO_PAIRS) == typeof(active)
     assert typeof(NO_FRICTION) == typeof(unwritable(np.zeros((1, 2)))[0])
 
 
