@@ -1,13 +1,14 @@
-"""Newton steps of equilibria along arcs, on which triangles that turn keep their size.
+"""Newton steps of equilibria along arcs, on which triangles that rotate keep their size.
 
-On the tangent, vertices that turn go beside their circles and stretch the sheet by the square of their angle,
-which Newton's method must take back. A way u gives every triangle, of deformation gradient F, the gradient
-∂u/∂x with spin W and strain ε, if its normal is to stay one. Along an arc it would become::
+A linear increment that rotates a triangle by an angle stretches it by the square of the angle, and later
+iterations must remove the stretch. An increment u from the deformation gradient F of a triangle has the
+gradient ∂u/∂x, with spin W and strain ε if the normal stays a normal. Along an arc the deformation gradient
+becomes::
 
     F' = exp(W) (1 + ε) F
 
-No positions fit that exactly; those that fit best, min Σ A |∂x'/∂X − F'|², solve a Poisson equation, whose
-matrix changes with nothing but what is prescribed, and is factored once.
+No positions fit all F' exactly. The best fit, min Σ A |∂x'/∂X − F'|², solves a Poisson equation, whose matrix
+depends on the prescribed unknowns only and is factored once.
 
 Sources: Yu, Zhou, Xu, Shi, Bao, Guo & Shum, Mesh editing with Poisson-based gradient field manipulation,
 SIGGRAPH 2004; Huang, Tong, Zhou, Bao & Desbrun, Interactive shape interpolation through controllable dynamic
@@ -28,31 +29,32 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 
 PREFIX = "arcs_"
-"""Of the options of the solver."""
+"""Options prefix of the linear solver."""
 
-FARTHEST = 0.4
-"""Angle [rad] by which a Newton step may turn a triangle: with 0.25 and 0.6 shells take as many iterations or
-more, with 1.5 a tenth to a fifth more."""
+MAX_TURN = 0.4
+"""Largest angle [rad] by which a Newton step may turn a triangle.
 
-STRAIGHT = 0.01
-"""Angle [rad] by which directors turn at most in steps that are left straight: an arc saves no iteration."""
+With 0.25 and 0.6 shells take as many iterations or more, with 1.5 a tenth to a fifth more."""
 
-LOOSE = 1e-9
-"""Diagonal over the largest one that holds what nothing else does: where it is."""
+MIN_TURN = 0.01
+"""Largest rotation [rad] of directors for which a step stays linear: an arc would save no iteration."""
+
+REGULARISATION = 1e-9
+"""Diagonal entry, over the largest one, that makes the matrix regular without prescribed unknowns."""
 
 
-def possible(ranks: int) -> bool:
-    """Whether this PETSc can factor the matrix."""
+def can_factor(ranks: int) -> bool:
+    """Whether this PETSc can factor a matrix on so many ranks."""
     return ranks == 1 or bool(PETSc.Sys.hasExternalPackage("mumps"))
 
 
 class Arcs:
-    """Bends ways to arcs; collective.
+    """Changes linear increments to increments along arcs; collective.
 
     Parameters
     ----------
     equations : StageEquations
-        Of a scene with directors on edges, whose stencils stay.
+        Those of a scene with directors on edges and without changing stencils.
     """
 
     def __init__(self, equations: StageEquations) -> None:
@@ -67,58 +69,62 @@ class Arcs:
         self._ksp: PETSc.KSP | None = None
         self._held: Mask = np.empty(0, dtype=bool)
 
-    def matter(self, way: Array) -> bool:
-        """Whether a way (n_owned, 3) [m/s] turns anything so far that its arc is another one."""
-        return self._equations.largest_turn(way * self._equations.stage.c) > STRAIGHT
+    def turns_notably(self, increment: Array) -> bool:
+        """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
+        return self._equations.largest_turn(increment * self._equations.stage.c) > MIN_TURN
 
-    def bend(self, v: Array, way: Array, *, strains: bool = True) -> tuple[Array, Array]:
-        """The way from v by ``way`` (n_owned, 3) [m/s] along arcs, and on the tangent, as far as no triangle
-        turns too far; without ``strains`` all of it, and triangles keep their shape.
+    def curve(self, v: Array, increment: Array, *, strains: bool = True) -> tuple[Array, Array]:
+        """An increment (n_owned, 3) [m/s] from v along arcs, and the linear one.
+
+        Both are shortened so that no triangle turns by more than `MAX_TURN`. Without ``strains`` they are not
+        shortened, and triangles keep their strain.
         """
         equations = self._equations
-        x, ahead = equations.displacement(v, way)
-        shape, spin, strain = self._turn(x, ahead)
+        x, displacement = equations.displacement(v, increment)
+        deformation, spin, strain = self._spin_and_strain(x, displacement)
         turn = np.linalg.norm(spin, axis=1)
-        farthest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
-        part = min(1.0, FARTHEST / farthest) if strains and farthest > 0.0 else 1.0
-        ahead, way = part * ahead, part * way
-        kept = np.eye(3) + (part * strain if strains else 0.0)
-        gradient = _rotations(part * spin) @ (kept @ shape)
-        missing = self._area[:, None, None] * (gradient - shape - self._gradients(ahead))
-        pulls, corners = self._slopes @ missing.transpose(0, 2, 1), self._term.stencil.ravel()
-        forces = [np.bincount(corners, pulls[:, :, i].ravel(), len(x))[: len(way)] for i in range(3)]
-        bent = way + self._solve(np.stack(forces, axis=1)) / equations.stage.c
-        equations.match_directors(v, way, bent)
-        return bent, way
+        largest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
+        part = min(1.0, MAX_TURN / largest) if strains and largest > 0.0 else 1.0
+        displacement, increment = part * displacement, part * increment
+        stretch = np.eye(3) + (part * strain if strains else 0.0)
+        gradient = _rotations(part * spin) @ (stretch @ deformation)
+        misfit = self._area[:, None, None] * (gradient - deformation - self._gradients(displacement))
+        element_forces, corners = self._slopes @ misfit.transpose(0, 2, 1), self._term.stencil.ravel()
+        forces = [
+            np.bincount(corners, element_forces[:, :, i].ravel(), len(x))[: len(increment)] for i in range(3)
+        ]
+        curved = increment + self._solve(np.stack(forces, axis=1)) / equations.stage.c
+        equations.match_directors(v, increment, curved)
+        return curved, increment
 
     def _gradients(self, x: Array) -> Array:
         """∂x/∂X (E, 3, 2) of the triangles."""
         found: Array = np.einsum("eci,eck->eik", x[self._term.stencil], self._slopes)
         return found
 
-    def _turn(self, x: Array, ahead: Array) -> tuple[Array, Array, Array]:
-        """F (E, 3, 2), spins (E, 3) and strains (E, 3, 3) of the way ``ahead`` from x (n_local, 3)."""
-        shape = self._gradients(x)
-        u, w = shape[:, :, 0], shape[:, :, 1]
+    def _spin_and_strain(self, x: Array, displacement: Array) -> tuple[Array, Array, Array]:
+        """F (E, 3, 2) at x (n_local, 3), and spins (E, 3) and strains (E, 3, 3) of a displacement from x."""
+        deformation = self._gradients(x)
+        u, w = deformation[:, :, 0], deformation[:, :, 1]
         normal = np.cross(u, w)
         square = np.sum(normal * normal, axis=1, keepdims=True)
-        # of triangles without area nothing is known
+        # triangles without area get zeros
         over = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0.0)
         dual = over[:, None] * np.stack([np.cross(w, normal), np.cross(normal, u)], axis=1)
         normal *= np.sqrt(over)
-        gradient = self._gradients(ahead) @ dual
+        gradient = self._gradients(displacement) @ dual
         turned = -np.einsum("eij,ei->ej", gradient, normal)
         gradient += turned[:, :, None] * normal[:, None, :]
         transposed = gradient.transpose(0, 2, 1)
         skew = 0.5 * (gradient - transposed)
         spin: Array = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-        return shape, spin, gradient - skew
+        return deformation, spin, gradient - skew
 
     def _solve(self, forces: Array) -> Array:
-        """Ways (n_owned, 3) [m] of the free coordinates by which forces (n_owned, 3) are balanced."""
+        """Displacements (n_owned, 3) [m] of the free unknowns by the Poisson equation for ``forces``."""
         mask, free = self._equations.prescribed.mask, self._equations.prescribed.free
-        (other,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
-        if other:
+        (changed,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
+        if changed:
             self._factor()
         assert self._matrix is not None
         assert self._ksp is not None
@@ -136,7 +142,7 @@ class Arcs:
         self._held = mask.copy()
         size = np.einsum("eck,eck->e", self._slopes, self._slopes)
         (largest,) = layout.global_max(float((self._area * size).max(initial=0.0)))
-        values, diagonal = rows.zeros(), np.full(layout.n_owned, LOOSE * largest)
+        values, diagonal = rows.zeros(), np.full(layout.n_owned, REGULARISATION * largest)
         diagonal[layout.n_vertices :] = 1.0
         rows.set_diagonal(diagonal, values)
         couplings = np.einsum("eak,ebk->eab", self._slopes, self._slopes)

@@ -1,9 +1,9 @@
-"""How much of the Hessian is regularised: as little as keeps it positive definite.
+"""The weight of the regularised Hessian in the Jacobian: the least that keeps it positive definite.
 
-The exact Hessian converges in few iterations but may be indefinite (compression, folds); the
-regularised one never is, but converges slowly. Conjugate gradients tell: when they meet negative
-curvature, the iteration is repeated with more regularisation; the next one tries less. A nearly
-singular Hessian shows in the line search: a step that had to be cut asks for more as well.
+With the exact Hessian Newton's method converges in few iterations, but it may be indefinite (compression,
+folds). The regularised Hessian never is, but converges slowly. When conjugate gradients meet negative
+curvature, the iteration is repeated with a larger weight; the next iteration tries a smaller one. A step that
+the line search shortens, as with a nearly singular Hessian, also increases the weight.
 """
 
 from __future__ import annotations
@@ -11,22 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-FIRST = 0.05
-RAISE = 8.0
-LOWER = 0.5
-SMALLEST = 1e-3
+FIRST, SMALLEST = 0.05, 1e-3
+"""Smallest weight after an increase, and weight below which none is used."""
+
+GROWTH, DECAY = 8.0, 0.5
+"""Factors of the weight after negative curvature, and from iteration to iteration."""
+
 CLOSE = 0.85
-"""Fraction of one that was enough up to which less is tried."""
+"""Bisection between a weight too small and one large enough ends if their ratio is above this."""
 
-FORGET = 0.3
-"""By how much what was too little falls in an iteration, so that less is tried again."""
+BOUND_DECAY = 0.3
+"""Factor of the weight known to be too small in each iteration, so that smaller ones are tried again."""
 
-CUT = 0.5
-"""Fraction of a step taken by the line search below which the Hessian was too soft."""
+SHORTENED = 0.5
+"""A step of which the line search takes less than this fraction increases the weight."""
 
 
 class Blend:
-    """The fraction of regularisation in use: 0 exact, 1 regularised.
+    """The weight of the regularised Hessian: 0 is exact, 1 regularised.
 
     Parameters
     ----------
@@ -41,45 +43,46 @@ class Blend:
     def __init__(self, mode: str) -> None:
         self._adaptive = mode == "adaptive"
         self.value = 1.0 if mode == "regularised" else 0.0
-        # what was too little lately, and what was enough: the least lies between them
+        # weights that were too small and large enough lately: the least admissible one lies between them
         self._too_little, self._enough = 0.0, 1.0
-        self._lower = LOWER
+        self._decay = DECAY
 
     def after(self, taken: float, *, exact: bool = False) -> float:
-        """The fraction for the next iteration, when the line search took ``taken`` of the last step; with
-        ``exact`` none is tried first.
+        """The weight for the next iteration, after the line search took ``taken`` of the last step.
+
+        With ``exact`` it is 0.
         """
-        if taken < CUT:
-            self.raise_()
+        if taken < SHORTENED:
+            self.increase()
         elif self._adaptive and exact:
             self._enough, self.value = self.value, 0.0
         elif self._adaptive:
             self._enough = self.value
-            lowered = self._lower * self.value
-            self._lower *= self._lower
-            if lowered <= self._too_little < self.value:
-                lowered = self._between(self._too_little, self.value)
-            self.value = lowered if lowered > SMALLEST else 0.0
-            self._too_little *= FORGET
+            smaller = self._decay * self.value
+            self._decay *= self._decay
+            if smaller <= self._too_little < self.value:
+                smaller = self._bisect(self._too_little, self.value)
+            self.value = smaller if smaller > SMALLEST else 0.0
+            self._too_little *= BOUND_DECAY
         return self.value
 
-    def raise_(self) -> bool:
-        """Take more, after negative curvature was met; False if there is no more."""
+    def increase(self) -> bool:
+        """Increase the weight after negative curvature; False if it is at its maximum."""
         if not self._adaptive or self.value >= 1.0:
             return False
-        self._too_little, self._lower = self.value, LOWER
-        raised = max(FIRST, RAISE * self.value)
-        if self.value < self._enough < raised:
-            raised = self._between(self.value, self._enough)
-        self.value = min(1.0, raised)
+        self._too_little, self._decay = self.value, DECAY
+        larger = max(FIRST, GROWTH * self.value)
+        if self.value < self._enough < larger:
+            larger = self._bisect(self.value, self._enough)
+        self.value = min(1.0, larger)
         return True
 
     def memory(self) -> dict[str, float]:
-        """What a checkpoint must hold to go on alike."""
+        """Entries of a checkpoint, for `restore`."""
         return {"blend": self.value, "too_little": self._too_little, "enough": self._enough}
 
     def restore(self, memory: Mapping[str, float]) -> None:
-        """Go on with a memory; an older one has but the value."""
+        """Continue from a memory; older ones have the weight only."""
         if not self._adaptive:
             return
         self.value = float(memory.get("blend", self.value))
@@ -87,6 +90,6 @@ class Blend:
         self._enough = float(memory.get("enough", self._enough))
 
     @staticmethod
-    def _between(low: float, high: float) -> float:
-        """A fraction between two, in the middle of their logarithms; the upper one where they are close."""
+    def _bisect(low: float, high: float) -> float:
+        """Geometric mean of two weights, or the upper one where they are close."""
         return math.sqrt(low * high) if 0.0 < low < CLOSE * high else high

@@ -78,13 +78,13 @@ class ContactModel:
             return False
         if self._follow():
             assemble()
-        linear.keep(v)
+        linear.save_rows(v)
         first, z, left = y.copy(), y.duplicate(), residual.copy()
         self._go(left, y, force - expected)
         for _ in range(SOLVES):
             slopes = self._chords(length, force, expected)
             while not (solved := self._solve(left, z, slopes, tolerance * size)) and ease():
-                linear.keep(v)
+                linear.save_rows(v)
                 residual.copy(left)
                 self._go(left, y, force - self._force + self._stiffness * (length - self._length))
             if not solved:
@@ -165,7 +165,7 @@ class ContactModel:
         def add(rows: Array) -> None:
             equations.add_contact_springs(self._springs, each, rows)
 
-        linear.with_more(add)
+        linear.assemble_with(add)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         kept = ksp.getTolerances()
         ksp.setTolerances(rtol=1e-14, atol=enough)

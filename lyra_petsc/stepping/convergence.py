@@ -1,4 +1,4 @@
-"""When Newton's method stops: by the scene's tolerances, ``-snes_*tol``, or at the floor of round-off."""
+"""Convergence test of Newton's method: the scene's tolerances, ``-snes_*tol``, and the round-off floor."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 Reason = PETSc.SNES.ConvergedReason
 
 STALLED = 0.5
-"""Fraction of the residual left by an iteration above which, at the round-off floor, it falls no more."""
+"""At the round-off floor an iteration that leaves more than this fraction of the residual has stalled."""
 
-FELL = 0.1
-"""Fraction of the residual left by an iteration below which the preconditioner stays."""
+FAST = 0.1
+"""The preconditioner is kept after an iteration that leaves less than this fraction of the residual."""
 
 HALVED = 0.5
-"""Fraction of it below which factors of the exact Hessian are worth another try, at the price of a solve."""
+"""The exact Hessian is factored again after an iteration that leaves less than this fraction."""
 
 FINER_IN_CONTACT = 0.1
-"""Part of the tolerances above which one more iteration is taken where parts meet: an impact magnifies what a
-step leaves, which depends on the number of ranks."""
+"""Where parts collide, one more iteration is taken unless this fraction of the tolerances is met: an impact
+magnifies the error of a step, which depends on the number of ranks."""
 
 SLOWEST = 0.5
-"""Fraction of the increment before above which increments are not extrapolated."""
+"""Increments are extrapolated only if each is less than this fraction of the one before."""
 
 RECENT = 0.1
-"""Weight of the last Newton iteration in the mean of linear iterations that judges the linear solver."""
+"""Weight of the last Newton iteration in the running mean of linear iterations."""
 
 
 class Convergence:
@@ -40,7 +40,7 @@ class Convergence:
     ----------
     equations : StageEquations
     tolerances : Solver
-        The scene's block.
+        The block ``solver`` of the scene.
     spacing : float
         Mean edge length [m], for the step tolerance.
     floor : float
@@ -52,22 +52,22 @@ class Convergence:
     ----------
     norm : float
         Last residual norm [N].
-    fell : bool
-        Whether the last iteration lessened it much.
+    fell_fast : bool
+        Whether the last iteration reduced the residual tenfold.
     halved : bool
-        Whether it at least halved it.
+        Whether the last iteration halved the residual.
     at_roundoff : bool
         Whether the solve ended because only round-off was left.
-    left : float
+    remaining : float
         Estimated remaining correction of any coordinate [m].
     too_slow : bool
-        Whether the solve was given up since its linear iterations passed the limit.
-    usual : float
-        Mean of recent linear iterations per Newton iteration, which the limit is for.
+        Whether the solve was given up because `mean_iterations` exceeded ``break_even_iterations``.
+    mean_iterations : float
+        Running mean of the linear iterations per Newton iteration.
     stopped_by : str
-        The option that ended the solve while the scene's force tolerance was not met; or nothing.
-    farthest : float
-        Way [m] of a coordinate in an iteration beyond which the solve is given up.
+        The option that ended the solve before the scene's force tolerance was met, or an empty string.
+    max_displacement : float
+        Displacement [m] of a coordinate in one iteration beyond which the solve is given up.
     """
 
     def __init__(
@@ -82,52 +82,54 @@ class Convergence:
         self._equations, self._tolerances, self.spacing = equations, tolerances, spacing
         self._floor = self._least_floor = floor
         self._break_even_iterations = break_even_iterations
-        self.usual, self.farthest = 0.0, np.inf
-        self.begin()
+        self.mean_iterations, self.max_displacement = 0.0, np.inf
+        self.begin_solve()
 
-    def begin(self) -> None:
-        """A new solve."""
-        self.norm, self.fell, self.at_roundoff, self._floor = 0.0, False, False, self._least_floor
+    def begin_solve(self) -> None:
+        """Prepare for a new solve."""
+        self.norm, self.fell_fast, self.at_roundoff, self._floor = 0.0, False, False, self._least_floor
         self.halved = True
-        self.left, self.too_slow, self.stopped_by = np.inf, False, ""
+        self.remaining, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
-        self._stalled = self._spent = 0
-        self._balanced = self._ended = self._was_good = False
-        self._expected = np.inf
+        self._stalled = self._iterations_before = 0
+        self._balanced = self._ended = self._met_tolerances = False
+        self._after_correction = np.inf
 
     @property
-    def judged(self) -> bool:
-        """Whether the solve ended by this test, or in a motion where it is good enough.
+    def accepted(self) -> bool:
+        """Whether this test ended the solve, or in dynamics the forces are in balance.
 
-        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual. In
-        statics small forces may lead far.
+        After a failed line search PETSc reports convergence if the step is short, whatever the residual. In
+        statics balanced forces are not enough, because small forces may cause large displacements.
         """
         return self._ended or (self._equations.integrator.dynamic and self.balanced)
 
     @property
     def balanced(self) -> bool:
-        """Whether the last residual is as small as the scene asks, or round-off."""
+        """Whether the last residual is below the force tolerance or the round-off floor."""
         return self.norm <= max(self._floor, self._force_tolerance())
 
-    def test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
-        """SNES's reason to stop after so many linear iterations ``spent``, or None."""
-        reason = self._test(snes, iteration, residual, spent)
+    def test(self, snes: PETSc.SNES, iteration: int, residual: float, linear_iterations: int) -> int | None:
+        """SNES's converged reason after so many linear iterations of the solve, or None; collective."""
+        reason = self._test(snes, iteration, residual, linear_iterations)
         self._ended = reason is not None
         return reason
 
-    def _test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
+    def _test(self, snes: PETSc.SNES, iteration: int, residual: float, linear_iterations: int) -> int | None:
         before, self.norm = self.norm, residual
-        self.fell = residual < FELL * before
+        self.fell_fast = residual < FAST * before
         self.halved = iteration == 0 or residual < HALVED * before
         if not np.isfinite(residual):
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
             moved = increment * self._equations.stage.c
-            if moved > self.farthest:
+            if moved > self.max_displacement:
                 return int(Reason.DIVERGED_MAX_IT)
-            self._moved_by(moved)
-            self.usual += RECENT * (spent - self._spent - self.usual)
+            self._estimate_remaining(moved)
+            self.mean_iterations += RECENT * (
+                linear_iterations - self._iterations_before - self.mean_iterations
+            )
         slow = iteration > 0 and residual > STALLED * before
         if slow and self._equations.discretisation.has_near_elements:
             self._floor = max(self._least_floor, roundoff_of_contact(self._equations))
@@ -135,8 +137,8 @@ class Convergence:
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
-        self._spent = spent
-        if self.usual > self._break_even_iterations:
+        self._iterations_before = linear_iterations
+        if self.mean_iterations > self._break_even_iterations:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol = (
@@ -154,49 +156,51 @@ class Convergence:
             self.stopped_by = "" if balanced else "-snes_rtol"
             return int(Reason.CONVERGED_FNORM_RELATIVE)
         was_balanced, self._balanced = self._balanced, balanced
-        near = self._tolerances.step_tolerance * self.spacing
-        if balanced and self.left <= near and not self._finer_in_contact(near):
-            # which came last
+        tolerance = self._tolerances.step_tolerance * self.spacing
+        if balanced and self.remaining <= tolerance and not self._needs_finer_solve(tolerance):
+            # the reason is the tolerance that was met last
             return int(Reason.CONVERGED_SNORM_RELATIVE if was_balanced else Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < self.left <= stol * self.spacing:
+        if 0.0 < self.remaining <= stol * self.spacing:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
 
-    def _finer_in_contact(self, near: float) -> bool:
-        """Whether a solve that is good enough, with corrections below ``near`` [m], takes another iteration
-        as parts meet; collective.
+    def _needs_finer_solve(self, tolerance: float) -> bool:
+        """Whether a solve that meets the tolerances needs one more iteration because parts may collide.
+
+        ``tolerance`` [m] is that of the remaining correction; collective.
         """
-        equations, was_good = self._equations, self._was_good
-        self._was_good = True
+        equations, was_good = self._equations, self._met_tolerances
+        self._met_tolerances = True
         if was_good or not (equations.discretisation.limits_motion and equations.integrator.dynamic):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
-        return (self.norm > part * enough or self.left > part * near) and equations.may_impact
+        return (self.norm > part * enough or self.remaining > part * tolerance) and equations.may_impact
 
     def _force_tolerance(self) -> float:
-        """Residual norm [N] that the scene asks for."""
+        """Residual norm [N] that the scene's tolerance allows; collective."""
         return float(self._tolerances.force_tolerance * self._equations.largest_force())
 
-    def corrected_by(self, correction: float, last: float, residual: float) -> bool:
-        """Expect corrections after a Newton step, by its matrix, to go on falling as from ``last`` to
-        ``correction`` [m/s]; whether that and the ``residual`` [N] they leave are as small as asked.
+    def correction_suffices(self, correction: float, last: float, residual: float) -> bool:
+        """Whether a Newton step and its corrections meet the tolerances, so that no further one is needed.
 
+        The remaining correction is estimated from the ratio of ``correction`` to ``last``, the increment
+        before it [m/s]; ``residual`` [N] is that after the correction.
         (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
         """
         part = correction / last
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
-        self._expected = expected * self._equations.stage.c
-        near = self._tolerances.step_tolerance * self.spacing
-        return self._expected <= near and residual <= self._force_tolerance()
+        self._after_correction = expected * self._equations.stage.c
+        tolerance = self._tolerances.step_tolerance * self.spacing
+        return self._after_correction <= tolerance and residual <= self._force_tolerance()
 
-    def _moved_by(self, increment: float) -> None:
-        """Expect increments to go on falling as they fell last, where the residual shows that they may.
+    def _estimate_remaining(self, increment: float) -> None:
+        """Estimate the remaining correction from the ratio of the last two increments [m].
 
-        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.) Corrections that were
-        added tell more.
+        The ratio is used only if the residual fell fast (Hairer & Wanner, Solving Ordinary Differential
+        Equations II, equation IV.8.10). An estimate from corrections is better and replaces a larger one.
         """
-        fell = increment / self._increment if self.fell and self._increment > 0.0 else 1.0
+        fell = increment / self._increment if self.fell_fast and self._increment > 0.0 else 1.0
         self._increment = increment
-        self.left = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)
-        self.left, self._expected = min(self.left, self._expected), np.inf
+        self.remaining = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)
+        self.remaining, self._after_correction = min(self.remaining, self._after_correction), np.inf

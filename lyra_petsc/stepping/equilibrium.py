@@ -349,10 +349,10 @@ class Equilibrium:
         snes, convergence = self._stepper.snes, self._stepper.convergence
         allowed = snes.getTolerances()[3]
         snes.setTolerances(max_it=min(allowed, most or allowed))
-        convergence.farthest = self._size if most else np.inf
+        convergence.max_displacement = self._size if most else np.inf
         attempt = self._stepper.attempt(before, factor)
         self._stepper.snes.setTolerances(max_it=allowed)
-        self._stepper.convergence.farthest = np.inf
+        self._stepper.convergence.max_displacement = np.inf
         return attempt
 
     def _go_on(self, attempt: Attempt) -> bool:

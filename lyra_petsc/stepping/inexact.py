@@ -1,7 +1,8 @@
-"""How exactly a Newton iteration's linear system is solved: as exactly as pays.
+"""Inexact Newton method: the relative tolerance of the linear solver in each Newton iteration.
 
-A loose solve is enough where the residual falls from iteration to iteration. In stiff sheets what it leaves
-is stretch, and the residual does not fall: then the next solves are ten times as exact, until it does.
+A loose tolerance is enough while the residual falls from iteration to iteration. In stiff sheets the error of
+a loose solve is stretch, and the residual does not fall. The tolerance of the next solves is then ten times
+smaller, until the residual falls.
 """
 
 from __future__ import annotations
@@ -12,74 +13,77 @@ LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
 LOOSEST_IN_CONTACT = 1e-3
-"""Where parts are near, but for multigrid, whose iterations are dear: looser solves cost more Newton
-iterations, each of which evaluates all pairs."""
+"""The loosest tolerance where parts are near: looser solves cost more Newton iterations, each of which
+evaluates all pairs. Not with multigrid, whose iterations are expensive."""
 
 STATIC = 1e-4
-"""In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
+"""Tolerance in a static analysis, where Newton steps are large and looser solves cost more of them."""
 
 ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Of the one linear solve of a semi-implicit step; the second where parts are near, and of all solves of a
-step in which parts collide. An impact magnifies what a solve leaves, which depends on the number of ranks,
-thirty to a hundred times."""
+"""Tolerances of the single linear solve of a semi-implicit step, the second where parts are near.
 
-ALONE = 1e-4
-"""Tolerance of the solves of a step with contact in which nothing is near: what looser ones leave, more on
-some ranks than on others, adds up until parts meet. It saves an iteration of Newton's method in three, and
-takes a third more of the linear solver's."""
+The second is also that of all solves of a step in which parts collide: an impact magnifies the error of a
+solve, which depends on the number of ranks, thirty to a hundred times."""
+
+NOTHING_NEAR = 1e-4
+"""Tolerance in steps of a scene with contact in which no parts are near.
+
+Errors of looser solves differ with the number of ranks and add up until parts meet. It saves one Newton
+iteration in three, and takes a third more linear iterations."""
 
 COLLISION = 1.0
-"""How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then
-buckle in one of many ways, and the first directions of Newton's method tell in which."""
+"""Approach of parts in a step, over the mean edge length, from which on they count as colliding: sheets then
+buckle into one of many shapes, and the first Newton steps decide into which."""
 
 SLOW = 0.3
-"""Fraction of the residual left by an iteration above which the linear solve was too loose."""
+"""After an iteration that leaves more than this fraction of the residual, the tolerance is tightened."""
 
 SLOW_IN_CONTACT = 0.7
-"""The same where parts are near: residuals also fall slowly as pairs meet and part."""
+"""The same where parts are near: residuals also fall slowly when contacts open or close."""
 
 FAST = 0.03
-"""Fraction below which a looser one would have done."""
+"""After an iteration that leaves less than this fraction, the tolerance is loosened."""
 
 
 class Forcing:
-    """Sets the tolerance of a KSP before each Newton iteration, unless the user gave one.
+    """Sets the relative tolerance of a KSP before each Newton iteration.
 
     Parameters
     ----------
     ksp : PETSc.KSP
     fixed : bool
-        Leave it alone.
+        Whether the user or the analysis fixed the tolerance, which then stays.
     cycles : bool
         Whether the preconditioner is a cycle of multigrid.
     contact : bool
-        Whether there is contact, near or not.
+        Whether the scene has contact, whether or not parts are near.
     """
 
     def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool, contact: bool = False) -> None:
         self._ksp, self._fixed, self._cycles, self._contact = ksp, fixed, cycles, contact
         self.tolerance = LOOSEST
-        self.begin(near=False, collides=False)
+        self.begin_solve(near=False, collides=False)
 
-    def begin(self, *, near: bool, collides: bool) -> None:
-        """A new solve: begin a little looser than the last one ended. In it parts may touch where they are
-        ``near``, or collide.
+    def begin_solve(self, *, near: bool, collides: bool) -> None:
+        """Prepare for a new solve, with ten times the tolerance at which the last one ended.
+
+        Says whether parts are near in the step, and whether they collide.
         """
         self._slow = SLOW_IN_CONTACT if near else SLOW
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
-        self._collides, self._alone = collides, self._contact and not near
+        self._collides, self._nothing_near = collides, self._contact and not near
 
     @property
-    def in_use(self) -> float:
-        """The tolerance of the present solves."""
+    def effective_tolerance(self) -> float:
+        """The tolerance of the present solves, with the limits of contact."""
         if self._collides and not self._fixed:
             return ONCE_IN_CONTACT
-        return min(self.tolerance, ALONE) if self._alone and not self._fixed else self.tolerance
+        return min(self.tolerance, NOTHING_NEAR) if self._nothing_near and not self._fixed else self.tolerance
 
     def before_solve(self, norm: float) -> None:
-        """``norm`` [N] is the residual at the present iterate."""
+        """Set the tolerance for the next linear solve; ``norm`` [N] is that of the present residual."""
         if self._fixed:
             return
         if self._norm > 0.0 and norm > self._slow * self._norm:
@@ -87,4 +91,4 @@ class Forcing:
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = norm
-        self._ksp.setTolerances(rtol=self.in_use)
+        self._ksp.setTolerances(rtol=self.effective_tolerance)

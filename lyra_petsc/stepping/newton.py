@@ -1,4 +1,4 @@
-"""What SNES asks while it iterates: Jacobians, directions, energies, and whether to stop."""
+"""The callbacks of PETSc's SNES: Jacobian, corrections of the Newton step, objective, convergence test."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ if TYPE_CHECKING:
     from lyra_petsc.stepping.contact_model import ContactModel
 
 
-SMALL = 0.005
-"""Half the gap over the edges' mean length below which the linear model has what is on its way: with larger
-gaps it saves a tenth of the iterations, and took twice the time."""
+SMALL_GAP = 0.005
+"""Half the gap over the mean edge length below which `ContactModel` is used.
 
-CORRECTED = 0.5
-"""Fraction of the residual at the end of a step below which a correction of it is taken."""
+With larger gaps it saved a tenth of the iterations and took twice the time."""
 
-MOST_CORRECTIONS = 8
-"""Of one step."""
+MAX_REMAINING = 0.5
+"""A correction of a step is taken if it leaves less than this fraction of the residual."""
 
-BACK, ON = -1.0, 0.5
-"""Broyden's matrix takes the place of the factored one where the correction, along the last step, is between
-these parts of it."""
+MAX_CORRECTIONS = 8
+"""Largest number of corrections of one step."""
+
+MIN_OVERLAP, MAX_OVERLAP = -1.0, 0.5
+"""Range of the correction's projection on the last step, over that step, in which Broyden's update acts."""
 
 
-def _largest(vector: PETSc.Vec) -> float:
+def _max_norm(vector: PETSc.Vec) -> float:
     return float(vector.norm(PETSc.NormType.INFINITY))
 
 
-def _by_secants(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
-    """Let a correction, solved for with the matrix of the first of these steps, be that of Broyden's matrix
-    after the last of them; collective.
+def _apply_broyden(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
+    """Change a correction solved with the matrix of the first step to that of Broyden's matrix; collective.
 
+    ``steps`` are the Newton step and the corrections before this one.
     (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.4, algorithm QNERR.)
     """
     for step, following in itertools.pairwise(steps):
         correction.axpy(step.dot(correction) / step.dot(step), following)
     repeated = steps[-1].dot(correction) / steps[-1].dot(steps[-1])
-    if BACK < repeated < ON:
+    if MIN_OVERLAP < repeated < MAX_OVERLAP:
         correction.scale(1.0 / (1.0 - repeated))
 
 
@@ -70,18 +70,18 @@ class Newton:
     blend : Blend
     convergence : Convergence
     iterates : bool
-        There is more than one iteration (not so under ``semi-implicit``).
+        Whether there is more than one iteration (not so under ``semi-implicit``).
     follow : callable
-        Lets the matrices be those of the present stencils; whether they are others; collective.
+        Updates the matrices to the present stencils, and returns whether they changed; collective.
 
     Attributes
     ----------
     convergence : Convergence
     globalisation : Globalisation
-    more_linear, foreseen_linear : int
-        Linear iterations of directions that were solved for again, and with what touches on their way.
-    allowed : float
-        Fraction of the last direction that terms allowed to go.
+    extra_iterations, contact_iterations : int
+        Linear iterations of repeated solves and corrections, and those of the contact model.
+    step_fraction : float
+        Fraction of the last Newton step that terms allowed.
     """
 
     def __init__(
@@ -101,49 +101,49 @@ class Newton:
         self._shape = (equations.points.n_owned, 3)
         skin = min((term.skin for term in equations.active.limiting), default=np.inf)
         self._contact: ContactModel | None = None
-        if iterates and skin < SMALL * convergence.spacing:
-            from lyra_petsc.stepping.contact_model import ContactModel  # of use for nothing else
+        if iterates and skin < SMALL_GAP * convergence.spacing:
+            from lyra_petsc.stepping.contact_model import ContactModel  # needed with small gaps only
 
             self._contact = ContactModel(self._ksp, equations, linear, follow)
-        self._from: PETSc.Vec | None = None
-        self._reach = 0.0
-        self._began_convex = False
-        still = not (equations.integrator.dynamic or equations.discretisation.limits_motion)
-        self._corrects = still and linear.factors and bool(equations.active.with_edges)
+        self._last_iterate: PETSc.Vec | None = None
+        self._last_c = 0.0
+        self._convex_at_start = False
+        static = not (equations.integrator.dynamic or equations.discretisation.limits_motion)
+        self._corrects = static and linear.factors and bool(equations.active.with_edges)
         self._arcs: Arcs | None = None
         if self._corrects:
-            from lyra_petsc.stepping.arcs import Arcs, possible  # of use for nothing else
+            from lyra_petsc.stepping.arcs import Arcs, can_factor  # needed in equilibria only
 
-            self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
+            self._arcs = Arcs(equations) if can_factor(equations.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not equations.integrator.dynamic
         self.forcing = Forcing(
             self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.limits_motion
         )
 
-    def begin_step(self) -> None:
-        """Forget the step before."""
-        self.more_linear = self.foreseen_linear = 0
-        self._length, self.allowed = 0.0, 1.0
-        # a step begins as the one before did
-        self._convex = self._began_convex
+    def begin_solve(self) -> None:
+        """Prepare for a new nonlinear solve; collective."""
+        self.extra_iterations = self.contact_iterations = 0
+        self._step_length, self.step_fraction = 0.0, 1.0
+        # the Hessian at the start of a step mostly resembles that at the start of the last step
+        self._convex = self._convex_at_start
         collides = self._iterates and self._equations.may_collide(COLLISION * self.convergence.spacing)
-        self._linear.begin()
-        self._linear.shift.begin()
-        self.convergence.begin()
-        self.globalisation.begin()
-        self.forcing.begin(near=self._equations.discretisation.has_near_elements, collides=collides)
+        self._linear.begin_solve()
+        self._linear.shift.decrease()
+        self.convergence.begin_solve()
+        self.globalisation.begin_solve()
+        self.forcing.begin_solve(near=self._equations.discretisation.has_near_elements, collides=collides)
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
-        """Jacobian, and preconditioning matrix, at velocities u."""
+        """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
         v = self._array(u)
         if self._iterates:
             self._equations.set_iterate(v)
             self.forcing.before_solve(self.convergence.norm)
-        # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
+        # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
-        self._linear.set(v, blend, keep=self.convergence.fell, convex=self._convex)
-        self._reach = self._equations.stage.c
+        self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
+        self._last_c = self._equations.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -151,236 +151,248 @@ class Newton:
 
     def _taken(self, u: PETSc.Vec) -> float:
         """Fraction of the last Newton step that the line search took; 1 before the first."""
-        if self._from is None or self._length == 0.0:
+        if self._last_iterate is None or self._step_length == 0.0:
             return 1.0
-        self._from.axpy(-1.0, u)
-        taken = self._from.norm() / self._length
-        self._from.destroy()
-        self._from = None
+        self._last_iterate.axpy(-1.0, u)
+        taken = self._last_iterate.norm() / self._step_length
+        self._last_iterate.destroy()
+        self._last_iterate = None
         return float(taken)
 
-    def direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Solve again with more regularisation while the linear solve meets negative curvature."""
-        if self.globalisation.go_back(x, y):
+    def correct_direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Correct the Newton step y (x − y is the next iterate) before the line search.
+
+        The linear solve is repeated with more regularisation while it meets negative curvature. The step then
+        follows contact, arcs and directors and is shortened to what terms allow. Returns whether y changed;
+        for ``SNESLineSearch.setPreCheck``.
+        """
+        if self.globalisation.return_to_best(x, y):
             return True
         changed = False
         residual = self._snes.getFunction()[0]
-        useless = self._useless(residual, y)
-        self._convex = not useless
+        failed = self._lacks_descent(residual, y)
+        self._convex = not failed
         if self._snes.getIterationNumber() == 0:
-            self._began_convex = self._convex
-        while useless:
-            if not self._ease(self._array(x)):
+            self._convex_at_start = self._convex
+        while failed:
+            if not self._ease_linear_solve(self._array(x)):
                 y.zeroEntries()
                 return True
             self._ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)
             self._ksp.solve(residual, y)
-            self.more_linear += self._ksp.getIterationNumber()
+            self.extra_iterations += self._ksp.getIterationNumber()
             changed = True
-            useless = self._useless(residual, y)
-        if self._contact is not None and not useless:
-            changed |= self._foresee(x, residual, y)
-        bent = self._arcs is not None and self.globalisation.trusts and self._bend(x, residual, y)
-        if self._equations.active.with_edges and self.globalisation.trusts and not bent:
-            changed |= self._follow_triangles(x, residual, y)
-        if self._equations.limits_steps and not bent:
-            changed |= self._limit(x, residual, y)
-        changed |= bent
-        if self._corrects and self.globalisation.trusts:
-            exact = self._linear.same and self._blend.value == 0.0
-            changed |= self._correct(x, y, exact=exact)
-        if self._from is not None:
-            self._from.destroy()
-        self._from, self._length = x.copy(), y.norm()
-        self.globalisation.search_along(residual.dot(y))
+            failed = self._lacks_descent(residual, y)
+        if self._contact is not None and not failed:
+            changed |= self._apply_contact_model(x, residual, y)
+        curved = (
+            self._arcs is not None
+            and self.globalisation.takes_full_steps
+            and self._apply_arcs(x, residual, y)
+        )
+        if self._equations.active.with_edges and self.globalisation.takes_full_steps and not curved:
+            changed |= self._turn_directors(x, residual, y)
+        if self._equations.limits_steps and not curved:
+            changed |= self._limit_step(x, residual, y)
+        changed |= curved
+        if self._corrects and self.globalisation.takes_full_steps:
+            exact = self._linear.uses_operator and self._blend.value == 0.0
+            changed |= self._apply_corrections(x, y, exact=exact)
+        if self._last_iterate is not None:
+            self._last_iterate.destroy()
+        self._last_iterate, self._step_length = x.copy(), y.norm()
+        self.globalisation.set_slope(residual.dot(y))
         return changed
 
-    def _ease(self, v: Array) -> bool:
-        """Let the linear system at velocities v be easier to solve, after that failed; whether it can be;
-        collective.
+    def _ease_linear_solve(self, v: Array) -> bool:
+        """Improve the preconditioner or regularise the matrix at velocities v after the linear solve failed.
+
+        Returns whether another solve may succeed; collective.
         """
-        if failed_factors.replace_failed(self._ksp) or self._linear.better_preconditioner(v):
+        if failed_factors.replace_failed(self._ksp) or self._linear.improve_preconditioner(v):
             return True
-        if not self._blend.raise_():
+        if not self._blend.increase():
             return False
-        self._linear.set_operator_again(v, self._blend.value)
+        self._linear.reassemble_operator(v, self._blend.value)
         return True
 
-    def _foresee(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Let a step y be that of the linear model in which parts do not pass each other; whether it is
-        another.
-        """
+    def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Replace a step y by that of `ContactModel`, which sees contacts along it; whether it changed."""
         assert self._contact is not None
         v = self._array(x)
 
         def assemble() -> None:
-            self._linear.set(v, self._blend.value, keep=False, convex=self._convex)
+            self._linear.assemble(v, self._blend.value, keep=False, convex=self._convex)
 
         def ease() -> bool:
-            self._linear.set_operator_again(v, self._blend.value)
-            return self._ease(v)
+            self._linear.reassemble_operator(v, self._blend.value)
+            return self._ease_linear_solve(v)
 
-        changed = self._contact.improve(v, residual, y, assemble, ease, self.forcing.in_use)
-        self.foreseen_linear += self._contact.linear_iterations
+        changed = self._contact.improve(v, residual, y, assemble, ease, self.forcing.effective_tolerance)
+        self.contact_iterations += self._contact.linear_iterations
         return changed
 
-    def _correct(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
-        """Solve again and again with the same matrix at the end of a step y that is taken in full, as long as
-        what is left there becomes much less; whether y is another by that. ``exact``: y is the whole Newton
-        step, and more than one correction is tried.
+    def _apply_corrections(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
+        """Add corrections, solved with the same factors, to a step y that is taken in full.
 
-        The first takes back the stretch of a step along tangents, for a residual and a solve with factors at
-        hand (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order). What
-        follows are steps of Broyden's method.
+        Each is solved for the residual at the end of the step, as long as it reduces that residual notably.
+        With ``exact``, where y is the unmodified Newton step, several are tried, else one. Returns whether y
+        changed. The first removes the stretch of a linear step (Traub, Iterative Methods for the Solution of
+        Equations, 1964, chapter 8: of third order), the others are steps of Broyden's method.
         """
         convergence, v = self.convergence, self._array(x)
         first = v - self._array(y)
-        size, force = self._force(first)
+        size, force = self._residual(first)
         if size == 0.0:
             return False
-        left, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
+        right, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
         corrected = False
-        for _ in range(MOST_CORRECTIONS if exact else 1):
-            left.setArray(force.ravel())
-            self._ksp.solve(left, correction)
-            self.more_linear += self._ksp.getIterationNumber()
+        for _ in range(MAX_CORRECTIONS if exact else 1):
+            right.setArray(force.ravel())
+            self._ksp.solve(right, correction)
+            self.extra_iterations += self._ksp.getIterationNumber()
             if exact:
-                _by_secants(correction, steps)
+                _apply_broyden(correction, steps)
             before = size
-            size, force = self._force(v - self._array(y) - self._array(correction))
-            if not size < CORRECTED * before:
+            size, force = self._residual(v - self._array(y) - self._array(correction))
+            if not size < MAX_REMAINING * before:
                 break
             corrected = True
             y.axpy(1.0, correction)
-            if exact and convergence.corrected_by(_largest(correction), _largest(steps[-1]), size):
+            if exact and convergence.correction_suffices(_max_norm(correction), _max_norm(steps[-1]), size):
                 break
             steps.append(correction.copy())
         if corrected:
             self._equations.linearise_to(first)
-        for vector in (left, correction, *steps):
+        for vector in (right, correction, *steps):
             vector.destroy()
         return corrected
 
-    def _force(self, v: Array) -> tuple[float, Array]:
+    def _residual(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
         equations, force = self._equations, np.empty(self._shape)
         equations.residual(v, equations.stage.sigma * (v - equations.history), force)
         (square,) = equations.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
-    def bend_guess(self, v: Array, guess: Array) -> None:
-        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs: the end of least energy of all
-        ways that are expected; collective.
+    def curve_guess(self, v: Array, guess: Array) -> None:
+        """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs; collective.
+
+        Of all expected increments it takes the one whose end has the least energy.
         """
         integrator = self._equations.integrator
         if self._arcs is None or not isinstance(integrator, Static):
             return
-        least, ways = np.inf, [guess - v, *(way / integrator.pseudo_dt for way in integrator.alternatives)]
-        for way in ways:
-            there = v + self._arcs.bend(v, way, strains=False)[0]
-            self._equations.prescribe(there)
-            energy = self._equations.objective(there)[0] if len(ways) > 1 else 0.0
-            if energy < least:
-                least, guess[:] = energy, there
+        others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
+        lowest = np.inf
+        for increment in (guess - v, *others):
+            end = v + self._arcs.curve(v, increment, strains=False)[0]
+            self._equations.prescribe(end)
+            energy = self._equations.objective(end)[0] if others else 0.0
+            if energy < lowest:
+                lowest, guess[:] = energy, end
 
     def tangent(self, force: Array) -> tuple[Array | None, int]:
         """See `Stepper.tangent`."""
-        if self._arcs is None or self._reach == 0.0:
+        if self._arcs is None or self._last_c == 0.0:
             return None, 0
         b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
         b.setArray(force.ravel())
         self._ksp.solve(b, x)
-        way = self._reach * self._array(x)
+        displacement = self._last_c * self._array(x) if self._ksp.getConvergedReason() > 0 else None
         b.destroy()
         x.destroy()
-        return (way if self._ksp.getConvergedReason() > 0 else None), int(self._ksp.getIterationNumber())
+        return displacement, int(self._ksp.getIterationNumber())
 
-    def _bend(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Let a step y that is taken in full go along arcs, as far as they lead; whether it does."""
+    def _apply_arcs(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Replace a step y that is taken in full by one along arcs if it descends; whether y changed."""
         assert self._arcs is not None
         v = self._array(x)
-        if not self._arcs.matter(-self._array(y)):
+        if not self._arcs.turns_notably(-self._array(y)):
             return False
         before = y.copy()
-        bent, way = self._arcs.bend(v, -self._array(y))
-        y.setArray(-bent.ravel())
-        downwards = bool(residual.dot(y) > 0.0)
-        if downwards:
-            self._equations.linearise_to(v + way)
-            self.allowed = 1.0
+        curved, increment = self._arcs.curve(v, -self._array(y))
+        y.setArray(-curved.ravel())
+        descends = bool(residual.dot(y) > 0.0)
+        if descends:
+            self._equations.linearise_to(v + increment)
+            self.step_fraction = 1.0
         else:
             before.copy(y)
         before.destroy()
-        return downwards
+        return descends
 
     def destroy(self) -> None:
-        """Free what it has of PETSc's; collective."""
+        """Free the PETSc objects of its own; collective."""
         if self._arcs is not None:
             self._arcs.destroy()
 
-    def _follow_triangles(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Let directors follow their triangles in a step y that is taken in full; whether any does."""
-        way = -self._array(y)
-        if not self._equations.turn_directors(self._array(x), way):
+    def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
+        increment = -self._array(y)
+        if not self._equations.turn_directors(self._array(x), increment):
             return False
         before = y.copy()
-        y.setArray(-way.ravel())
-        downwards = bool(residual.dot(y) > 0.0)
-        if not downwards:
+        y.setArray(-increment.ravel())
+        descends = bool(residual.dot(y) > 0.0)
+        if not descends:
             before.copy(y)
         before.destroy()
-        return downwards
+        return descends
 
-    def _limit(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Shorten a step y to what terms allow, or let it lead past what is near; whether it is another."""
+    def _limit_step(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Shorten a step y to what terms allow, or separate the pairs that it brings too near.
+
+        Returns whether y changed.
+        """
         equations, v = self._equations, self._array(x)
         fraction = equations.largest_step(v, -self._array(y))
-        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell
-        past = equations.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
-        if past is not None:
+        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
+        separated = equations.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
+        if separated is not None:
             before = y.copy()
-            y.setArray(-past.ravel())
-            farther = equations.largest_step(v, past) if residual.dot(y) > 0.0 else 0.0
+            y.setArray(-separated.ravel())
+            farther = equations.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:
                 before.copy(y)
-                past = None
+                separated = None
             before.destroy()
-        self.allowed = fraction
+        self.step_fraction = fraction
         y.scale(fraction)
-        return past is not None or fraction < 1.0
+        return separated is not None or fraction < 1.0
 
-    def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Whether the linear solve failed in a way that leaves no direction of descent."""
+    def _lacks_descent(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Whether the linear solve failed or gave no direction of descent."""
         if self._ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0:
             return True
-        return self._linear.same and negative_pivots(self._ksp.getPC()) > 0
+        return self._linear.uses_operator and negative_pivots(self._ksp.getPC()) > 0
 
     def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
         """For ``SNES.setConvergenceTest``."""
-        spent = self.linear_iterations - self.foreseen_linear
+        spent = self.linear_iterations - self.contact_iterations
         return self.convergence.test(snes, iteration, norms[2], spent)
 
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold for the next steps to be solved as they would be."""
         return {
-            "convex": self._began_convex,
+            "convex": self._convex_at_start,
             "tolerance": self.forcing.tolerance,
-            "usual": self.convergence.usual,
+            "usual": self.convergence.mean_iterations,
             **self._blend.memory(),
             **self._linear.shift.memory(),
         }
 
     def restore(self, memory: Mapping[str, float]) -> None:
-        """Go on with a memory; an older one has less."""
-        self._began_convex = bool(memory.get("convex", self._began_convex))
+        """Continue from a memory; entries that older checkpoints lack keep their defaults."""
+        self._convex_at_start = bool(memory.get("convex", self._convex_at_start))
         self.forcing.tolerance = float(memory.get("tolerance", self.forcing.tolerance))
-        self.convergence.usual = float(memory.get("usual", self.convergence.usual))
+        self.convergence.mean_iterations = float(memory.get("usual", self.convergence.mean_iterations))
         self._blend.restore(memory)
         self._linear.shift.restore(memory)
 
     @property
     def linear_iterations(self) -> int:
         """Linear iterations of the present solve so far."""
-        return int(self._snes.getLinearSolveIterations()) + self.more_linear + self.foreseen_linear
+        return int(self._snes.getLinearSolveIterations()) + self.extra_iterations + self.contact_iterations

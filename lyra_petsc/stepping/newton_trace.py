@@ -1,6 +1,6 @@
-"""What a nonlinear solve did, iteration by iteration, and where it stood when it failed.
+"""The history of a nonlinear solve, and the state of a failed one.
 
-Arrays are rows of the owned vertices; collective where the solver is.
+Arrays have a row for each owned block row. Functions that call the solver are collective.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class Iteration:
     Attributes
     ----------
     residual : float
-        Norm [N].
+        Norm [N] of the residual.
     linear_iterations : int
-        Of the direction that led here; 0 for the first iterate.
+        Linear iterations of the step to this iterate; 0 for the first iterate.
     linear_reason : int
-        KSP's reason to stop there; 0 for the first iterate.
+        KSP's converged reason in this step; 0 for the first iterate.
     taken : float or None
-        Fraction of the direction that the line search took; None for the first iterate.
+        Fraction of the step that the line search took; None for the first iterate.
     """
 
     residual: float
@@ -40,25 +40,25 @@ class Iteration:
 
 @dataclass(frozen=True)
 class FailedSolve:
-    """Where a failed solve stood.
+    """The state of a failed solve.
 
     Attributes
     ----------
     iterations : tuple of Iteration
     norm : float
-        Of the residual [N], with prescribed coordinates.
+        Norm [N] of the residual, rows of prescribed unknowns included.
     time : float
-        Of the stage [s], or the load factor.
+        Time [s] of the stage, or the load factor.
     velocity, position : (n_owned, 3)
-        Of the stage, [m/s] and [m].
+        Velocities [m/s] and positions [m] of the stage.
     residual : (n_owned, 3)
-        [N]; may hold numbers that are not finite.
+        Residual [N], possibly with numbers that are not finite.
     forces : dict of name → (n_owned, 3)
-        The parts that the residual is the sum of [N].
+        The parts [N] whose sum is the residual.
     prescribed : (n_owned, 3) bool
-        Coordinates that handles prescribe.
+        Unknowns that handles prescribe.
     goal : (n_owned, 3)
-        Where they prescribe them to be at the end of the step [m]; elsewhere the position before it.
+        Prescribed positions [m] at the end of the step, elsewhere the positions before the step.
     snes_reason, ksp_reason : int
     linear_residuals : (n,)
         Residual norms of the last linear solve [N], where KSP kept them.
@@ -78,21 +78,21 @@ class FailedSolve:
     linear_residuals: Array
 
     def of_vertices(self, n: int) -> FailedSolve:
-        """The same with the rows of the n owned vertices alone."""
+        """The same without the rows of edges, for n owned vertices."""
         rows = ("velocity", "position", "residual", "prescribed", "goal")
         forces = {name: part[:n] for name, part in self.forces.items()}
         return replace(self, forces=forces, **{name: getattr(self, name)[:n] for name in rows})
 
 
 class Trace:
-    """Watches one SNES.
+    """Records the iterations of one SNES.
 
     Parameters
     ----------
     snes : PETSc.SNES
     system : StageEquations
     linear_iterations : callable
-        Those of the present solve so far.
+        Returns the number of linear iterations of the present solve so far.
     """
 
     def __init__(
@@ -105,18 +105,18 @@ class Trace:
         self._last: Array | None = None
         self._ksp.setConvergenceHistory(reset=True)
 
-    def begin(self) -> None:
-        """A new solve."""
+    def begin_solve(self) -> None:
+        """Forget the last solve."""
         self._iterations, self._linear, self._last = [], 0, None
 
     def monitor(self, snes: PETSc.SNES, number: int, norm: float) -> None:
-        """Note the present iterate; for ``SNES.setMonitor``."""
+        """Record the present iterate; for ``SNES.setMonitor``; collective."""
         here = snes.getSolution().getArray(readonly=True).copy()
         linear = self._linear_iterations()
         taken = None
         if number > 0 and self._last is not None:
-            way = here - self._last
-            (square,) = self._system.points.global_sum(float(np.vdot(way, way)))
+            increment = here - self._last
+            (square,) = self._system.points.global_sum(float(np.vdot(increment, increment)))
             moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0
@@ -124,9 +124,10 @@ class Trace:
         self._iterations.append(Iteration(norm, linear - self._linear, reason, taken))
         self._linear, self._last = linear, here
 
-    def stuck(self, velocity: Array | None = None) -> FailedSolve:
-        """Where the solve that just failed stands, or one that does not begin, at a velocity (n_owned, 3);
-        collective, before the next step begins.
+    def failed_solve(self, velocity: Array | None = None) -> FailedSolve:
+        """The state of the solve that just failed; collective, before the next step begins.
+
+        If a solve could not begin, ``velocity`` (n_owned, 3) [m/s] is its starting point.
         """
         system, stage = self._system, self._system.stage
         n = system.points.n_owned

@@ -1,4 +1,4 @@
-"""The function whose gradient the residual of a step is, and its round-off: what line searches compare."""
+"""The function that a step minimises, whose gradient is the residual, and its round-off."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Objective:
     """Called with velocities v (n_owned, 3) of the stage; collective.
 
-    The last two values are kept: a line search ends, and a first guess begins, where one was computed before.
+    The last two values are kept, because the end of a line search and the first guess are evaluated twice.
     """
 
     def __init__(self, equations: StageEquations) -> None:
@@ -28,18 +28,18 @@ class Objective:
         self._size = 0.0
 
     def begin_step(self) -> None:
-        """Take the coordinates' size from the state that the step starts from."""
+        """Drop kept values, and take the largest coordinate from the state at the start of the step."""
         self.forget()
         self._size = float(np.abs(self._equations.x).max(initial=0.0))
 
     def forget(self) -> None:
-        """Drop kept values, as the equations are others now."""
+        """Drop kept values, after the equations have changed."""
         self._kept = []
 
     def __call__(self, v: Array) -> tuple[float, float]:
-        """The function, and what its round-off is relative to [W]; collective.
+        """Value of the function, and the scale to which its round-off is relative, both [W]; collective.
 
-        The latter is the size of its summands, and for each elastic energy the root of itself times the
+        The scale is the sum of the absolute summands and of the geometric mean of each elastic energy and the
         energy at which strains are of order one: small strains are small differences of large coordinates.
         """
         if self._kept:
@@ -66,7 +66,7 @@ class Objective:
                 stiffness = term.stiffness(x, of.active.frozen[term])[: term.n_owned]
             sizes = term.sizes(self._size)
             of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
-            # ** would raise where the square is infinite
+            # `**` would raise an error where the square is infinite
             square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
         parts.append(-rate * float(np.vdot(of.applied.force, x[:n] - of.x[:n])))
         if of.applied.following is not None:

@@ -469,7 +469,7 @@ class Sensitivities:
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
             system.set_iterate(None)
-            linear.set(velocity, 0.0, keep=keep, convex=True)
+            linear.assemble(velocity, 0.0, keep=keep, convex=True)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()
         ksp.setTolerances(rtol=max(0.3 * self._tolerance, 1e-13), atol=0.0, max_it=5000)

@@ -191,7 +191,7 @@ class Stepper:
         if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.limits_motion:
             from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
 
-            snes.setMonitor(ContactMonitor(equations, lambda: newton.allowed))
+            snes.setMonitor(ContactMonitor(equations, lambda: newton.step_fraction))
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
@@ -200,7 +200,7 @@ class Stepper:
             rtol, stol = min(scene.solver.force_tolerance, 0.99), scene.solver.step_tolerance
             snes.setTolerances(rtol=rtol, atol=self._floor, stol=stol, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(newton.converged)
-            snes.setLineSearchPreCheck(newton.direction)
+            snes.setLineSearchPreCheck(newton.correct_direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
             ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC, max_it=5000)
@@ -234,11 +234,11 @@ class Stepper:
         self._follow_stencils()
         if iteration > 0 and self._equations.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
-            self._newton.globalisation.begin()
+            self._newton.globalisation.begin_solve()
 
     def _follow_stencils(self) -> bool:
         """Let the matrices be those of the present stencils; whether they are others; collective."""
-        if not self.linear.renew():
+        if not self.linear.update_pattern():
             return False
         self._set_jacobian()
         return True
@@ -288,8 +288,8 @@ class Stepper:
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
         stuck: FailedSolve | None = None
         if equations.discretisation.limits_motion and not equations.find_start():
-            self._trace.begin()
-            stuck = self._trace.stuck(equations.stationary_velocity())
+            self._trace.begin_solve()
+            stuck = self._trace.failed_solve(equations.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=stuck)
         velocity, words = self._solve(t0)
         if (
@@ -300,7 +300,7 @@ class Stepper:
             velocity, words = None, MEETS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
         outcome = self._newton.convergence
-        ended = outcome.norm, outcome.left, outcome.at_roundoff
+        ended = outcome.norm, outcome.remaining, outcome.at_roundoff
         if velocity is not None:
             if not self._iterates and equations.active.with_edges:
                 velocity = self._with_triangles(velocity)
@@ -314,12 +314,12 @@ class Stepper:
                     linear + self._newton.linear_iterations,
                 )
                 if rates is None:
-                    stuck, velocity = self._trace.stuck(), None
+                    stuck, velocity = self._trace.failed_solve(), None
                 equations.end_edge_solve(rates)
                 if rates is None:
                     equations.state.set(before, rate_before)
         else:
-            stuck = self._trace.stuck()
+            stuck = self._trace.failed_solve()
         self.ts.setTimeStep(t1 - t0)
         if velocity is not None:
             self.velocity.setArray(equations.v[: self._shape[0]].ravel())
@@ -333,9 +333,9 @@ class Stepper:
         finite = self.ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
         too_old = self.linear.reuse.reused and self._linear_failed and finite
         if not self._iterates and (
-            failed_factors.replace_failed(self.ksp) or self.linear.shift.raise_() or too_old
+            failed_factors.replace_failed(self.ksp) or self.linear.shift.increase() or too_old
         ):
-            self.linear.reuse.renew()
+            self.linear.reuse.discard()
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
 
@@ -374,12 +374,12 @@ class Stepper:
         length = 1.0 / (theta * stage.sigma)
         self.ts.setTime(t0 + stage.offset - theta * length)
         self.ts.setTimeStep(length)
-        self._newton.begin_step()
+        self._newton.begin_solve()
         if not self._iterates and not is_set("ksp_rtol"):
             self.ksp.setTolerances(
                 rtol=ONCE_IN_CONTACT if equations.discretisation.has_near_elements else ONCE
             )
-        self._trace.begin()
+        self._trace.begin_solve()
         try:
             self.ts.step()
         except Exception as error:
@@ -394,8 +394,8 @@ class Stepper:
             ) from None
         self._linear_failed = False
         if not self._iterates:
-            self.linear.reuse.solved(self.ksp.getIterationNumber())
-        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.judged:
+            self.linear.reuse.end_solve(self.ksp.getIterationNumber())
+        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.accepted:
             self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
@@ -414,7 +414,7 @@ class Stepper:
         arrays: dict[str, Array] = {}
         names, newton = self._left or (self.presets, self._newton.memory())
         numbers: dict[str, Any] = {"preset": names[0], **newton}
-        self.linear.reuse.renew()  # who goes on from here has none
+        self.linear.reuse.discard()  # who goes on from here has none
         if not self._iterates or self._left is not None:
             self._extrapolation.learn(time, self._equations.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()
@@ -442,7 +442,7 @@ class Stepper:
         """Positions (n_owned, 3) of the iterate of least energy of the last solve, if that is less than where
         Newton's method started; collective.
         """
-        velocity = self._newton.globalisation.lowest()
+        velocity = self._newton.globalisation.lowest_iterate()
         if velocity is None:
             return None
         positions: Array = self._equations.evaluate_at(velocity)[0][: len(velocity)].copy()
@@ -483,7 +483,7 @@ class Stepper:
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
         if first_guess(self._equations, guess):
-            self._newton.bend_guess(self._equations.stationary_velocity(), guess)
+            self._newton.curve_guess(self._equations.stationary_velocity(), guess)
         if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations
@@ -496,7 +496,7 @@ class Stepper:
     ) -> bool:
         self._newton.assemble(u)
         if self._iterates:
-            self._newton.globalisation.remember(u)
+            self._newton.globalisation.note_iterate(u)
         return True
 
 

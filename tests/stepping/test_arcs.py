@@ -12,7 +12,7 @@ from physics import grid, rotation, scene_of
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
 from lyra_petsc.stepping import equilibrium
-from lyra_petsc.stepping.arcs import FARTHEST, STRAIGHT, Arcs
+from lyra_petsc.stepping.arcs import MAX_TURN, MIN_TURN, Arcs
 from lyra_petsc.stepping.simulation import SteppedScene
 
 SHEET: dict[str, Any] = {
@@ -41,13 +41,13 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
 def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SHEET))
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
-    staying, way = turning(simulation, 0.9 * FARTHEST)
+    staying, way = turning(simulation, 0.9 * MAX_TURN)
     arcs = Arcs(system)
-    bent, straight = arcs.bend(staying, way)
+    bent, straight = arcs.curve(staying, way)
     np.testing.assert_array_equal(straight, way)
     start, there = system.x[:n].copy(), system.displacement(staying, bent)
     moved = (there[0] + there[1])[:n]
-    turned = start @ rotation(AXIS, 0.9 * FARTHEST).T
+    turned = start @ rotation(AXIS, 0.9 * MAX_TURN).T
 
     # nothing holds it: the middle goes on, beside its circle
     def middle(x: np.ndarray) -> np.ndarray:
@@ -75,14 +75,14 @@ def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
     way *= 0.01 / (system.stage.c * np.abs(way[:n]).max())
     apart = []
     for size in (0.1, 0.01):
-        bent, _ = arcs.bend(staying, size * way)
+        bent, _ = arcs.curve(staying, size * way)
         assert not np.any((bent - size * way)[~system.prescribed.free])
         apart.append(np.abs(bent - size * way).max())
     assert 0.0 < apart[1] < 0.02 * apart[0]
-    far, least = arcs.bend(staying, 1e3 * way)[1], 1e-6 * STRAIGHT
+    far, least = arcs.curve(staying, 1e3 * way)[1], 1e-6 * MIN_TURN
     assert np.abs(far).max() < 0.9 * np.abs(1e3 * way).max()  # cut
-    assert arcs.matter(1e3 * way)
-    assert not arcs.matter(least * way)
+    assert arcs.turns_notably(1e3 * way)
+    assert not arcs.turns_notably(least * way)
     arcs.destroy()
     simulation.destroy()
 

@@ -120,7 +120,7 @@ def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
     v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, 0.0, 0.8 * GAP / system.stage.c)
     system.evaluate_at(v)
     assert comm.size == 1 or comm.allreduce(system.points.n_local > n_local, MPI.LOR)
-    assert simulation.stepper.linear.renew()
+    assert simulation.stepper.linear.update_pattern()
     system.evaluate_at_start()
     simulation.stepper.presets = ["multigrid", "direct"]
     assert simulation.stepper.next_preset() == "direct"

@@ -15,15 +15,15 @@ from lyra_petsc.stepping.linear_system import SET_UP, Reuse
 MASK = np.zeros((1, 3), dtype=bool)
 
 
-def equations(reach: float = 0.01, mask: object = MASK) -> Any:
-    return SimpleNamespace(stage=SimpleNamespace(reach=reach), prescribed=SimpleNamespace(mask=mask))
+def equations(c: float = 0.01, mask: object = MASK) -> Any:
+    return SimpleNamespace(stage=SimpleNamespace(c=c), prescribed=SimpleNamespace(mask=mask))
 
 
 def test_it_is_kept_until_the_average_would_grow() -> None:
     reuse, kept = Reuse(acts=True), []
     for iterations in (10, 11, 12, 13, 14, 15, 16, 17):
-        kept.append(reuse.begin(equations()))
-        reuse.solved(iterations)
+        kept.append(reuse.begin_solve(equations()))
+        reuse.end_solve(iterations)
     # (8 + 10 + 11 + 12 + 13) / 4 = 13.5 > 13, (54 + 14) / 5 = 13.6 < 14
     assert SET_UP == 8.0
     assert kept == [False, True, True, True, True, False, True, True]
@@ -31,14 +31,14 @@ def test_it_is_kept_until_the_average_would_grow() -> None:
 
 def test_another_step_or_other_prescribed_unknowns_need_their_own() -> None:
     reuse = Reuse(acts=True)
-    for other in (equations(), equations(reach=0.02), equations(0.02, MASK.copy()), equations(mask=MASK)):
-        assert not reuse.begin(other)
-        reuse.solved(10)
-        assert reuse.begin(other)
-        reuse.solved(10)
+    for other in (equations(), equations(c=0.02), equations(0.02, MASK.copy()), equations(mask=MASK)):
+        assert not reuse.begin_solve(other)
+        reuse.end_solve(10)
+        assert reuse.begin_solve(other)
+        reuse.end_solve(10)
     never = Reuse(acts=False)
-    never.solved(10)
-    assert not never.begin(equations())
+    never.end_solve(10)
+    assert not never.begin_solve(equations())
 
 
 @pytest.mark.parallel(2)

@@ -14,7 +14,7 @@ from lyra_petsc import phases as profiling
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import INCOMPLETE
 from lyra_petsc.stepping import linear_system
-from lyra_petsc.stepping.linear_system import LARGEST_SHIFT, LEAST_SHIFT, DiagonalShift
+from lyra_petsc.stepping.linear_system import MAX_SHIFT, MIN_SHIFT, DiagonalShift
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
 """Positive definite, while its incomplete factors are not (Kershaw, J. Comput. Phys. 26, 1978, 43-65)."""
@@ -50,7 +50,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
     growing = DiagonalShift(ksp, acts=True)
-    assert growing.value == LEAST_SHIFT
+    assert growing.value == MIN_SHIFT
     tries = 0
     while True:
         diagonal = np.diag(KERSHAW) * (1.0 + growing.value)
@@ -61,15 +61,15 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
         if ksp.getConvergedReason() > 0:
             break
         tries += 1
-        assert growing.raise_()
+        assert growing.increase()
     assert tries > 0
-    assert LEAST_SHIFT < growing.value <= LARGEST_SHIFT
+    assert MIN_SHIFT < growing.value <= MAX_SHIFT
     np.testing.assert_allclose(KERSHAW @ y.getArray(), b.getArray(), atol=1e-4)
     # what did not fail asks for no more
-    assert not growing.raise_()
+    assert not growing.increase()
     before = growing.value
-    growing.begin()
-    assert LEAST_SHIFT <= growing.value < before
+    growing.decrease()
+    assert MIN_SHIFT <= growing.value < before
 
 
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
@@ -77,7 +77,7 @@ def test_nothing_is_enlarged_where_it_has_no_sense(kind: str, acts: bool) -> Non
     ksp, _ = solver(kind)
     idle = DiagonalShift(ksp, acts=acts)
     assert idle.value == 0.0
-    assert not idle.raise_()
+    assert not idle.increase()
 
 
 def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, list[str], str]:
@@ -99,8 +99,8 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
     x, notes, preset = journey(comm, "semi-implicit")
     assert (notes, preset) == ([], incomplete)
     if comm.size == 1:
-        monkeypatch.setattr(linear_system, "LEAST_SHIFT", 0.0)
-        monkeypatch.setattr(DiagonalShift, "raise_", lambda self: False)
+        monkeypatch.setattr(linear_system, "MIN_SHIFT", 0.0)
+        monkeypatch.setattr(DiagonalShift, "increase", lambda self: False)
         other, notes, preset = journey(comm, "semi-implicit")
         assert preset != "ilu"
         assert "linear solver 'ilu' broke down" in notes[0]

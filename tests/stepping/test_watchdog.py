@@ -13,14 +13,14 @@ from lyra_petsc.stepping.globalisation import PATIENCE, Watchdog
 def seen(energies: Iterable[float]) -> int:
     """After how many iterates of these energies trust is lost; 0 if it never is."""
     watchdog, u = Watchdog(), PETSc.Vec().createSeq(1)
-    watchdog.begin()
+    watchdog.begin_solve()
     lost = 0
     for number, energy in enumerate(energies, start=1):
-        watchdog.see(u, energy, 1e-14)
-        if watchdog.lost:
+        watchdog.note_iterate(u, energy, 1e-14)
+        if watchdog.must_return:
             lost = number
             break
-    watchdog.begin()
+    watchdog.begin_solve()
     u.destroy()
     return lost
 
