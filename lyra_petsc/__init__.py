@@ -5,8 +5,8 @@
     >>> run = lyra_petsc.run(scene, "runs/flag")
     >>> run.positions[-1], run.history
 
-``docs/python.md`` has more. Nothing heavy is imported, and neither MPI nor PETSc started, before a name is
-used that needs it; `load` and `Run` need neither.
+See ``docs/python.md``. Modules are imported, and MPI and PETSc started, when a name that needs them is first
+used; `load` and `Run` need neither MPI nor PETSc.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
     "run",
 ]
 
-_HOMES = {
+_MODULES = {
     "InputError": "errors",
     "LyraError": "errors",
     "OutputError": "errors",
@@ -57,10 +57,10 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    home = _HOMES.get(name)
-    if home is None:
+    module = _MODULES.get(name)
+    if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{home}"), name)
+    value = getattr(import_module(f"{__name__}.{module}"), name)
     globals()[name] = value
     return value
 

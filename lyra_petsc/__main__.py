@@ -9,9 +9,9 @@ import sys
 
 def main() -> None:
     """Run the command line and leave with its exit code."""
-    from lyra_petsc.cli.signals import leave_at_once
+    from lyra_petsc.cli.signals import exit_on_signals
 
-    leave_at_once()  # the imports that follow take a second
+    exit_on_signals()  # before the imports that follow, which take a second
     from lyra_petsc.cli.app import run_command_line
 
     code = run_command_line(sys.argv)
@@ -20,8 +20,8 @@ def main() -> None:
             stream.flush()
         except OSError:  # the reader is gone; Python would try again and complain
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-    # Python would look through all objects, and destroy them, after the last line: half a second of processor
-    # time, many on a busy machine; PETSc's in an order that need not be the same on all ranks
+    # keeps Python from destroying all objects at exit, which takes half a second or more, and frees PETSc's
+    # objects in an order that may differ between ranks
     gc.freeze()
     sys.exit(code)
 

@@ -1,4 +1,4 @@
-"""Starts mpirun, and other processes of this package, from a process that has no launcher."""
+"""Starts mpirun from a process that was not started by a launcher itself."""
 
 from __future__ import annotations
 
@@ -20,33 +20,34 @@ from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import reason
 
 POLL = 0.05
-"""Seconds between checks of a process."""
+"""Seconds between checks whether a process has ended."""
 
 GRACE = 10.0
-"""Seconds that a process has to end before it is killed."""
+"""Seconds after the request to end before a process is killed."""
 
 PR_SET_PDEATHSIG = 1
-"""Linux: the signal that a process gets when its parent ends."""
+"""Number of the Linux prctl that sets the signal a process gets when its parent ends."""
 
 LAUNCHER_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK", "PMIX_RANK", "MPI_LOCALNRANKS")
 """Environment variables of processes that a launcher has started."""
 
-NOT_INHERITED = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_", "ORTE_SCHIZO_")
+JOB_PREFIXES = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_", "ORTE_SCHIZO_")
 
-OF_ONE_PROCESS = frozenset(
+SINGLETON_VARIABLES = frozenset(
     f"OMPI_MCA_{name}"
     for name in ("ess", "pmix", "orte_launch", "orte_ess_num_procs", "orte_precondition_transports")
 )
-"""What Open MPI 4 sets in a process without a launcher, and what mpirun started from there would fail by."""
+"""Variables that Open MPI 4 sets in a process without a launcher, with which an mpirun started there
+fails."""
 
 
 def is_launched(environment: Mapping[str, str]) -> bool:
     """Whether this process was started by mpirun, mpiexec or srun."""
-    if environment.get("OMPI_MCA_ess") == "singleton":  # below a process that no launcher has started
+    if environment.get("OMPI_MCA_ess") == "singleton":  # child of a process without a launcher
         return False
     if any(name in environment for name in LAUNCHER_VARIABLES):
         return True
-    # only inside srun: a batch script has the first of these, too
+    # only within srun: a batch script may have the first of these variables as well
     return "SLURM_STEP_NUM_TASKS" in environment and "SLURM_PROCID" in environment
 
 
@@ -56,7 +57,7 @@ def find_launcher(ranks: int) -> list[str]:
     Raises
     ------
     InputError
-        Under an mpirun, for a number that is none, or where there is no launcher.
+        Under an mpirun, for fewer ranks than one, or if there is no launcher.
     """
     if ranks < 1:
         raise InputError(f"must be at least 1, not {ranks}", key="--ranks")
@@ -75,40 +76,41 @@ def find_launcher(ranks: int) -> list[str]:
 
 def environment() -> dict[str, str]:
     """Environment for a launcher: that of this process without the variables of a parallel job."""
-    ours = {
+    variables = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(NOT_INHERITED) and name not in OF_ONE_PROCESS
+        if not name.startswith(JOB_PREFIXES) and name not in SINGLETON_VARIABLES
     }
-    ours.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
-    ours.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
-    ours.setdefault("OMP_NUM_THREADS", "1")
+    variables.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
+    variables.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
+    variables.setdefault("OMP_NUM_THREADS", "1")
     if os.geteuid() == 0:
         for name in ("OMPI_ALLOW_RUN_AS_ROOT", "PRTE_ALLOW_RUN_AS_ROOT"):
-            ours[name] = ours[f"{name}_CONFIRM"] = "1"
-    home = str(Path(lyra_petsc.__file__).resolve().parents[1])
-    if home not in site.getsitepackages():
-        ours["PYTHONPATH"] = home + os.pathsep * bool(ours.get("PYTHONPATH")) + ours.get("PYTHONPATH", "")
-    return ours
+            variables[name] = variables[f"{name}_CONFIRM"] = "1"
+    root = str(Path(lyra_petsc.__file__).resolve().parents[1])
+    if root not in site.getsitepackages():
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, [root, variables.get("PYTHONPATH")]))
+    return variables
 
 
 def run_launched(
     words: Sequence[str], watch: Callable[[], None], keep_open: Sequence[int] = ()
 ) -> tuple[int, str]:
-    """Run a launcher's command to its end; its exit code and its standard error.
+    """Run a command with a launcher to its end; returns its exit code and its standard error.
 
     Parameters
     ----------
     words : sequence of str
+        The command.
     watch : callable
-        Called repeatedly; if it raises, the process is ended.
+        Called repeatedly; if it raises, the process is terminated.
     keep_open : sequence of int
-        File descriptors that it inherits.
+        File descriptors that the process inherits.
 
     Raises
     ------
     OutputError
-        If it cannot be started.
+        If the command cannot be started.
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors_file:
         try:
@@ -136,7 +138,7 @@ def run_launched(
 
 
 def _end_with_parent() -> Callable[[], None] | None:
-    """What a new process calls so that it ends when this one is killed; None if the system lacks that."""
+    """Function for a new process to call so that it ends with this one; None if the system has no prctl."""
     try:
         control = ctypes.CDLL(None).prctl
     except (AttributeError, OSError):
@@ -153,8 +155,8 @@ def _terminate(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def last_words(errors: str, code: int) -> str:
-    """The message of a launched process: the line of this program, else its last line and the exit code."""
+def error_message(errors: str, code: int) -> str:
+    """Message of a failed process: this program's line in ``errors``, else exit code and last line."""
     own = [line for line in errors.splitlines() if line.startswith("lyra-petsc: ")]
     if own:
         return own[0].removeprefix("lyra-petsc: ")

@@ -1,4 +1,4 @@
-"""The loop of a run: set-up, all steps, results on disk, and a summary for every way of ending."""
+"""The loop of a run: set-up, all steps, results on disk, and a summary however the run ends."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from lyra_petsc.scene.load import STORED, with_stored_bending_model
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
-StopAsked = Callable[[], int]
-"""Returns the signal by which any rank was asked to stop, else 0; collective."""
+SignalCheck = Callable[[], int]
+"""Returns the signal that requested any rank to stop, else 0; collective."""
 
 
 class ProgressCallbacks:
-    """Called on all ranks while a run goes on; to be overridden."""
+    """Methods called on all ranks during a run; to be overridden."""
 
     def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """The initial state, or that of the checkpoint, is on disk in ``folder``."""
@@ -40,7 +40,7 @@ class ProgressCallbacks:
         """A step was accepted and recorded."""
 
     def close(self) -> None:
-        """No step follows, whatever the reason."""
+        """The last step is over, for whatever reason."""
 
     def done(self, simulation: SteppedScene, folder: Path) -> None:
         """The run has reached its end, and all its files are written."""
@@ -51,7 +51,7 @@ def simulate(
     scene: Scene,
     choice: FolderChoice,
     callbacks: ProgressCallbacks,
-    stop: StopAsked,
+    stop: SignalCheck,
     phases: Phases | None = None,
 ) -> Path:
     """Simulate a scene from its start or from a checkpoint; collective. Returns the folder of the results.
@@ -61,9 +61,9 @@ def simulate(
     InputError
         Bad input; nothing is written.
     SolverError, OutputError
-        The run could not go on; all states announced before can be read.
+        The run could not continue; all states written before can be read.
     Interrupted
-        It was asked to stop; the last step is in the checkpoint.
+        A signal requested it to stop; the last step is in the checkpoint.
     """
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
         import_ahead()
@@ -85,8 +85,8 @@ def simulate(
             simulation.problem.release()
             _RunLoop(simulation, recorder, directory.path, callbacks, resumed=choice.resume).run(stop)
         except BaseException:
-            if comm.size == 1:  # on several ranks some may not come here, and destruction is collective
-                with suppress(Exception):  # the first error is the one to report
+            if comm.size == 1:  # destruction is collective, and other ranks may not have failed
+                with suppress(Exception):  # report the first error
                     simulation.destroy()
             raise
         simulation.destroy()
@@ -94,7 +94,7 @@ def simulate(
 
 
 class _RunLoop:
-    """Takes all steps, and writes the summary for every way of ending."""
+    """Takes all steps, and writes the summary however the run ends."""
 
     def __init__(
         self,
@@ -113,20 +113,20 @@ class _RunLoop:
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
         if resumed:
-            earlier = self._earlier()
+            earlier = self._earlier_summary()
             changes = [{"key": c.key, "old": c.old, "new": c.new} for c in recorder.changes]
             start = {"step": simulation.step_number, "time": simulation.time, "ranks": self._comm.size}
             self._resumed = [*earlier.get("resumed", []), start | {"changes": changes}]
 
-    def _earlier(self) -> dict[str, Any]:
-        """The summary of the run that is resumed; resuming does not depend on it."""
+    def _earlier_summary(self) -> dict[str, Any]:
+        """The summary of the run that is resumed, empty if it cannot be read."""
         try:
             return on_root(self._comm, lambda: read_summary(self._folder / "summary.json")) or {}
         except InputError as error:
             self._simulation.notes.append(f"{error}; what it told of earlier resumptions is lost")
             return {}
 
-    def run(self, stop: StopAsked) -> None:
+    def run(self, stop: SignalCheck) -> None:
         simulation, recorder, callbacks = self._simulation, self._recorder, self._callbacks
         self._summarise("running")
         try:
@@ -140,13 +140,13 @@ class _RunLoop:
                     recorder.record(report)
                 self._show_notes()
                 callbacks.step(simulation, report)
-                if note := self._waiting.look(last=simulation.finished):
+                if note := self._waiting.check(last=simulation.finished):
                     callbacks.note(note)
                 if number := stop():
                     recorder.write_checkpoint()
                     recorder.settle()
-                    told = f" after step {simulation.step_number} (t = {simulation.time:g} s)"
-                    raise Interrupted(f"{told}; the checkpoint is written, --resume goes on", number)
+                    when = f" after step {simulation.step_number} (t = {simulation.time:g} s)"
+                    raise Interrupted(f"{when}; the checkpoint is written, --resume goes on", number)
             with simulation.phases("output"):
                 recorder.settle()
             if simulation.note_of_repeats:
@@ -156,7 +156,7 @@ class _RunLoop:
                 error.details += self._write_failure(str(error))
             raise
         except LyraError as error:
-            with suppress(OutputError):  # on a full disk this fails as well
+            with suppress(OutputError):  # fails as well on a full disk
                 self._summarise(str(error))
             if isinstance(error, OutputError) and not self._folder.is_dir():
                 error.details += (f"the folder {self._folder} is gone; nothing can be resumed",)
@@ -176,7 +176,7 @@ class _RunLoop:
         self._notes_shown = len(self._simulation.notes)
 
     def _write_failure(self, outcome: str) -> tuple[str, ...]:
-        """Write the last good state and the failed step; where these can be looked at."""
+        """Write the last accepted state and the failed step; returns lines that name their files."""
         try:
             self._recorder.write_state()
             self._recorder.settle()

@@ -16,7 +16,7 @@ from types import FrameType
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.api.run_loop import ProgressCallbacks, StopAsked, simulate
+from lyra_petsc.api.run_loop import ProgressCallbacks, SignalCheck, simulate
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.api.simulations import refuse_mixed_options
 from lyra_petsc.errors import Interrupted, LyraError
@@ -41,7 +41,7 @@ def run(
     comm: MPI.Comm | None = None,
     progress: bool | None = None,
 ) -> Path:
-    """`lyra_petsc.run`, of which it has the parameters and errors; the folder of the results; collective."""
+    """Implements `lyra_petsc.run`, see there; returns the folder of the results; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
     callbacks = NotebookProgress(on_step, shown=in_notebook() if progress is None else progress)
     try:
@@ -49,8 +49,8 @@ def run(
         refuse_mixed_options(loaded)
         stem = loaded.source.stem if loaded.source else "scene"
         choice = choose(comm, stem, out, force=force, resume=resume)
-        with _noted_interrupt(comm) as stop_asked, np.errstate(over="ignore", invalid="ignore"):
-            folder = simulate(comm, loaded, choice, callbacks, stop_asked)
+        with _defer_interrupt(comm) as stop, np.errstate(over="ignore", invalid="ignore"):
+            folder = simulate(comm, loaded, choice, callbacks, stop)
     except (LyraError, KeyboardInterrupt) as error:
         callbacks.end("stopped")
         if isinstance(error, Interrupted):
@@ -71,7 +71,7 @@ class NotebookProgress(ProgressCallbacks):
     """Calls a function after each step, and shows a bar below the cell."""
 
     def __init__(self, on_step: OnStep | None, *, shown: bool) -> None:
-        self._on_step, self._words, self._share = on_step, "set-up and first step", 0.0
+        self._on_step, self._text, self._fraction = on_step, "set-up and first step", 0.0
         self._drawn, self._handle = -REDRAW_SECONDS, None
         if shown:
             from IPython.display import display
@@ -80,16 +80,16 @@ class NotebookProgress(ProgressCallbacks):
 
     def step(self, simulation: SteppedScene, report: StepReport) -> None:
         end = simulation.control.end
-        self._share = min(report.time / end, 1.0)
-        self._words = f"step {report.step}, t = {report.time:.4g} of {end:.4g}"
+        self._fraction = min(report.time / end, 1.0)
+        self._text = f"step {report.step}, t = {report.time:.4g} of {end:.4g}"
         if time.monotonic() - self._drawn >= REDRAW_SECONDS:
             self._draw()
         if self._on_step is not None:
             self._on_step(report)
 
-    def end(self, words: str) -> None:
-        """No step follows."""
-        self._words += f", {words}"
+    def end(self, outcome: str) -> None:
+        """Show how the run ended."""
+        self._text += f", {outcome}"
         self._draw()
 
     def _draw(self) -> None:
@@ -98,28 +98,28 @@ class NotebookProgress(ProgressCallbacks):
             self._handle.update(self)
 
     def _repr_html_(self) -> str:
-        return f'<progress max="1" value="{self._share:.4f}"></progress> {html.escape(self._words)}'
+        return f'<progress max="1" value="{self._fraction:.4f}"></progress> {html.escape(self._text)}'
 
     def __repr__(self) -> str:
-        return f"{self._share:.0%} {self._words}"
+        return f"{self._fraction:.0%} {self._text}"
 
 
 @contextmanager
-def _noted_interrupt(comm: MPI.Comm) -> Iterator[StopAsked]:
-    """Within the context a first interrupt is noted, and a second one is handled as before it."""
-    seen = 0
+def _defer_interrupt(comm: MPI.Comm) -> Iterator[SignalCheck]:
+    """Within the context a first interrupt is only recorded; a second one is handled as before."""
+    received = 0
     before = signal.getsignal(signal.SIGINT)
-    in_main_thread = threading.current_thread() is threading.main_thread()  # others may not handle signals
+    in_main_thread = threading.current_thread() is threading.main_thread()  # only it may set handlers
 
-    def note(number: int, frame: FrameType | None) -> None:
-        nonlocal seen
-        seen = number
+    def record(number: int, frame: FrameType | None) -> None:
+        nonlocal received
+        received = number
         signal.signal(signal.SIGINT, before)
 
     if in_main_thread:
-        signal.signal(signal.SIGINT, note)
+        signal.signal(signal.SIGINT, record)
     try:
-        yield lambda: int(comm.allreduce(seen, MPI.MAX))
+        yield lambda: int(comm.allreduce(received, MPI.MAX))
     finally:
         if in_main_thread:
             signal.signal(signal.SIGINT, before)

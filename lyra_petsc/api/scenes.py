@@ -1,4 +1,4 @@
-"""Scenes from files, or from dictionaries."""
+"""Loads scenes from files or dictionaries."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SceneLike: TypeAlias = Scene | str | Path | Mapping[str, Any]
 def load(
     source: SceneLike | None = None, changes: Mapping[str, Any] | None = None, *, trust_mesh: bool = False
 ) -> Scene:
-    """A checked scene.
+    """Load and check a scene.
 
     Parameters
     ----------
     source : path, mapping or Scene, optional
-        A scene file, or its keys as nested dictionaries; without it the default scene, a flag.
+        A scene file, or its keys as nested dictionaries; default is the default scene, a flag.
     changes : mapping of ``key.path`` to value, optional
         As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
     trust_mesh : bool
@@ -33,12 +33,12 @@ def load(
     Returns
     -------
     Scene
-        Its attributes have the names of the scene file's keys; ``scene.changed({…})`` makes another.
+        Its attributes have the names of the scene file's keys; ``scene.changed({…})`` returns a changed copy.
 
     Raises
     ------
     InputError
-        On anything that cannot be used, naming file and key.
+        For invalid input, naming file and key.
     """
     with in_python():
         if isinstance(source, Mapping):

@@ -21,7 +21,7 @@ from lyra_petsc.parallel import on_root, take_back_signals
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene
 
-take_back_signals()  # the import of PETSc has replaced them
+take_back_signals()  # PETSc's import has replaced the signal handlers
 
 
 _OPEN: weakref.WeakSet[Simulation] = weakref.WeakSet()
@@ -36,15 +36,15 @@ class Step:
     number : int
         Accepted steps so far.
     time, dt : float
-        End and length of the step [s]; of the load factor in a static analysis.
+        End and length of the step [s]; in a static analysis load factor and its increment.
     positions, velocities : (n, 3) float64
-        [m], [m/s], of this rank's vertices, ``Simulation.vertices``.
+        Positions [m] and velocities [m/s] of this rank's vertices, ``Simulation.vertices``.
     energies : dict of str to float
-        [J]; see ``Simulation.energies``.
+        Energies [J]; see ``Simulation.energies``.
     newton_iterations, linear_iterations, rejected : int
-        What it took, rejected attempts included.
+        Numbers of iterations, including those of rejected attempts, and of rejected attempts.
     residual : float
-        Norm of the force residual [N] that was left.
+        Norm of the final force residual [N].
     wall_seconds : float
     """
 
@@ -70,14 +70,14 @@ class Simulation:
             for step in flag:
                 print(step.time, step.energies["kinetic"])
 
-    Under mpirun every rank has the vertices it owns; in one process that is all of them, in the
-    order of the mesh file only after ``gather``.
+    Under mpirun every rank has the vertices it owns; a single process has all of them. ``gather`` returns
+    arrays in the order of the mesh file.
 
     Parameters
     ----------
     scene : Scene, path or mapping
     comm : MPI.Comm, optional
-        COMM_WORLD unless given.
+        Default COMM_WORLD.
     trust_mesh : bool
         Give gmsh this scene's scripts (.geo) whatever they say.
 
@@ -116,19 +116,19 @@ class Simulation:
     # -- stepping ------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[Step]:
-        """The steps from here to the end of the scene."""
+        """Take the remaining steps up to the end of the scene."""
         while not self.finished:
             yield self.step()
 
     def step(self) -> Step:
-        """One step, repeated with a smaller Δt where it fails.
+        """Take one step, which is repeated with a smaller Δt if it fails.
 
         Raises
         ------
         SolverError
             If even the smallest Δt fails; the state is that before the step.
         """
-        # numbers that overflow make a step fail, and the message says so
+        # overflow makes a step fail, with a message of its own
         with np.errstate(over="ignore", invalid="ignore"):
             report = self._running.step()
         return Step(
@@ -152,7 +152,7 @@ class Simulation:
 
     @property
     def time(self) -> float:
-        """[s], or the load factor of a static analysis."""
+        """Current time [s], or the load factor of a static analysis."""
         return self._running.time
 
     @property
@@ -164,21 +164,21 @@ class Simulation:
 
     @property
     def positions(self) -> Array:
-        """(n, 3) current positions [m] of this rank's vertices, a copy."""
+        """Current positions (n, 3) [m] of this rank's vertices, a copy."""
         return self._running.problem.system.x[: len(self.vertices)].copy()
 
     @property
     def velocities(self) -> Array:
-        """(n, 3) current velocities [m/s] of this rank's vertices, a copy."""
+        """Current velocities (n, 3) [m/s] of this rank's vertices, a copy."""
         return np.array(self._running.problem.system.output_velocity()[: len(self.vertices)])
 
     def field(self, name: str) -> Array:
-        """A field that ``output.fields`` of a scene may name, on this rank's vertices or triangles.
+        """A field of those that a scene's ``output.fields`` may name, on this rank's vertices or triangles.
 
         Raises
         ------
         InputError
-            If there is none of that name, or its term is not in the scene.
+            If there is no field of that name, or the scene lacks its term.
         """
         if name not in FIELDS:
             raise InputError(f"unknown field {name!r}, {nearest(name, FIELDS)}", key="field")
@@ -188,9 +188,11 @@ class Simulation:
 
     @property
     def energies(self) -> dict[str, float]:
-        """Of the whole sheet [J]: kinetic, membrane, bending, potential; and the cumulative works
-        external_work (handles and loads other than gravity) and dissipation (damping of the material and of
-        impacts); and the energies of terms that have a column of their own in history.csv.
+        """Energies [J] of the whole sheet.
+
+        kinetic, membrane, bending, potential; the cumulative works external_work (handles and loads other
+        than gravity) and dissipation (damping of the material and of impacts); and the energies of terms with
+        a column in history.csv.
         """
         energies = asdict(self._running.budget)
         more: dict[str, float] = energies.pop("more")
@@ -198,18 +200,18 @@ class Simulation:
 
     @property
     def notes(self) -> list[str]:
-        """What one should know: mesh repairs, a linear solver that was changed, …"""
+        """Messages for the user, about mesh repairs, a changed linear solver, …"""
         return [*self._running.notes, *filter(None, [self._running.note_of_repeats])]
 
     def gather(self, rows: NDArray[Any], on: Literal["vertex", "triangle"] = "vertex") -> NDArray[Any] | None:
-        """Rows of the ranks' vertices, or triangles, in the order of the mesh file: on rank 0, else None.
+        """Gather rows of all ranks in the order of the mesh file on rank 0; None on other ranks.
 
         Parameters
         ----------
         rows : (n, ...) or (m, ...) array
-            A row for each of this rank's ``vertices``, as in ``positions``, or ``triangles``.
+            A row for each of this rank's ``vertices``, as in ``positions``, or of its ``triangles``.
         on : str
-            Which of these.
+            Whether rows are on vertices or triangles.
         """
         numbers = self.vertices if on == "vertex" else self.triangles
         if not self.comm.allreduce(len(rows) == len(numbers), MPI.LAND):
@@ -232,7 +234,7 @@ class Simulation:
         return self._stepping
 
     def close(self) -> None:
-        """Free what PETSc and MPI hold, and take back the scene's PETSc options; collective."""
+        """Free all PETSc and MPI objects, and remove the scene's PETSc options; collective."""
         if self._stepping is not None:
             self._stepping.destroy()
             self._stepping = None
@@ -244,17 +246,17 @@ class Simulation:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None or self.comm.size == 1:  # on several ranks others may not come here
+        if error is None or self.comm.size == 1:  # collective: other ranks may not have the error
             self.close()
 
     def __del__(self) -> None:
-        # on several ranks it is not known whether all of them drop it at the same time
+        # collective: several ranks need not delete it at the same time
         if getattr(self, "_stepping", None) is not None and self.comm.size == 1 and not MPI.Is_finalized():
             self.close()
 
 
 def refuse_mixed_options(scene: Scene) -> None:
-    """PETSc has one set of options: two simulations at a time cannot have different ones.
+    """Refuse a scene whose PETSc options differ from those of an open simulation: PETSc has one database.
 
     Raises
     ------

@@ -1,4 +1,5 @@
-"""The start of the command line, and the message and exit code of each way of failing."""
+"""Entry point of the command line: starts PETSc, runs a verb, and turns errors into messages and exit
+codes."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.arguments import help_asked, petsc_cannot_start, split, start_petsc
+from lyra_petsc.cli.arguments import move_help, split, start_error, start_petsc
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError, with_short_words
 from lyra_petsc.parallel import take_back_signals
@@ -20,7 +21,7 @@ from lyra_petsc.parallel import take_back_signals
 PROGRAM = "lyra-petsc"
 
 COMPLETION = "_LYRA_PETSC_COMPLETE"
-"""Variable by which the shell asks click for completions; click derives it from the program's name."""
+"""Environment variable by which a shell requests completions; click derives it from the program's name."""
 
 BUG = 70
 """Exit code of unexpected errors."""
@@ -29,20 +30,20 @@ PETSC_OUT_OF_MEMORY = 55
 """PETSc's error code PETSC_ERR_MEM."""
 
 RESERVE = 4 * 2**20
-"""Bytes kept in reserve: a rank that is out of memory needs some to say so, and MPI to end the job."""
+"""Bytes kept in reserve: a rank that runs out of memory needs some to print a message and end the job."""
 
 
 def run_command_line(argv: Sequence[str]) -> int:
     """Start PETSc with its part of the arguments and run the verb; returns the exit code."""
-    if COMPLETION in os.environ:  # the shell asks at a press of the tab key: PETSc is not needed
+    if COMPLETION in os.environ:  # completion does not need PETSc
         verbs.main([], prog_name=PROGRAM)
-    ours, petsc = help_asked(*split(argv[1:]))
-    # without a launcher Open MPI starts a daemon, which only a process that spawns others would need
+    ours, petsc = move_help(*split(argv[1:]))
+    # without a launcher Open MPI would start a daemon, which is only needed to spawn processes
     os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
     try:
-        why = petsc_cannot_start(petsc)
-        if not why:
-            why = start_petsc([argv[0], *petsc])
+        failure = start_error(petsc)
+        if not failure:
+            failure = start_petsc([argv[0], *petsc])
             take_back_signals()
         import numpy as np
         from mpi4py import MPI
@@ -55,18 +56,18 @@ def run_command_line(argv: Sequence[str]) -> int:
         return InputError.exit_code
 
     comm = MPI.COMM_WORLD
-    if why:
-        _say(comm, why)
-        MPI.Finalize()  # which a PETSc that has not started leaves to others
+    if failure:
+        _print_error(comm, failure)
+        MPI.Finalize()  # PETSc does not, as it has not started
         return InputError.exit_code
     from petsc4py import PETSc
 
     from lyra_petsc.linear.petsc_options import quoted, refused
 
     reserve = [bytes(RESERVE)]
-    # numba would put colour codes on the standard output where it finds colorama
+    # if colorama is installed, numba would print colour codes to the standard output
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-    # numbers that overflow make a step fail, and the message says so
+    # overflow makes a step fail, with a message of its own
     np.seterr(over="ignore", invalid="ignore")
     try:
         code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=comm)
@@ -77,7 +78,7 @@ def run_command_line(argv: Sequence[str]) -> int:
     except click.ClickException as error:
         return _leave_together(comm, InputError.exit_code, _in_one_line(error))
     except (Exception, KeyboardInterrupt) as error:
-        reserve.clear()  # Open MPI without memory leaves with a code of its own
+        reserve.clear()  # without memory Open MPI would end with another exit code
         if isinstance(error, PETSc.Error) and quoted(error):
             line = str(refused(error))
             _clear_frames(error)
@@ -91,14 +92,15 @@ def run_command_line(argv: Sequence[str]) -> int:
 
 
 def _clear_frames(error: BaseException) -> None:
-    """Free the objects that the frames of an exception and of its causes still hold."""
+    """Free the objects referenced by the frames of an exception and of its causes."""
     chain: BaseException | None = error
     while chain is not None:
         traceback.clear_frames(chain.__traceback__)
         chain = chain.__cause__ or chain.__context__
 
 
-def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
+def _print_error(comm: Any, line: str, details: Sequence[str] = ()) -> None:
+    """Print an error message with details on rank 0."""
     if comm.rank == 0:
         lines = [f"lyra-petsc: {' '.join(line.split())}", *(f"  {detail}" for detail in details)]
         with suppress(OSError):
@@ -109,9 +111,9 @@ def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()
     """Print the message; returns the exit code if all ranks failed together, else ends the MPI job."""
     from lyra_petsc.parallel import all_here
 
-    _say(comm, line, details)
+    _print_error(comm, line, details)
     if not all_here(comm):
-        if comm.rank > 0:  # rank 0, which prints the messages, does not know
+        if comm.rank > 0:  # rank 0 may not have failed, and printed nothing
             with suppress(OSError):
                 print(f"lyra-petsc: rank {comm.rank}: {' '.join(line.split())}", file=sys.stderr, flush=True)
         comm.Abort(code)
@@ -119,10 +121,10 @@ def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()
 
 
 def _report_unexpected(comm: Any, error: BaseException) -> int:
-    """Print an unexpected error, which this rank alone may have met; returns the exit code."""
+    """Print an unexpected error, which may concern this rank only; returns the exit code."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
-    where = f"{Path(frame.filename).name}:{frame.lineno}"
-    what = f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'} ({where})"
+    location = f"{Path(frame.filename).name}:{frame.lineno}"
+    message = f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'} ({location})"
     if isinstance(error, MemoryError) or getattr(error, "ierr", 0) == PETSC_OUT_OF_MEMORY:
         code, kind = SolverError.exit_code, "out of memory"
         remedy = "take more memory, more machines or a coarser mesh"
@@ -130,7 +132,7 @@ def _report_unexpected(comm: Any, error: BaseException) -> int:
         code, kind = BUG, "internal error"
         remedy = "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
     with suppress(OSError):
-        print(f"lyra-petsc: {kind} on rank {comm.rank}: {what}; {remedy}", file=sys.stderr, flush=True)
+        print(f"lyra-petsc: {kind} on rank {comm.rank}: {message}; {remedy}", file=sys.stderr, flush=True)
     if os.environ.get("LYRA_TRACEBACK"):
         traceback.print_exception(error)
     return code

@@ -1,7 +1,7 @@
-"""Splits a command line into our arguments and PETSc's options.
+"""Splits a command line into arguments of this program and PETSc options, and starts PETSc.
 
-Ours begin with two dashes; everything with one dash and a letter goes to PETSc together with its
-value, as in every PETSc program. A scene that follows a PETSc flag is still the scene.
+Options of this program begin with two dashes; an option with one dash and a letter goes to PETSc together
+with its value, as in every PETSc program. A scene that follows a PETSc flag is not taken for its value.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _TAKES_FILE = ("options_file", "options_file_yaml", "options_string", "options_s
 
 
 def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Our arguments and PETSc's, each in order.
+    """Arguments of this program, and PETSc options, each in order.
 
-    A word after a PETSc option is its value unless it is an option itself; a negative number is a
-    value. A word that names a scene (.yaml, .yml, .json) is ours, but after ``-options_file`` and its
-    kin. What follows ``--`` is ours.
+    A word after a PETSc option is its value unless it is an option itself; a negative number is a value. A
+    word that names a scene (.yaml, .yml, .json) belongs to this program, except after ``-options_file`` and
+    similar options; so does all that follows ``--``.
     """
     ours: list[str] = []
     petsc: list[str] = []
@@ -35,7 +35,7 @@ def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
             return ours + [word, *words], petsc
         if word.startswith("--"):
             ours.append(word)
-            # --name value: the value is ours even when it begins with a dash and a digit
+            # in ``--name value`` the value is a separate word, and may begin with a dash and a digit
             continue
         if not _PETSC.match(word):
             ours.append(word)
@@ -52,10 +52,10 @@ def _is_value(option: str, word: str) -> bool:
     return not _SCENE.match(word) or option.lstrip("-") in _TAKES_FILE
 
 
-def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]:
-    """Both kinds of arguments, with PETSc's ``-help`` as our ``--help``.
+def move_help(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]:
+    """Both kinds of arguments, with ``-help`` turned into ``--help`` of this program.
 
-    Beside a scene to run it stays PETSc's, whose objects list their options as they are made.
+    With a scene to run it stays a PETSc option, by which PETSc objects list their options when created.
     """
     runs = ours[:1] == ["run"] and any(_SCENE.match(word) for word in ours[1:])
     if "-help" not in petsc or runs:
@@ -63,20 +63,20 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
     return [*ours[:1], "--help"], [word for word in petsc if word != "-help"]
 
 
-def petsc_cannot_start(words: Sequence[str]) -> str:
-    """Why PETSc would fail or crash as it reads these options, PETSC_OPTIONS and option files; else empty."""
-    every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
-    files = [] if "-skip_petscrc" in every else [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
-    for path in filter(os.path.isfile, files):
+def start_error(options: Sequence[str]) -> str:
+    """Message if PETSc would fail or crash when it reads these options, PETSC_OPTIONS and option files."""
+    all_options = [*os.environ.get("PETSC_OPTIONS", "").split(), *options]
+    files = [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
+    for path in filter(os.path.isfile, [] if "-skip_petscrc" in all_options else files):
         with suppress(OSError, ValueError):
-            if why := _cannot_start(_words_of(Path(path).read_text("utf-8")), [os.path.realpath(path)]):
+            if why := _options_error(_read_words(Path(path).read_text("utf-8")), [os.path.realpath(path)]):
                 return f"{path}: {why}"
-    return _cannot_start(every, [])
+    return _options_error(all_options, [])
 
 
-def _cannot_start(every: Sequence[str], files: list[str]) -> str:
-    """Why PETSc would not start with these options; ``files`` are those whose inclusion led here."""
-    for option, value in itertools.pairwise([*every, ""]):
+def _options_error(options: Sequence[str], files: list[str]) -> str:
+    """Message if PETSc would not start with these options; ``files`` are the files that include them."""
+    for option, value in itertools.pairwise([*options, ""]):
         if not option.startswith("-"):
             continue
         name = option.lstrip("-").lower()
@@ -90,7 +90,7 @@ def _cannot_start(every: Sequence[str], files: list[str]) -> str:
             if path in files:
                 return f"-{name}: '{value}' includes itself"
             if name == "options_file":
-                why = _wrong_line(text) or _cannot_start(_words_of(text), [*files, path])
+                why = _syntax_error(text) or _options_error(_read_words(text), [*files, path])
                 if why:
                     return f"-{name}: {value}: {why}"
         if name == "python":
@@ -104,16 +104,16 @@ def _cannot_start(every: Sequence[str], files: list[str]) -> str:
     return ""
 
 
-def _words_of(text: str) -> list[str]:
-    """The words of an options file without its comments."""
+def _read_words(text: str) -> list[str]:
+    """Words of an options file without its comments."""
     lines = (line.split("#")[0].split() for line in text.splitlines())
     return [word for words in lines if words and words[0][0] not in "!%" for word in words]
 
 
 def start_petsc(words: Sequence[str]) -> str:
-    """Start PETSc with its options; why it does not, or nothing.
+    """Start PETSc with its options; returns an error message, empty if it starts.
 
-    PETSc would say why in some twenty lines; without them, ``PetscErrorMessage`` tells.
+    PETSc's own message of some twenty lines is replaced by that of ``PetscErrorMessage``.
     """
     import petsc4py
     import petsc4py.lib
@@ -124,19 +124,19 @@ def start_petsc(words: Sequence[str]) -> str:
     printing.value = silent
     try:
         petsc4py.init(words)
-    except RuntimeError as error:  # of a class that petsc4py has only once it has started
-        told = ctypes.c_char_p(), ctypes.c_char_p()
-        library.PetscErrorMessage(error.args[0], *map(ctypes.byref, told))
-        reason = "; ".join(text.value.decode("utf-8", "replace") for text in told if text.value)
+    except RuntimeError as error:  # PETSc.Error does not exist before PETSc has started
+        texts = ctypes.c_char_p(), ctypes.c_char_p()
+        library.PetscErrorMessage(error.args[0], *map(ctypes.byref, texts))
+        reason = "; ".join(text.value.decode("utf-8", "replace") for text in texts if text.value)
         return f"PETSc does not start with its options: {reason}"
     finally:
-        if printing.value == silent:  # else an option has chosen
+        if printing.value == silent:  # unless an option has changed it
             printing.value = usual
     return ""
 
 
-def _wrong_line(text: str) -> str:
-    """The first line of an options file that PETSc does not understand."""
+def _syntax_error(text: str) -> str:
+    """Message about the first line of an options file that PETSc does not understand, if any."""
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].split()
         if words and not (words[0][0] in "-!%" or words[0].lower() in ("alias", "mpi")):

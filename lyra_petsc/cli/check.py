@@ -1,4 +1,4 @@
-"""``check``: what a run of a scene would do; runs nothing."""
+"""The verb ``check`` for a scene: prints what a run would do, without running it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.simulation import SteppedScene
 
 LISTED_RANKS = 16
-"""Ranks shown one by one; of more, only the extremes."""
+"""Number of ranks up to which all are listed; of more only the extremes are."""
 
 
 def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_mesh: bool = False) -> None:
@@ -75,7 +75,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
                 f"tolerance {time.tolerance:g}; {written}"
             )
     width = None if Console().is_terminal else 100
-    # titles and paths are text: what looks like rich's markup in them is not
+    # without markup, as titles and paths may contain brackets
     console = Console(width=width, highlight=False, soft_wrap=True, markup=False, emoji=False)
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
@@ -107,7 +107,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
 
 
 def _sandbox(scene: Scene) -> list[tuple[str, str]]:
-    """How gmsh is sandboxed; only for scenes with gmsh scripts."""
+    """Row of the plan about gmsh's sandbox; only for scenes with gmsh scripts."""
     if not scene.has_scripts:
         return []
     return [("gmsh's sandbox", describe_sandbox(supported_layers(), trusted=scene.trusts_meshes))]
@@ -141,12 +141,12 @@ def _friction(friction: float | Friction) -> str:
 
 
 def _count(ratio: float) -> float:
-    """Whole steps in a run that is ``ratio`` steps long; inf where that overflows."""
+    """Number of whole steps in a run of length ``ratio`` · Δt; inf if that overflows."""
     return math.ceil(ratio - 1e-9) if math.isfinite(ratio) else ratio
 
 
 def _rank_table(ranks: Ints) -> Table:
-    """Table of each rank's share; a ghost row is one vertex or three edges."""
+    """Table of the ranks' parts of the mesh; a ghost row is one vertex or three edges."""
     edges = ["owned edges"] if ranks[:, 5].any() else []
     heads = ["rank", "owned vertices", *edges, "ghosts", "ghost share", "blocks", "elements"]
     table = Table(*heads, box=None, header_style="")
@@ -162,7 +162,7 @@ def _rank_table(ranks: Ints) -> Table:
 
 
 def _megabytes(ranks: Ints) -> float:
-    """Rough memory [MB] of the fullest rank: matrix, preconditioner, assembly buffers, element constants."""
+    """Estimated memory [MB] of the fullest rank: matrix, preconditioner, assembly buffers, element data."""
     return float((ranks[:, 2] * 9 * 8 * 4 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 
 

@@ -1,4 +1,4 @@
-"""``check`` of a run's folder: crossings of triangles with each other, and of sheets with obstacles."""
+"""The verb ``check`` for a run's folder: crossings of triangles with each other and with obstacles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StateCrossings(NamedTuple):
     corner_pairs : (m, 2) int64
         Triangles with one common vertex that cross elsewhere.
     overlaps : mapping of str to Overlaps
-        What is in each obstacle.
+        Parts of sheets inside each obstacle.
     """
 
     pairs: Ints
@@ -39,7 +39,7 @@ class StateCrossings(NamedTuple):
 
 
 def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: int) -> StateCrossings:
-    """The crossings in a state of a run with these obstacles.
+    """Crossings in a state of a run with these obstacles.
 
     Raises
     ------
@@ -56,34 +56,34 @@ def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: 
     return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 
 
-NAMED = 3
-"""Pairs of a state that are named, and at least as many obstacles."""
+MAX_NAMED = 3
+"""Number of pairs of a state that are listed; together with obstacles twice as many."""
 
 PAIRS = "{:>5} {:>11} {:>16} {:>17}  "
 INSIDE = "{:>11} {:>8} {:>12}  "
-"""Columns of the table; the second where the scene has obstacles."""
+"""Columns of the table; the second ones only if the scene has obstacles."""
 
 
 def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
-    """Print on rank 0 what crosses in each state of a run; collective. Each rank looks at some of the states.
+    """Print the crossings in each state of a run on rank 0; collective. Each rank checks some of the states.
 
     Parameters
     ----------
     comm : MPI.Comm
     folder : Path
-        Of the run, which may go on.
+        Folder of the run, which may still be running.
     crossings : bool
-        Crossings of sheets are a failure also where the scene has no contact of sheets with themselves.
+        Whether crossings of sheets are a failure even if the scene has no self-contact.
 
     Returns
     -------
     int
-        Exit code: 1 if anything crosses that contact rules out, or with ``crossings`` at all.
+        Exit code: 1 for crossings that contact should prevent, or with ``crossings`` for any.
 
     Raises
     ------
     InputError
-        If it is not the folder of a run, or is damaged.
+        If the folder is not that of a run, or is damaged.
     """
     run = on_root(comm, lambda: StoredRun(folder))
     scene = on_root(comm, lambda: run.scene)
@@ -91,57 +91,56 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     row = PAIRS + (INSIDE if scene.obstacles else "")
     time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
-    _say(comm, f"{folder}: {len(run)} states; pairs of triangles that cross, with")
-    _say(comm, row.format("state", time, *heads) + "first")
+    _print(comm, f"{folder}: {len(run)} states; pairs of triangles that cross, with")
+    _print(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_each(comm, partial(_of_state, run, obstacles, begin + comm.rank))
+        found = on_each(comm, partial(_count_in_state, run, obstacles, begin + comm.rank))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
                 rows.append(one[0])
-                _say(comm, row.format(state, f"{run.times[state]:g}", *one[0]) + one[1])
+                _print(comm, row.format(state, f"{run.times[state]:g}", *one[0]) + one[1])
     counts = np.array(rows)
     pairs, inside = counts[:, :2].sum(axis=1), counts[:, 2:].sum(axis=1)
-    _say(comm, _summary("crossings", pairs, "pairs"))
+    _print(comm, _summary("crossings", pairs, "pairs"))
     if scene.obstacles:
-        _say(comm, _summary("parts of sheets in obstacles", inside, "vertices, edges and triangles"))
+        _print(comm, _summary("parts of sheets in obstacles", inside, "vertices, edges and triangles"))
     judged = crossings or (scene.contact is not None and scene.contact.self)
     if not judged:
-        _say(comm, "the scene has no contact of sheets; --crossings makes a crossing exit code 1")
+        _print(comm, "the scene has no contact of sheets; --crossings makes a crossing exit code 1")
     return int(inside.any() or (judged and pairs.any()))
 
 
-def _of_state(
+def _count_in_state(
     run: StoredRun, obstacles: Sequence[Solid | Container], state: int
 ) -> tuple[list[int], str] | None:
-    """The counts of a state's row, and the names to print; None beyond the last state."""
+    """Counts of a state for its row of the table, and the names to print; None beyond the last state."""
     if state >= len(run):
         return None
     found = crossings_of(run, obstacles, state)
     inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
     in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else [0, 0, 0]
-    pairs = np.concatenate([found.pairs[:NAMED], found.corner_pairs[:NAMED]])[:NAMED]
-    first = [f"{one}-{other}" for one, other in pairs.tolist()]
-    first += [_where(name, overlap) for name, overlap in found.overlaps.items() if len(overlap.triangles)]
-    return [len(found.pairs), len(found.corner_pairs), *in_all], ", ".join(first[: 2 * NAMED])
+    pairs = np.concatenate([found.pairs[:MAX_NAMED], found.corner_pairs[:MAX_NAMED]])[:MAX_NAMED]
+    names = [f"{one}-{other}" for one, other in pairs.tolist()]
+    names += [_describe(name, overlap) for name, overlap in found.overlaps.items() if len(overlap.triangles)]
+    return [len(found.pairs), len(found.corner_pairs), *in_all], ", ".join(names[: 2 * MAX_NAMED])
 
 
-def _where(name: str, overlap: Overlaps) -> str:
-    """An obstacle, and the first that is in it."""
+def _describe(name: str, overlap: Overlaps) -> str:
+    """Name of an obstacle, and the first vertex or triangle in it."""
     if len(overlap.vertices):
         return f"{name}: vertex {overlap.vertices[0]}"
     return f"{name}: triangle {overlap.triangles[0]}"
 
 
-def _summary(what: str, counts: Ints, of: str) -> str:
+def _summary(subject: str, counts: Ints, unit: str) -> str:
     if not counts.any():
-        return f"no {what} in {len(counts)} states"
-    most = int(counts.argmax())
-    return (
-        f"{what} in {(counts > 0).sum()} of {len(counts)} states, most in state {most}: {counts[most]} {of}"
-    )
+        return f"no {subject} in {len(counts)} states"
+    worst = int(counts.argmax())
+    affected = f"{subject} in {(counts > 0).sum()} of {len(counts)} states"
+    return f"{affected}, most in state {worst}: {counts[worst]} {unit}"
 
 
-def _say(comm: MPI.Comm, line: str) -> None:
+def _print(comm: MPI.Comm, line: str) -> None:
     if comm.rank == 0:
         print(line.rstrip(), flush=True)

@@ -38,7 +38,7 @@ class FitProgress(ProgressBar, Observer):
     def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
         self._cost = f"  sum of squares {2.0 * trial.cost:.5g}"
         again = " (from before)" if resumed else ""
-        self._line(f"evaluation {number}{self._cost}{again}")
+        self._print_line(f"evaluation {number}{self._cost}{again}")
 
 
 def fit(

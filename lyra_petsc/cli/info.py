@@ -1,4 +1,4 @@
-"""``info``: versions and configuration of the installation, parts that do not fit together, and remedies."""
+"""The verb ``info``: versions and configuration of the installation, incompatible parts, and remedies."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ OLDEST_PETSC = (3, 18)
 
 @dataclass
 class Installation:
-    """What was found; ``None`` where a part is missing."""
+    """Facts about the installation and the MPI job; ``None`` for a missing part."""
 
     ranks: int = 1
     launched: int = 1
-    """Ranks the launcher says it started."""
+    """Ranks that the launcher started, by its environment variables."""
     ranks_per_host: dict[str, int] = field(default_factory=dict)
     cores: int = 1
-    """Of the host of rank 0."""
+    """Cores of the host of rank 0."""
     threads: str = ""
-    """OMP_NUM_THREADS as it stands; empty when unset."""
+    """Value of OMP_NUM_THREADS; empty if unset."""
     petsc: tuple[int, ...] | None = None
     complex_scalars: bool = False
     mpi_libraries: tuple[str, ...] = ()
-    """Files of the MPI libraries loaded."""
+    """Files of the loaded MPI libraries."""
     missing: list[str] = field(default_factory=list)
     broken: dict[str, str] = field(default_factory=dict)
 
 
-def misfits(found: Installation) -> list[str]:
+def incompatibilities(found: Installation) -> list[str]:
     """One line for each problem, with its remedy."""
     lines = [f"{name} is missing: {_source(name)}." for name in found.missing]
     lines += [f"{name} is there but fails: {error}." for name, error in found.broken.items()]
@@ -56,18 +56,18 @@ def misfits(found: Installation) -> list[str]:
             "h5py must be built with the same one."
         )
     if found.petsc is not None and found.petsc[:2] < OLDEST_PETSC:
-        version, least = ".".join(map(str, found.petsc)), ".".join(map(str, OLDEST_PETSC))
-        lines.append(f"PETSc {version} is too old: {least} or newer is needed.")
+        version, oldest = ".".join(map(str, found.petsc)), ".".join(map(str, OLDEST_PETSC))
+        lines.append(f"PETSc {version} is too old: {oldest} or newer is needed.")
     if found.complex_scalars:
         lines.append(
             "PETSc was built with complex scalars: use a real build (Debian: python3-petsc4py-real; "
             'conda-forge: "petsc=*=real*").'
         )
     threads = int(found.threads) if found.threads.isdigit() else 1
-    crowded = max(found.ranks_per_host.values(), default=1)
-    if threads > 1 and threads * crowded > found.cores:
+    ranks = max(found.ranks_per_host.values(), default=1)
+    if threads > 1 and threads * ranks > found.cores:
         lines.append(
-            f"OMP_NUM_THREADS={threads} on {crowded} ranks asks for more than the {found.cores} cores of a "
+            f"OMP_NUM_THREADS={threads} on {ranks} ranks asks for more than the {found.cores} cores of a "
             "host: set OMP_NUM_THREADS=1, the ranks are the parallelism."
         )
     return lines
@@ -82,21 +82,16 @@ def _source(name: str) -> str:
 
 
 EXTERNAL = ("ptscotch", "parmetis", "hypre", "ml", "mumps", "superlu_dist", "suitesparse", "hdf5")
-"""Packages PETSc may have been built with that matter here (suitesparse brings CHOLMOD)."""
+"""Optional packages of PETSc that are relevant here (suitesparse contains CHOLMOD)."""
 
 
 def info(comm: Any) -> str:
-    """Versions, configuration and misfits as text.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-        Collective over it.
+    """Versions, configuration and incompatibilities as text; collective.
 
     Returns
     -------
     str
-        Several lines, the same on every rank; a part that is missing or broken is named as such.
+        Several lines, the same on every rank, in which missing and broken parts are marked.
     """
     hosts = comm.allgather(socket.gethostname())
     facts = Installation(
@@ -120,30 +115,30 @@ def info(comm: Any) -> str:
     lines.append(("ranks", ranks))
     width = max(len(name) for name, _ in lines)
     text = [f"{name:<{width}}  {value}" for name, value in lines]
-    found = misfits(facts)
+    problems = incompatibilities(facts)
     text.append("")
     text += (
-        ["What does not fit together:", *(f"- {misfit}" for misfit in found)]
-        if found
+        ["What does not fit together:", *(f"- {problem}" for problem in problems)]
+        if problems
         else ["All fits together."]
     )
-    # what rank 0 found counts: h5py and the libraries are the same files on every rank
+    # rank 0 decides: h5py and the libraries are the same files on every rank
     return comm.bcast("\n".join(text), root=0)
 
 
 def launched_ranks(environment: Mapping[str, str]) -> int:
-    """Number of ranks the launcher says it started; 1 without a launcher."""
+    """Number of ranks that the launcher started, by its environment variables; 1 without a launcher."""
     for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MPI_LOCALNRANKS"):
         if environment.get(name, "").isdigit():
             return int(environment[name])
-    # only inside srun: sbatch sets SLURM_NTASKS for the batch script, which is one process, too
+    # only within srun: the batch script, a single process, has SLURM_NTASKS as well
     if environment.get("SLURM_STEP_NUM_TASKS", "").isdigit() and "SLURM_PROCID" in environment:
         return int(environment["SLURM_STEP_NUM_TASKS"])
     return 1
 
 
 def loaded_mpi_libraries() -> tuple[str, ...]:
-    """Files of the MPI libraries in this process; empty where the system does not tell."""
+    """Files of the MPI libraries loaded in this process; empty on systems without /proc."""
     try:
         maps = Path("/proc/self/maps").read_text(errors="replace")
     except OSError:
@@ -159,7 +154,7 @@ def _described(name: str, describe: Callable[[Installation], str], facts: Instal
     except ModuleNotFoundError:
         facts.missing.append(name)
         return "missing"
-    except Exception as error:  # a broken library may raise anything, and this verb is where it shows
+    except Exception as error:  # a broken library may raise anything, and this verb must report it
         facts.broken[name] = " ".join(str(error).split()) or type(error).__name__
         return "broken"
 
@@ -197,7 +192,7 @@ def _petsc(facts: Installation) -> str:
 
 
 def _petsc_debugging(config: Mapping[str, str]) -> bool | None:
-    """Whether PETSc was built with debugging; ``None`` where its headers are not installed."""
+    """Whether PETSc was built with debugging; ``None`` if its headers are not installed."""
     header = Path(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", ""), "include", "petscconf.h")
     try:
         return "#define PETSC_USE_DEBUG 1" in header.read_text(errors="replace")
@@ -239,4 +234,4 @@ PARTS: dict[str, Callable[[Installation], str]] = {
     "pydantic": _module_version("pydantic"),
     "ruamel.yaml": _module_version("ruamel.yaml"),
 }
-"""What is described, in this order; each may note facts on the way."""
+"""The parts to describe, in this order; each function may also set facts."""

@@ -1,4 +1,4 @@
-"""``new``: write a commented starter scene."""
+"""The verb ``new``: writes a commented starter scene."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def new(comm: Any, name: str, mesh: Path | None, trust_mesh: bool) -> None:
 
     path = on_root(comm, lambda: write_starter(name, mesh, trust_mesh=trust_mesh))
     if comm.rank == 0:
-        word, (one, several) = shlex.quote(str(path)), ways_to_start()
-        click.echo(f"{path} written; next: {one} check {word}, then: {several} run {word}")
+        name, (one, several) = shlex.quote(str(path)), start_commands()
+        click.echo(f"{path} written; next: {one} check {name}, then: {several} run {name}")
 
 
-def ways_to_start() -> tuple[str, str]:
-    """Commands that start the program on one and on two ranks; the script of a checkout chooses by itself."""
+def start_commands() -> tuple[str, str]:
+    """Commands that start the program on one and on two ranks; in a checkout a script that chooses itself."""
     script = Path(__file__).resolve().parents[2] / "scripts" / "lyra.sh"
     if shutil.which("lyra-petsc") is None and script.is_file():
         command = f"bash {shlex.quote(os.path.relpath(script))}"
@@ -43,12 +43,12 @@ def ways_to_start() -> tuple[str, str]:
 
 
 def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
-    """Write it; the file's path.
+    """Write a starter scene; returns the file's path.
 
     Raises
     ------
     InputError
-        If there is such a file already, it cannot be written, or the mesh cannot be used.
+        If the file exists or cannot be written, or the mesh cannot be used.
     """
     from lyra_petsc.cli.starter import starter
 
@@ -56,11 +56,11 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
     if not given.name or not name.isprintable():
         raise InputError("must be a name for the scene's file", key="NAME")
     path = given if given.suffix.lower() in (".yaml", ".yml") else given.with_name(f"{given.name}.yaml")
-    if os.path.lexists(path):  # before the mesh, which may take long
+    if os.path.lexists(path):  # before the mesh is read, which may take long
         raise InputError("exists and is left as it is; choose another name", file=path)
-    text = starter(path, ways_to_start(), mesh, trust_mesh=trust_mesh)
+    text = starter(path, start_commands(), mesh, trust_mesh=trust_mesh)
     try:
-        # two at the same time: only one makes the file
+        # exclusive creation: of two processes at the same time only one succeeds
         with open(path, "x", encoding="utf-8") as file:
             file.write(text)
     except OSError as error:

@@ -1,7 +1,7 @@
 """Options that several verbs share.
 
-`cli.verbs` registers the commands. A module that declares one imports what it needs for its work only when
-it is called: the declarations of all verbs are read for each.
+`cli.verbs` registers the commands. A module that declares a verb imports the modules for its work only when
+it is called, as the declarations of all verbs are imported every time.
 """
 
 from __future__ import annotations
@@ -15,26 +15,27 @@ import click
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def tells(name: str, text: Callable[[click.Context], str], says: str) -> Decorator:
-    """An option that prints a text on rank 0 and ends."""
+def prints(name: str, text: Callable[[click.Context], str], description: str) -> Decorator:
+    """An option that prints a text on rank 0 and exits."""
 
-    def tell(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    def callback(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value and not ctx.resilient_parsing:
             if ctx.obj.rank == 0:
                 click.echo(text(ctx))
             ctx.exit()
 
-    return click.option(name, is_flag=True, is_eager=True, expose_value=False, callback=tell, help=says)
+    flags: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False}
+    return click.option(name, callback=callback, help=description, **flags)
 
 
-helped = tells("--help", click.Context.get_help, "Show this and exit.")
+with_help = prints("--help", click.Context.get_help, "Show this and exit.")
 
 
 SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
 
 
 def example(*lines: str) -> str:
-    """What a verb's help ends with: commands to copy."""
+    """The end of a verb's help: commands to copy."""
     heading = "Examples:" if len(lines) > 1 else "Example:"
     return "\n".join(["\b", heading, *(f"  {line}" for line in lines)])
 
@@ -44,7 +45,7 @@ def verb(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
 
     def declare(function: Callable[..., Any]) -> click.Command:
         command = click.command(context_settings=SETTINGS, epilog=example(*examples))
-        return command(helped(click.pass_obj(function)))
+        return command(with_help(click.pass_obj(function)))
 
     return declare
 

@@ -1,4 +1,4 @@
-"""What runs and films show on the terminal: how far they are, and at the end where a run's time went."""
+"""Progress of runs, films and studies on the terminal, and the closing table of a run's wall time."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from typing_extensions import Self
 
-FEWEST_STEPS = 3
-LEAST_SECONDS, LEAST_PART = 2.0, 0.05
-"""Steps, and seconds or part of the run, that have to be over for an estimate of the time left."""
+MIN_STEPS = 3
+MIN_SECONDS, MIN_FRACTION = 2.0, 0.05
+"""Steps, and seconds or fraction of the run, after which the remaining time is estimated."""
 
 REDRAW_SECONDS = 0.1
-LINE_SECONDS = 2.0  # plain lines never come faster than this,
-LINE_FRACTION = 0.05  # and then one for each 5 % of the run
-LINE_AT_LEAST_SECONDS = 60.0  # or each minute, whichever is first
+LINE_SECONDS = 2.0  # minimum time between plain lines;
+LINE_FRACTION = 0.05  # one is printed for each 5 % of the run
+MAX_LINE_SECONDS = 60.0  # or each minute, whichever comes first
 
 
 class ProgressBar:
-    """A progress bar where stderr is a terminal, plain lines where not. Shown by rank 0 only.
+    """A progress bar if stderr is a terminal, else plain lines. Shown by rank 0 only.
 
     Parameters
     ----------
     comm : MPI.Comm
-        All ranks may make the same calls; none communicates.
+        All ranks may make the same calls; no method communicates.
     plain : bool
-        Lines also on a terminal.
+        Print lines even on a terminal.
     stream : text stream
-        stderr unless given, so that stdout has results only.
+        Default stderr, so that stdout only has results.
     clock : callable
         Returns seconds.
     """
@@ -50,9 +50,10 @@ class ProgressBar:
     ) -> None:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
-        self._drawn, self._told, self._part_told = -math.inf, clock(), 0.0
-        self._pending = ""
-        self._first: tuple[float, float] | None = None
+        self._drawn = -math.inf  # clock time when the bar was last drawn
+        self._last_line, self._last_fraction = clock(), 0.0  # time and fraction of the last plain line
+        self._pending = ""  # a line that is not printed yet
+        self._first: tuple[float, float] | None = None  # time and work done at the first estimate
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
             self._bar = _bar(self._stream)
@@ -63,42 +64,42 @@ class ProgressBar:
         """Print a line for the user, above the bar."""
         if not self._shown:
             return
-        with suppress(OSError, ValueError):  # a run goes on also if its messages cannot be written
+        with suppress(OSError, ValueError):  # a run continues even if its messages cannot be written
             if self._bar is not None:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:
                 print(text, file=self._stream, flush=True)
 
     def _show(
-        self, fraction: float, state: str, *, seconds: float = LINE_AT_LEAST_SECONDS, part: float = math.inf
+        self, fraction: float, state: str, *, seconds: float = MAX_LINE_SECONDS, part: float = math.inf
     ) -> None:
-        """Move the bar, or print a line where none has come for so many seconds, or for that part of all."""
+        """Update the bar, or print a line if the last one is ``seconds`` or the fraction ``part`` ago."""
         now = self._clock()
-        if self._bar is not None:  # redrawn a few times a second and at the end
+        if self._bar is not None:
             with suppress(OSError):
                 self._bar.update(self._task, completed=fraction, state=state)
                 if fraction >= 1.0 or now - self._drawn >= REDRAW_SECONDS:
                     self._drawn = now
                     self._bar.refresh()
             return
-        self._pending, since = f"{fraction:4.0%}  {state}", now - self._told
-        if since >= seconds or (since >= LINE_SECONDS and fraction - self._part_told >= part - 1e-9):
-            self._part_told = fraction
-            self._line(self._pending)
+        self._pending, since = f"{fraction:4.0%}  {state}", now - self._last_line
+        if since >= seconds or (since >= LINE_SECONDS and fraction - self._last_fraction >= part - 1e-9):
+            self._last_fraction = fraction
+            self._print_line(self._pending)
 
-    def _line(self, text: str) -> None:
+    def _print_line(self, text: str) -> None:
         self.say(text)
-        self._told, self._pending = self._clock(), ""
+        self._last_line, self._pending = self._clock(), ""
 
-    def _left(self, done: float, whole: float = 1.0) -> float:
-        """Estimated seconds left, at the mean speed since the first call; NaN at the first call."""
+    def _remaining(self, done: float, whole: float = 1.0) -> float:
+        """Estimated remaining seconds, at the mean speed since the first call; NaN at the first call."""
         began, before = self._first = self._first or (self._clock(), done)
         if done <= before:
             return 0.0 if done >= whole else math.nan
         return (self._clock() - began) * (whole - done) / (done - before)
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Remove the bar."""
         if self._bar is not None:
             with suppress(OSError):
                 self._bar.refresh()
@@ -121,11 +122,11 @@ class Progress(ProgressBar):
     end : float
         Simulated time at which the run ends [s] (static: load factor 1).
     start : float
-        Simulated time at which it starts or goes on [s].
+        Simulated time at which it starts or resumes [s].
     unit : str
-        Of the time; empty: it is a load factor.
+        Unit of the time; empty for a load factor.
     **options
-        Of `ProgressBar`.
+        Parameters of `ProgressBar`.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class Progress(ProgressBar):
         self._name = "t" if unit else "load"
         self._unit = f" {unit}" if unit else ""
         self._start, self._end = start, end
-        self._steps, self._told = 0, -math.inf  # the first step is told at once
+        self._steps, self._last_line = 0, -math.inf  # the first step is shown at once
 
     def update(
         self, step: int, time: float, newton_iterations: int, linear_iterations: int, energy: float
@@ -149,30 +150,30 @@ class Progress(ProgressBar):
         time : float
             Simulated time [s].
         newton_iterations, linear_iterations : int
-            Of this step.
+            Iterations of this step.
         energy : float
             Kinetic and potential energy [J].
         """
         now = self._clock()
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
-        # the first step does what later ones need not, so the time left is estimated from the others
-        left, self._steps = self._left(fraction), self._steps + 1
+        # the estimate begins after the first step, which takes longer than later ones
+        remaining, self._steps = self._remaining(fraction), self._steps + 1
         began, done = self._first or (now, fraction)
-        enough = now - began >= LEAST_SECONDS or fraction - done >= LEAST_PART
+        enough = now - began >= MIN_SECONDS or fraction - done >= MIN_FRACTION
         state = (
             f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
             f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"
         )
-        if self._steps > FEWEST_STEPS and enough and math.isfinite(left):
-            state += f"  {duration(left)} left"
+        if self._steps > MIN_STEPS and enough and math.isfinite(remaining):
+            state += f"  {duration(remaining)} left"
         self._show(fraction, state, part=LINE_FRACTION)
 
     def close(self) -> None:
-        """Show the last step and leave the terminal as it was."""
+        """Show the last step and remove the bar."""
         super().close()
         if self._pending:
-            self._line(self._pending)
+            self._print_line(self._pending)
 
 
 class FrameProgress(ProgressBar):
@@ -181,8 +182,8 @@ class FrameProgress(ProgressBar):
     LINE_SECONDS = 10.0
 
     def update(self, done: int, count: int) -> None:
-        """Show how many of the states are drawn."""
-        text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
+        """Show the number of states that are drawn."""
+        text = f"{done} of {count} states drawn  {duration(self._remaining(done, count))} left"
         self._show(done / count, text, seconds=self.LINE_SECONDS)
 
 
@@ -195,38 +196,37 @@ class StudyProgress(ProgressBar):
     stop : callable
         Called after every step on all ranks; may raise to end the study.
     combinations : int
-        How many there are.
+        Number of combinations.
     **options
-        Of `ProgressBar`.
+        Parameters of `ProgressBar`.
     """
 
     def __init__(self, comm: MPI.Comm, stop: Callable[[], None], combinations: int, **options: Any) -> None:
         super().__init__(comm, **options)
         self._stop, self._combinations = stop, combinations
-        self._label, self._number, self._told = "", 0, -math.inf
+        self._label, self._number, self._last_line = "", 0, -math.inf
 
     def case(self, label: str, *, resumed: bool) -> None:
-        """A case begins, or was found finished."""
+        """A case begins, or was finished before."""
         reference = label.startswith("reference")
         self._number += not reference
         self._label = label if reference else f"{self._number}/{self._combinations} {label}"
         if self._bar is None:
-            self._line(f"{self._label}: finished before" if resumed else self._label)
+            self._print_line(f"{self._label}: finished before" if resumed else self._label)
 
     def progress(self, done: float, whole: float) -> None:
-        """Work done and in all; may raise, see ``stop``."""
+        """Show the work done of the whole work; may raise, see ``stop``."""
         self._stop()
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
-        # what was finished before took no time now
-        self._show(fraction, f"{self._label}  {duration(self._left(done, whole))} left")
+        self._show(fraction, f"{self._label}  {duration(self._remaining(done, whole))} left")
 
     def note(self, text: str) -> None:
-        """A line for the user, above the bar."""
-        self._line(f"note: {text}")
+        """Print a line for the user, above the bar."""
+        self._print_line(f"note: {text}")
 
 
 def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | str, outcome: str) -> None:
-    """Show where the time went, where the results are and how to open them. Rank 0 only.
+    """Print the wall time of each phase, where the results are and how to open them. Rank 0 only.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | st
 
 
 def duration(seconds: float) -> str:
-    """``1:05:09``, ``5:09`` or ``?``."""
+    """A duration [s] as ``1:05:09`` or ``5:09``; ``?`` if it is not finite."""
     if not math.isfinite(seconds):
         return "?"
     minutes, rest = divmod(round(seconds), 60)
@@ -274,5 +274,5 @@ def _bar(stream: TextIO) -> Any:
         TaskProgressColumn(),
         TextColumn("{task.fields[state]}", markup=False),
         console=Console(file=stream),
-        auto_refresh=False,  # without a thread beside MPI: redrawn with the steps
+        auto_refresh=False,  # no thread beside MPI; redrawn with the steps
     )

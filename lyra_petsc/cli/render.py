@@ -1,4 +1,5 @@
-"""``render``, ``export`` and ``report``: pictures, films, files for other programs, and a page of a run."""
+"""The verbs ``render``, ``export`` and ``report``: pictures, films, files for other programs, a run's
+page."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lyra_petsc.cli.options import results, verb
-from lyra_petsc.cli.signals import watched
+from lyra_petsc.cli.signals import stop_signals
 
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
@@ -71,16 +72,15 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
         def show_progress(done: int, count: int) -> None:
             progress.update(done, count)
             if number := stop.signal_number():
-                told = f" after {done} of {count} states; a film is not kept in part"
-                raise Interrupted(told, number)
+                raise Interrupted(f" after {done} of {count} states; a film is not kept in part", number)
 
         written = draw(comm, plan, show_progress)
     if comm.rank == 0:
         for path in written:
-            print(_line(path, plan.film), flush=True)
+            print(_file_line(path, plan.film), flush=True)
 
 
-def _line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
+def _file_line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
     if film is None or path != film[0]:
         return f"{'sheet' if path.stem == 'sheet' else 'picture':<8} {path}"
     timing = film[1]
@@ -105,8 +105,8 @@ def export(comm: Any, /, run: Path, **asked: Any) -> None:
     from lyra_petsc.parallel import on_root
     from lyra_petsc.show.export import export_run
 
-    for number in watched():  # rank 0 does the work and prints the message
-        signal.signal(number, _give_up if comm.rank == 0 else signal.SIG_IGN)
+    for number in stop_signals():  # rank 0 does the work and prints the message
+        signal.signal(number, _interrupt if comm.rank == 0 else signal.SIG_IGN)
     done = on_root(comm, lambda: export_run(run, **asked))
     if comm.rank == 0 and done is not None:
         states = f"{done.states} state{'s' if done.states > 1 else ''}"
@@ -115,7 +115,7 @@ def export(comm: Any, /, run: Path, **asked: Any) -> None:
         click.echo(f"{states} in {done.folder}: {named}")
 
 
-def _give_up(number: int, frame: FrameType | None) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
     from lyra_petsc.errors import Interrupted
 
     raise Interrupted("; nothing was written", number)

@@ -1,4 +1,4 @@
-"""Signals: a run finishes its step and writes a checkpoint; during the set-up the process ends at once."""
+"""Signals: a run finishes its step and writes a checkpoint; before that the process ends at once."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-ASKED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-LOST = signal.SIGHUP
-"""The terminal was closed; ignored under nohup, where it stays so."""
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+HANGUP = signal.SIGHUP
+"""The terminal was closed; under nohup this signal is ignored, and stays so."""
 
 
-def watched() -> tuple[signal.Signals, ...]:
-    """The signals that ask a run to stop."""
-    return ASKED if signal.getsignal(LOST) == signal.SIG_IGN else (*ASKED, LOST)
+def stop_signals() -> tuple[signal.Signals, ...]:
+    """The signals that request a run to stop."""
+    return STOP_SIGNALS if signal.getsignal(HANGUP) == signal.SIG_IGN else (*STOP_SIGNALS, HANGUP)
 
 
-def leave_at_once() -> None:
-    """Let these signals end the process without a message, until a run watches them."""
-    for number in watched():
-        signal.signal(number, _leave)
+def exit_on_signals() -> None:
+    """Let the stop signals end the process at once without a message, until a run handles them."""
+    for number in stop_signals():
+        signal.signal(number, _exit)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def _exit(number: int, frame: FrameType | None) -> None:
     os._exit(130 if number == signal.SIGINT else 143)
 
 
 class StopRequest:
-    """Notes the first signal that this rank receives; a second SIGINT ends the job at once."""
+    """Records the first stop signal that this rank receives; a second SIGINT ends the job at once."""
 
     def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
-        self._seen = 0
-        for number in watched():
-            signal.signal(number, self._note)
+        self._received = 0
+        for number in stop_signals():
+            signal.signal(number, self._record)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self._seen and number == signal.SIGINT:
+    def _record(self, number: int, frame: FrameType | None) -> None:
+        if self._received and number == signal.SIGINT:
             self._comm.Abort(130)
-        self._seen = self._seen or number
+        self._received = self._received or number
 
     def signal_number(self) -> int:
         """The signal that any rank has received, else 0; collective."""
         from mpi4py import MPI
 
-        return int(self._comm.allreduce(self._seen, MPI.MAX))
+        return int(self._comm.allreduce(self._received, MPI.MAX))

@@ -1,6 +1,6 @@
-"""The verbs and their options; the work is in the module of the same name.
+"""The verbs and their options; their work is in the modules of the same names.
 
-Modules may declare theirs themselves. All are registered at the end.
+Some modules declare their verbs themselves. All verbs are registered at the end.
 """
 
 from __future__ import annotations
@@ -13,7 +13,17 @@ import click
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, tells, trust_mesh, verb
+from lyra_petsc.cli.options import (
+    SETTINGS,
+    example,
+    out,
+    prints,
+    scene,
+    settings,
+    trust_mesh,
+    verb,
+    with_help,
+)
 from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError, nearest
@@ -44,8 +54,8 @@ class _Verbs(click.Group):
     invoke_without_command=True,
     epilog=example("lyra-petsc new kite", "mpirun -n 2 lyra-petsc run kite.yaml"),
 )
-@helped
-@tells("--version", lambda _: f"lyra-petsc {__version__}", "Show the version and exit.")
+@with_help
+@prints("--version", lambda _: f"lyra-petsc {__version__}", "Show the version and exit.")
 @click.pass_context
 def verbs(ctx: click.Context) -> None:
     """Thin-shell simulation (cloth, membranes, plates) in parallel on PETSc.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainValidator, TypeAdapter
 
-from lyra_petsc.api.mpirun import last_words, run_launched
+from lyra_petsc.api.mpirun import error_message, run_launched
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.agreement import replace_text
 
@@ -200,7 +200,7 @@ class Launcher:
         """Run the verb; returns the exit code and the last message on stderr, see `run_launched`."""
         program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
         code, stderr = run_launched([*program, *arguments, *self.petsc_options], watch, keep_open)
-        return code, last_words(stderr, code)
+        return code, error_message(stderr, code)
 
     def run_case(self, arguments: Sequence[str], watch: Watch, kind: type[T]) -> tuple[T | None, str]:
         """Run one case with ``--job``; returns its record, None if it left none, and the last message.

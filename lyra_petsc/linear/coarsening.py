@@ -1,14 +1,14 @@
-"""Coarser triangle meshes for multigrid: a part of the vertices, and smooth interpolation from them.
+"""Coarse triangle meshes for multigrid: a subset of the vertices, and smooth interpolation from them.
 
-A greedy independent set of the vertices stays, on a grid one that is as regular. Every other vertex belongs
-to the nearest of its neighbours that stay; triangles whose corners belong to three of them make the coarse
-triangles (the dual of that Voronoi diagram on the mesh). A vertex that goes is interpolated by its
-barycentric coordinates in the coarse triangle that contains it. Each vertex is then moved halfway to the mean
-of its neighbours, as by a subdivision scheme: of linear interpolation alone every coarse edge makes a fold,
-whose bending is twice too stiff on each coarser mesh. Small weights are then left out: they make rows of
-coarse matrices long.
+The coarse vertices are a greedy independent set, regular on a regular grid. Each fine vertex belongs to its
+nearest coarse neighbour; fine triangles whose corners belong to three coarse vertices give the coarse
+triangles (the dual of this Voronoi diagram on the mesh). A fine vertex is interpolated by its barycentric
+coordinates in the coarse triangle that contains it. The result is then averaged, half with the mean of the
+neighbours, as in a subdivision scheme: with linear interpolation alone each coarse edge is a fold, and
+bending is twice too stiff on each coarser mesh. Finally small weights are dropped, as they lengthen the rows
+of coarse matrices.
 
-Functions of arrays, of a whole mesh.
+All functions take arrays of a whole mesh.
 """
 
 from __future__ import annotations
@@ -20,43 +20,44 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
+from lyra_petsc.linear.pattern import row_pointers
 from lyra_petsc.mesh.partitioner import vertex_graph
 from lyra_petsc.mesh.topology import boundary_edges
 
-OUTSIDE = -0.3
-"""Smallest barycentric coordinate with which a linear function is continued beyond its triangle."""
+MIN_BARYCENTRIC = -0.3
+"""Smallest barycentric coordinate up to which a vertex outside a triangle is extrapolated from it."""
 
-FEWER = 0.95
-"""Fraction of the vertices for which a less regular choice is taken."""
+SPARSER = 0.95
+"""Ratio of the vertices of a less regular choice to those of the regular one below which it is taken."""
 
-LEAST_WEIGHT = 0.04
-"""Weights below it are left out: on irregular meshes there are many, and without them all levels of a W cycle
-have a fifth fewer blocks to read, while iterations hardly grow (of stiff sheets from 26 to 28). The least on
-a grid of parallel diagonals, where iterations need it, is 1/24."""
+MIN_WEIGHT = 0.04
+"""Smaller weights are dropped: irregular meshes have many of them, and without them all levels of a W cycle
+have a fifth fewer blocks, while iterations hardly increase (for stiff sheets from 26 to 28). The smallest
+weight on a grid of parallel diagonals, 1/24, is needed for convergence."""
 
-ALIKE = 1e-3
+EQUAL = 1e-3
 """Relative difference of squared distances below which they count as equal."""
 
 OBLIQUE = (1.0, 0.618, 0.382)
-"""A direction in which no two corners of a square or a cube are equally far, however it lies on the axes."""
+"""A direction in which the corners of an axis-aligned square or cube have different coordinates."""
 
 
 @dataclass
-class Coarse:
+class CoarseMesh:
     """A coarse mesh and the interpolation from it, in compressed rows.
 
     Attributes
     ----------
     vertices : (C,) int64
-        The fine vertices that stay.
+        Fine vertices that are coarse vertices.
     triangles : (G, 3) int64
-        Into ``vertices``.
+        Coarse triangles, as indices into ``vertices``.
     start : (N + 1,) int64
-        Where each fine vertex' parents begin.
+        Row pointers of the fine vertices.
     parents : (P,) int64
-        Coarse vertices that it is interpolated from.
+        Coarse vertices from which a fine vertex is interpolated.
     weights : (P,) float64
-        They add up to one for each vertex.
+        Their sum is one for each fine vertex.
     """
 
     vertices: Ints
@@ -66,65 +67,62 @@ class Coarse:
     weights: Array
 
 
-def coarsen(x: Array, triangles: Ints) -> Coarse:
+def coarsen(x: Array, triangles: Ints) -> CoarseMesh:
     """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3)."""
     n = len(x)
     start, neighbours = vertex_graph([triangles], n)
-    border = _borders(n, triangles)
-    stays = _fewest(start, neighbours, border)
-    vertices = np.flatnonzero(stays)
-    label = np.full(n, -1, dtype=np.int64)
+    border = _border_level(n, triangles)
+    vertices = np.flatnonzero(_choose_coarse(start, neighbours, border))
+    label = np.full(n, -1, dtype=np.int64)  # number among the coarse vertices
     label[vertices] = np.arange(len(vertices))
-    owner = _nearest(x, start, neighbours, label)
+    owner = _nearest_coarse(x, start, neighbours, label)
     coarse = owner[triangles] if len(triangles) else np.zeros((0, 3), dtype=np.int64)
     a, b, c = coarse.T
     coarse = coarse[(a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(coarse, axis=1), axis=0, return_index=True)
     coarse = coarse[np.sort(first)]
-    at, around = _around(len(vertices), coarse)
+    first, incident = _incident_triangles(len(vertices), coarse)
     parents, weights = np.full((n, 3), -1, dtype=np.int64), np.zeros((n, 3))
-    _interpolate(x, start, neighbours, label, owner, vertices, coarse, at, around, parents, weights)
+    _interpolate(x, start, neighbours, label, owner, vertices, coarse, first, incident, parents, weights)
     along = vertex_graph([boundary_edges(triangles).edges], n)
-    return Coarse(vertices, coarse, *_smoothed(*along, start, neighbours, border, parents, weights))
+    return CoarseMesh(vertices, coarse, *_smooth(*along, start, neighbours, border, parents, weights))
 
 
-def _borders(n: int, triangles: Ints) -> NDArray[np.int8]:
-    """2 for corners of the border (ends of no or of one triangle), 1 for other border vertices, else 0."""
+def _border_level(n: int, triangles: Ints) -> NDArray[np.int8]:
+    """2 for corners (vertices of at most one triangle), 1 for other border vertices, 0 for interior ones."""
     border = np.zeros(n, dtype=np.int8)
     border[boundary_edges(triangles).edges] = 1
     border[np.bincount(triangles.ravel(), minlength=n) < 2] = 2
     return border
 
 
-def _around(n: int, triangles: Ints) -> tuple[Ints, Ints]:
-    """Compressed rows of the triangles at each vertex."""
+def _incident_triangles(n: int, triangles: Ints) -> tuple[Ints, Ints]:
+    """Compressed rows of the triangles at each of n vertices."""
     order = np.argsort(triangles.ravel(), kind="stable")
-    start = np.zeros(n + 1, dtype=np.int64)
-    np.cumsum(np.bincount(triangles.ravel(), minlength=n), out=start[1:])
-    return start, order // 3
+    return row_pointers(np.bincount(triangles.ravel(), minlength=n)), order // 3
 
 
-def _fewest(start: Ints, neighbours: Ints, border: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Which vertices (N,) stay: as on a regular grid, or where that leaves many in another order.
+def _choose_coarse(start: Ints, neighbours: Ints, border: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Mask (N,) of the coarse vertices: the regular choice, or the sparsest if it has clearly fewer vertices.
 
-    From a corner that no diagonal meets half of a grid of alternating diagonals would stay. On irregular
-    meshes fewest stay where those come first that most others can go beside.
+    Started from a corner without a diagonal, the regular choice keeps half of a grid of alternating
+    diagonals. On irregular meshes choosing vertices with most undecided neighbours first keeps fewest.
     """
     corners, degrees = (np.argsort(-key, kind="stable") for key in (border, np.diff(start)))
     orders = (corners, False), (degrees, False), (corners, True)
     regular, *others = (_independent(start, neighbours, border, *order) for order in orders)
     sparse = min(others, key=np.count_nonzero)
-    chosen: NDArray[np.bool_] = sparse if sparse.sum() < FEWER * regular.sum() else regular
+    chosen: NDArray[np.bool_] = sparse if sparse.sum() < SPARSER * regular.sum() else regular
     return chosen
 
 
 @cached()
-def _spread(start, neighbours, seed, only, border, greedy, state, layer, ordered, most):  # type: ignore[no-untyped-def]
-    """Decide the vertices reachable from seed, nearest first; those with border ≥ only.
+def _decide_from(start, neighbours, seed, only, border, greedy, state, layer, ordered, degree):  # type: ignore[no-untyped-def]
+    """Decide on the vertices with border ≥ only that are reachable from seed, breadth first.
 
-    Of equally near ones those with most neighbours come first: on a grid of alternating diagonals they are
-    every fourth vertex and have two kinds of neighbours, while those with four are half of the vertices.
-    If ``greedy``, only those neighbours count that are not decided yet.
+    Within a layer, vertices with most neighbours come first: on a grid of alternating diagonals those with
+    eight are a quarter of the vertices, those with four half of them. If ``greedy``, only neighbours that are
+    not decided yet count.
     """
     layer[0] = seed
     n = 1
@@ -132,11 +130,11 @@ def _spread(start, neighbours, seed, only, border, greedy, state, layer, ordered
     while n > 0:
         for i in range(n):
             v = layer[i]
-            most[v] = start[v + 1] - start[v]
+            degree[v] = start[v + 1] - start[v]
             if greedy:
                 for k in range(start[v], start[v + 1]):
-                    most[v] -= state[neighbours[k]] & 3 > 0
-        _by_size(layer[:n], most, ordered)
+                    degree[v] -= state[neighbours[k]] & 3 > 0
+        _sort_descending(layer[:n], degree, ordered)
         m = 0
         for i in range(n):
             v = ordered[i]
@@ -157,46 +155,46 @@ def _spread(start, neighbours, seed, only, border, greedy, state, layer, ordered
 
 
 @cached()
-def _by_size(vertices, size, ordered):  # type: ignore[no-untyped-def]
-    """Put the vertices into ``ordered``, those of the largest size (N,) first, others as they stand."""
-    most = 0
+def _sort_descending(vertices, key, ordered):  # type: ignore[no-untyped-def]
+    """ordered = vertices by descending key (N,), stable (counting sort)."""
+    largest = 0
     for v in vertices:
-        most = max(most, size[v])
-    at = np.zeros(most + 2, np.int64)
+        largest = max(largest, key[v])
+    at = np.zeros(largest + 2, np.int64)
     for v in vertices:
-        at[most - size[v] + 1] += 1
-    for i in range(most + 1):
+        at[largest - key[v] + 1] += 1
+    for i in range(largest + 1):
         at[i + 1] += at[i]
     for v in vertices:
-        i = most - size[v]
+        i = largest - key[v]
         ordered[at[i]] = v
         at[i] += 1
 
 
 @cached()
 def _independent(start, neighbours, border, seeds, greedy):  # type: ignore[no-untyped-def]
-    """Which vertices stay: no two neighbours, and all others beside one. Corners first, then borders.
+    """Mask of a maximal independent set of vertices; corners are decided first, then other border vertices.
 
-    ``seeds`` (N,) is the order in which vertices are begun with; ``greedy`` as for `_spread`.
+    ``seeds`` (N,) is the order in which vertices are tried as seeds; ``greedy`` as for `_decide_from`.
     """
     n = len(border)
-    state = np.zeros(n, np.uint8)  # 1 stays, 2 goes, 4 was looked at
-    layer, ordered, most = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    state = np.zeros(n, np.uint8)  # bits: 1 coarse, 2 not coarse, 4 visited
+    layer, ordered, degree = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     for only in (2, 1, 0):
         for v in range(n):
             state[v] &= 3
         for v in seeds:
             if border[v] >= only and state[v] & 4 == 0:
-                _spread(start, neighbours, v, only, border, greedy, state, layer, ordered, most)
+                _decide_from(start, neighbours, v, only, border, greedy, state, layer, ordered, degree)
     return (state & 1) > 0
 
 
 @cached()
-def _nearest(x, start, neighbours, label):  # type: ignore[no-untyped-def]
-    """Label of the nearest neighbour that stays; its own for those that stay.
+def _nearest_coarse(x, start, neighbours, label):  # type: ignore[no-untyped-def]
+    """Label (N,) of each vertex' nearest coarse neighbour; of a coarse vertex its own.
 
-    Of equally near ones the farthest along an oblique direction: so squares that have their corners in the
-    coarse mesh are all cut alike, and it is as regular as this one.
+    Of equally near ones the farthest along an oblique direction, so that all squares of coarse vertices get
+    the same diagonal and the coarse mesh of a regular grid is regular.
     """
     owner = label.copy()
     for v in range(len(label)):
@@ -207,20 +205,20 @@ def _nearest(x, start, neighbours, label):  # type: ignore[no-untyped-def]
                 if label[w] >= 0:
                     d = (x[v, 0] - x[w, 0]) ** 2 + (x[v, 1] - x[w, 1]) ** 2 + (x[v, 2] - x[w, 2]) ** 2
                     back = -(OBLIQUE[0] * x[w, 0] + OBLIQUE[1] * x[w, 1] + OBLIQUE[2] * x[w, 2])
-                    if d < (1.0 - ALIKE) * best or (d < (1.0 + ALIKE) * best and back < farthest):
+                    if d < (1.0 - EQUAL) * best or (d < (1.0 + EQUAL) * best and back < farthest):
                         best, farthest, owner[v] = d, back, label[w]
     return owner
 
 
 @cached()
 def _dot(u, v):  # type: ignore[no-untyped-def]
-    """Of vectors of three; numpy's would call the BLAS through SciPy, which need not be there."""
+    """Dot product of 3-vectors; numpy's needs SciPy in numba, which need not be installed."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
 @cached()
 def _barycentric(p, a, b, c):  # type: ignore[no-untyped-def]
-    """Coordinates of p in the plane of the triangle; −∞ where it has no area."""
+    """Barycentric coordinates of p, projected onto the triangle's plane; −∞ for a triangle without area."""
     u, v, w = b - a, c - a, p - a
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
     det = uu * vv - uv * uv
@@ -232,37 +230,38 @@ def _barycentric(p, a, b, c):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _interpolate(x, start, neighbours, label, owner, vertices, triangles, at, around, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
+def _interpolate(x, start, neighbours, label, owner, vertices, triangles, first, incident, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Up to three parents and weights (N, 3) of each vertex, from the best of the coarse triangles nearby."""
     for v in range(len(label)):
         if label[v] >= 0:
             parents[v, 0], weights[v, 0] = label[v], 1.0
             continue
-        best = OUTSIDE
+        best = MIN_BARYCENTRIC
         for k in range(start[v], start[v + 1]):
             near = label[neighbours[k]]
             if near < 0:
                 continue
-            for m in range(at[near], at[near + 1]):
-                t = triangles[around[m]]
+            for m in range(first[near], first[near + 1]):
+                t = triangles[incident[m]]
                 q = _barycentric(x[v], x[vertices[t[0]]], x[vertices[t[1]]], x[vertices[t[2]]])
-                least = min(q[0], min(q[1], q[2]))
-                if least > best:
-                    best = least
+                smallest = min(q[0], min(q[1], q[2]))
+                if smallest > best:
+                    best = smallest
                     for i in range(3):
                         parents[v, i], weights[v, i] = t[i], q[i]
                         if abs(q[i]) < 1e-3:
                             parents[v, i], weights[v, i] = -1, 0.0
-        if best == OUTSIDE:
+        if best == MIN_BARYCENTRIC:
             parents[v, 0], weights[v, 0] = owner[v], 1.0
-            _between(x, start, neighbours, label, vertices, v, parents, weights)
+            _interpolate_on_line(x, start, neighbours, label, vertices, v, parents, weights)
         total = weights[v, 0] + weights[v, 1] + weights[v, 2]
         for i in range(3):
             weights[v, i] /= total
 
 
 @cached()
-def _between(x, start, neighbours, label, vertices, v, parents, weights):  # type: ignore[no-untyped-def]
-    """Where there is no triangle: on the line between two neighbours that stay, if v is near one."""
+def _interpolate_on_line(x, start, neighbours, label, vertices, v, parents, weights):  # type: ignore[no-untyped-def]
+    """Interpolate vertex v linearly between two coarse neighbours, if it lies well between two of them."""
     best = 0.25
     for k in range(start[v], start[v + 1]):
         for m in range(start[v], k):
@@ -278,13 +277,13 @@ def _between(x, start, neighbours, label, vertices, v, parents, weights):  # typ
 
 
 @cached()
-def _without_small(parents, weights, lo, hi):  # type: ignore[no-untyped-def]
-    """Leave out the small ones of the weights lo..hi, whose sum stays; where they then end."""
+def _drop_small(parents, weights, lo, hi):  # type: ignore[no-untyped-def]
+    """Drop small weights among lo..hi, and rescale the others to the same sum; returns their new end."""
     before = after = 0.0
     end = lo
     for p in range(lo, hi):
         before += weights[p]
-        if abs(weights[p]) >= LEAST_WEIGHT:
+        if abs(weights[p]) >= MIN_WEIGHT:
             parents[end], weights[end] = parents[p], weights[p]
             after += weights[p]
             end += 1
@@ -294,28 +293,31 @@ def _without_small(parents, weights, lo, hi):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _smoothed(along_start, along_ends, start, neighbours, border, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compressed rows of (parents, weights) (N, 3), each halfway to its neighbours' mean.
+def _smooth(along_start, along_ends, start, neighbours, border, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Compressed rows of (parents, weights) (N, 3), each averaged with the mean of its neighbours.
 
-    Vertices of the border look along the border only, or the sheet would shrink, and corners stay.
+    Border vertices only use neighbours along the border, as the sheet would shrink otherwise; corners stay.
     """
     n = len(border)
     first = np.zeros(n + 1, np.int64)
     seen, at = np.full(n, -1, np.int64), np.zeros(n, np.int64)
     out = np.empty(4 * n + 16, np.int64)
     share = np.empty(len(out))
-    q = np.int64(0)  # 0 has a type of its own, for which what takes it is compiled once more
+    q = np.int64(0)  # a literal 0 has another type, for which functions would be compiled again
     for v in range(n):
         around, begin = neighbours, start
         if border[v] > 0:
             around, begin = along_ends, along_start
         degree = 0 if border[v] > 1 else begin[v + 1] - begin[v]
-        most = 3 * (degree + 1)
-        if q + most > len(out):
-            bigger, more = np.empty(2 * len(out) + most, np.int64), np.empty(2 * len(out) + most)
-            for i in range(q):  # arrays as a whole would take seconds to compile
-                bigger[i], more[i] = out[i], share[i]
-            out, share = bigger, more
+        needed = 3 * (degree + 1)
+        if q + needed > len(out):
+            larger_out, larger_share = (
+                np.empty(2 * len(out) + needed, np.int64),
+                np.empty(2 * len(out) + needed),
+            )
+            for i in range(q):  # assignments of slices would take seconds to compile
+                larger_out[i], larger_share[i] = out[i], share[i]
+            out, share = larger_out, larger_share
         for k in range(-1, degree):
             w = v if k < 0 else around[begin[v] + k]
             part = 1.0 if degree == 0 else (0.5 if k < 0 else 0.5 / degree)
@@ -328,6 +330,6 @@ def _smoothed(along_start, along_ends, start, neighbours, border, parents, weigh
                     out[q], share[q] = p, 0.0
                     q += 1
                 share[at[p]] += part * weights[w, i]
-        q = _without_small(out, share, first[v], q)
+        q = _drop_small(out, share, first[v], q)
         first[v + 1] = q
     return first, out[:q].copy(), share[:q].copy()

@@ -380,7 +380,7 @@ class Discretisation:
             pattern.locate({name: stencil for name, stencil in stencils.items() if name not in self._located})
             self._located = set(stencils)
             acts = [term for term in self._changing if term.n_elements]
-            fits = not any(pattern.lacks(term.name, acting[term]) for term in acts)
+            fits = not any(pattern.misses_block(term.name, acting[term]) for term in acts)
         if not any(self.layout.global_max(not fits)):
             return False
         # includes elements that do not act yet, as some soon will

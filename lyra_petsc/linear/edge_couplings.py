@@ -1,15 +1,14 @@
-"""Couplings of edges one by one, behind the blocks of a pattern.
+"""Matrix entries of edges' unknowns, stored as scalars behind the 3 × 3 blocks of a pattern.
 
-In blocks of 3 × 3, with edges in rows of three, four tenths of the numbers of vertices and edges would be
-zero in any matrix, of those of edges seven tenths. So owned rows have, of two numbers that are each other's
-transpose one:
+In 3 × 3 blocks, with three edges in a row, 40 % of the entries that couple vertices with edges would always
+be zero, and 70 % of those that couple edges with edges. So one half of the symmetric owned rows is stored as
 
-- 3 × 3 blocks of vertices, which are the pattern's,
-- of each vertex, 3 × 4 blocks with groups of four of its edges; what is too much in the last is zero,
-- numbers of edges.
+- 3 × 3 blocks of vertices, in the pattern,
+- *groups*: 3 × 4 blocks of a vertex and four of its edges, padded with zeros in a vertex' last group,
+- *numbers*: scalar entries of pairs of edges.
 
-Couplings to ghosts, of which there are few, are 3 × 3 blocks of the pattern. Values are one array: blocks,
-groups, numbers.
+Couplings to ghosts are few, and stay 3 × 3 blocks of the pattern. One array of values holds blocks, groups
+and numbers in this order. A *place* is the index of an edge's unknown in a flattened array of local rows.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ if TYPE_CHECKING:
 
 
 GROUP = 4
-"""Edges of a vertex in one block."""
+"""Edges of a group."""
 
-ALIGNED = 4
-"""Groups begin where the number of blocks before them would be a multiple of this: at 16 bytes."""
+ALIGNMENT = 4
+"""Groups begin after a multiple of this many 3 × 3 blocks, that is at a multiple of 16 bytes."""
 
 AHEAD_EDGES = 32
-"""Blocks of four edges by which they are fetched before they are used."""
+"""Prefetch distance, in groups."""
 
 
 class Groups(NamedTuple):
-    """3 × 4 blocks of owned vertices with four owned edges.
+    """3 × 4 blocks of owned vertices with four owned edges, in compressed rows.
 
     Attributes
     ----------
     indptr : (n_vertices + 1,)
     places : (n_groups, 4) int32
-        Of the edges' unknowns in the flat form of arrays over local rows.
+        Places of the edges.
     """
 
     indptr: Ints
@@ -55,13 +54,13 @@ class Groups(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Couplings of owned edges.
+    """Scalar couplings of owned edges, in compressed rows; the first entry of a row is the diagonal one.
 
     Attributes
     ----------
-    indptr : (n + 1,) int32, int64 where there are too many
-        Of places from that of the first edge on; the first of a row is its diagonal.
+    indptr : (n_edges + 1,) int32, or int64 if needed
     places : (n_numbers,) int32
+        Places of the columns' edges.
     """
 
     indptr: NDArray[Any]
@@ -69,14 +68,14 @@ class Numbers(NamedTuple):
 
 
 class EdgeValues(NamedTuple):
-    """Values of a pattern's couplings.
+    """Views of the values of a pattern with edge couplings.
 
     Attributes
     ----------
     blocks : (n_blocks, 9)
-        Column by column.
+        Each column by column.
     groups : (n_groups, 12)
-        Row by row.
+        Each row by row.
     numbers : (n_numbers, 1)
     """
 
@@ -86,7 +85,7 @@ class EdgeValues(NamedTuple):
 
 
 class EdgeCouplings:
-    """Which couplings of owned edges there are.
+    """Sparsity of the couplings of owned edges.
 
     Parameters
     ----------
@@ -97,8 +96,9 @@ class EdgeCouplings:
     Attributes
     ----------
     n_vertices : int
-        Owned rows before the first one of edges.
-    groups, numbers
+        Owned rows of vertices; those of edges follow.
+    groups : Groups
+    numbers : Numbers
     """
 
     def __init__(self, elements: Sequence[WithEdges], n_owned: int) -> None:
@@ -107,16 +107,16 @@ class EdgeCouplings:
         self.n_vertices = first = min(beyond, *least) // 3
 
         def keys(part: WithEdges) -> tuple[list[Ints], list[Ints]]:
-            """Of vertices and edges, and of two edges: one times ``beyond`` plus the place of the other."""
+            """Keys of vertex-edge and edge-edge couplings: row · ``beyond`` + place of the column."""
             mixed, edges = [], []
             places = part.edges.astype(np.int64)
             for b, place in enumerate(places.T):
                 for vertex in part.vertices.T:
-                    there = (place < beyond) & (vertex < n_owned)
-                    mixed.append(vertex[there].astype(np.int64) * beyond + place[there])
+                    owned = (place < beyond) & (vertex < n_owned)
+                    mixed.append(vertex[owned].astype(np.int64) * beyond + place[owned])
                 for other in places.T[:b]:
-                    there = (place < beyond) & (other < beyond)
-                    lesser, greater = np.minimum(place, other)[there], np.maximum(place, other)[there]
+                    owned = (place < beyond) & (other < beyond)
+                    lesser, greater = np.minimum(place, other)[owned], np.maximum(place, other)[owned]
                     edges.append(lesser * beyond + greater)
             return mixed, edges
 
@@ -127,7 +127,7 @@ class EdgeCouplings:
         at = GROUP * groups[vertex] + np.arange(len(vertex)) - row_pointers(count)[vertex]
         places = np.full(GROUP * groups[-1], -1, dtype=np.int32)
         places[at] = place
-        # in place of edges that are not there, one that is near
+        # padding refers to an edge of the group, whose cache line is needed anyway
         places = places.reshape(-1, GROUP)
         self.groups = Groups(groups, np.where(places < 0, places[:, :1], places))
 
@@ -136,32 +136,32 @@ class EdgeCouplings:
         indptr = row_pointers(np.bincount(one - 3 * first, minlength=len(diagonal)))
         self.numbers = Numbers(indptr.astype(index_type(len(other))), other.astype(np.int32))
 
-    # -- where values stand --------------------------------------------------------------------------
+    # -- positions of values, as indices into the flattened array ------------------------------------
 
     @property
     def n_values(self) -> int:
-        """Of groups and numbers."""
+        """Stored values of groups and numbers."""
         return int(3 * self.groups.places.size + len(self.numbers.places))
 
     @property
-    def n_numbers(self) -> int:
-        """In whole rows, both of those that are each other's transpose, and zeros in groups."""
+    def n_entries(self) -> int:
+        """Entries of groups and numbers in both halves of the matrix, including padding."""
         return 2 * self.n_values - len(self.numbers.indptr) + 1
 
     def first_group(self, n_blocks: int) -> int:
-        """Where groups begin behind so many blocks, in the flat form of values."""
-        return 9 * ALIGNED * -(-n_blocks // ALIGNED)
+        """Position of the first group, behind n_blocks blocks."""
+        return 9 * ALIGNMENT * -(-n_blocks // ALIGNMENT)
 
     def first_number(self, n_blocks: int) -> int:
-        """Where numbers begin."""
+        """Position of the first number."""
         return self.first_group(n_blocks) + 3 * self.groups.places.size
 
-    def room(self, n_blocks: int) -> int:
-        """Blocks (3 × 3) that all values have the size of."""
+    def n_stored(self, n_blocks: int) -> int:
+        """Number of 3 × 3 blocks that take as much memory as all values."""
         return -(-(self.first_group(n_blocks) + self.n_values) // 9)
 
     def diagonal(self, n_blocks: int) -> Ints:
-        """Where the edges' own numbers stand, those of padding too."""
+        """Positions of the edges' diagonal entries, including padding."""
         own: Ints = self.numbers.indptr[:-1].astype(np.int64)
         return own + self.first_number(n_blocks)
 
@@ -172,11 +172,10 @@ class EdgeCouplings:
         return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
 
     def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> Offsets:
-        """Where the couplings (a, b), b ≥ a, of elements go in which b is an edge; edges come after vertices.
+        """Positions of the couplings (a, b), b ≥ a, of elements for edges b; edges come after vertices.
 
-        Of a vertex and an edge four times the place of the first of three numbers in the flat form of values,
-        plus how far apart they are, less one; of two edges the place of their number. −1 where other ranks
-        have both.
+        For a vertex and an edge 4 · position of the first of three values + their stride − 1; for two edges
+        the position of their value; −1 if other ranks own both.
         """
         stencil, m = elements.stencil, elements.edges.shape[1]
         n = stencil.shape[1] - m
@@ -189,10 +188,8 @@ class EdgeCouplings:
 
     # -- prescribed unknowns -------------------------------------------------------------------------
 
-    def beside(self, mask: NDArray[np.bool_], n_blocks: int) -> tuple[Ints, Ints, Ints]:
-        """Of prescribed unknowns, mask (n_local, 3), in the flat form of values: couplings with them (m,),
-        edges' own numbers (k,), and the own numbers (k, 3) of edges in the same rows.
-        """
+    def constrained_entries(self, mask: NDArray[np.bool_], n_blocks: int) -> tuple[Ints, Ints, Ints]:
+        """Positions ``zeros``, ``edges`` and ``row_edges`` of `ConstrainedEntries`; mask (n_local, 3)."""
         held = mask.ravel()
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
         coupled = mask[vertex][:, :, None] | held[self.groups.places][:, None, :]
@@ -209,7 +206,7 @@ class EdgeCouplings:
     # -- in blocks -----------------------------------------------------------------------------------
 
     def _coupled(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Of all numbers of groups and of edges their rows and columns, places in the flat form."""
+        """Rows and columns of all groups' entries, then of all numbers, as indices of unknowns."""
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
         shape = (len(vertex), 3, GROUP)
         row = np.broadcast_to((3 * vertex[:, None] + np.arange(3))[:, :, None], shape).ravel()
@@ -218,7 +215,7 @@ class EdgeCouplings:
         return row, column.astype(np.int64), edge, self.numbers.places.astype(np.int64)
 
     def whole(self, pattern: BlockPattern) -> BlockPattern:
-        """A pattern of blocks alone, in which owned edges are in rows of three."""
+        """The equivalent pattern of 3 × 3 blocks only, in which rows of owned edges hold three edges."""
         row, column, edge, other = (place // 3 for place in self._coupled())
         keys = union(
             pattern.keys(pattern.n_local), row * pattern.n_local + column, edge * pattern.n_local + other
@@ -226,7 +223,7 @@ class EdgeCouplings:
         return BlockPattern.of_keys(keys, pattern.n_owned, pattern.n_local)
 
     def in_blocks(self, pattern: BlockPattern, values: Array) -> Array:
-        """Values (n_stored, 3, 3) as that pattern has them, (n_blocks, 3, 3)."""
+        """Values (n_blocks, 3, 3) of the pattern ``whole`` from values (n_stored, 3, 3)."""
         blocks, groups, numbers = self.parts(values, pattern.n_blocks)
         n_local = pattern.n_local
         keys = pattern.whole.keys(n_local)
@@ -234,18 +231,18 @@ class EdgeCouplings:
         out[np.searchsorted(keys, pattern.keys(n_local))] = blocks
         flat = out.reshape(-1)
 
-        def place(row: Ints, column: Ints) -> Ints:
-            """Values of a block stand column by column."""
+        def position(row: Ints, column: Ints) -> Ints:
+            """Blocks are stored column by column."""
             block = np.searchsorted(keys, (row // 3) * n_local + column // 3)
             found: Ints = 9 * block + 3 * (column % 3) + row % 3
             return found
 
         row, column, edge, other = self._coupled()
-        # of an edge that fills up a group the coupling is 0 there
-        np.add.at(flat, place(row, column), groups.ravel())
-        flat[place(edge, other)] = numbers[:, 0]
-        together = edge // 3 == other // 3
-        flat[place(other[together], edge[together])] = numbers[together, 0]
+        # added, as the padding of a group repeats an edge with value 0
+        np.add.at(flat, position(row, column), groups.ravel())
+        flat[position(edge, other)] = numbers[:, 0]
+        same_row = edge // 3 == other // 3
+        flat[position(other[same_row], edge[same_row])] = numbers[same_row, 0]
         return out.reshape(-1, 3, 3)
 
 
@@ -253,7 +250,7 @@ class EdgeCouplings:
 def _look_up(  # type: ignore[no-untyped-def]
     indptr, columns, group_ptr, places, number_ptr, others, first_group, first_number, stencil, edges, out
 ):
-    """Offsets of elements whose stencil (E, n + m) ends with the rows of edges (E, m)."""
+    """Positions (`offsets_of`) of elements whose stencil (E, n + m) ends with the rows of edges (E, m)."""
     n_owned, n_vertices = len(indptr) - 1, len(group_ptr) - 1
     n = stencil.shape[1] - edges.shape[1]
     for e in range(len(stencil)):
@@ -300,7 +297,7 @@ def _look_up(  # type: ignore[no-untyped-def]
 def multiply(  # type: ignore[no-untyped-def]
     indptr, ends, columns, group_ptr, places, number_ptr, others, blocks, groups, numbers, x, sums, out
 ):
-    """out (n_owned, 3) = the matrix · x (n_local, 3); sums (n_vertices, 4) is scratch."""
+    """out (n_owned, 3) = A x for x (n_local, 3); sums (n_vertices, 4) is scratch."""
     n, n_owned = Index(len(sums)), Index(len(ends))
     sums[:] = 0.0
     out[n:] = 0.0
@@ -334,13 +331,13 @@ def multiply(  # type: ignore[no-untyped-def]
 
 
 class ProductWithEdges:
-    """Products with symmetric values of which one half is stored, some of them of edges.
+    """Products with symmetric block rows, of which one half is stored, and edge couplings.
 
     Parameters
     ----------
     pattern : BlockPattern
     values : (n_stored, 3, 3)
-        They are read where they stand.
+        The product keeps views of them.
     """
 
     def __init__(self, pattern: BlockPattern, values: Array) -> None:
@@ -351,5 +348,5 @@ class ProductWithEdges:
         self._n_vertices = couplings.n_vertices
 
     def __call__(self, x: Array, out: Array) -> None:
-        """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
+        """out (n_owned, 3) = A x for x (n_local, 3) with current ghost values."""
         multiply(*self._rows, x, np.empty((self._n_vertices, 4)), out)

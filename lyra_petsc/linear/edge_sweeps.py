@@ -1,12 +1,12 @@
-"""Gauss-Seidel where edges carry unknowns: over the edges one by one, and over the points of the vertices.
+"""Gauss-Seidel with unknowns on edges: scalar over the edges, block by block over the vertices.
 
-As ``gauss_seidel``, on ``edge_couplings``. The residual of edges is apart, (n_local, 3) as x is. What the
-first sweep leaves of it coarser levels see through the vertices alone: beside their correction each edge gets
-one of its own, by the diagonal. What both add between the sweeps is symmetric and positive semidefinite, so
-that the cycle stays positive definite, and conjugate gradients take a fifth fewer iterations.
+Like ``gauss_seidel``, with the storage of ``edge_couplings``. The residual of edges is a separate array
+(n_local, 3). Coarser levels only have vertices; besides their correction each edge gets one of its residual
+over its diagonal entry (Jacobi). Both corrections between the sweeps are symmetric and positive semidefinite,
+so that the cycle stays positive definite, and conjugate gradients take a fifth fewer iterations.
 
-Bending is of fourth order, so that a sweep leaves much of it. Where it is stiff beside inertia vertices are
-swept more than once, and edges before every second of these sweeps.
+Bending is of fourth order, and one sweep reduces its error little. If it is stiff compared with inertia,
+vertices are swept several times, and edges before every second of these sweeps.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ Floats = NDArray[np.float32]
 EDGES_EVERY = 2
 """Sweeps over the vertices for one over the edges."""
 
-ALIGNED = 8
-"""Vectors begin at a multiple of so many numbers of double precision."""
+ALIGNMENT = 8
+"""Vectors begin at a multiple of this many float64 numbers."""
 
 SWEEPS = ((0.03, (3, 3, 3)), (0.3, (2, 2, 2)))
-"""Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices of
-the mesh, of the next coarser level, and of those below, which cost little; beyond, one. Of numbers that take
-equally long those with which iterations grow least with the mesh."""
+"""Upper bounds of inertia's share in the stiffness of the vertices' softest directions, and the numbers of
+sweeps over the vertices on the finest level, the next coarser one, and those below; else one. Among
+numbers that cost equal time these let iterations grow least with the mesh."""
 
 
-def room(pattern: BlockPattern) -> tuple[int, int]:
-    """How much memory `SweepsWithEdges` takes, in numbers of double precision: its rows, and its vectors."""
-    return ALIGNED * -(-9 * pattern.n_stored // (2 * ALIGNED)), 8 * pattern.n_local
+def memory_sizes(pattern: BlockPattern) -> tuple[int, int]:
+    """Memory of `SweepsWithEdges`, in float64 numbers: of the copy of its rows, and of its vectors."""
+    return ALIGNMENT * -(-9 * pattern.n_stored // (2 * ALIGNMENT)), 8 * pattern.n_local
 
 
 @cached()
 def invert_numbers(indptr, numbers, inverse):  # type: ignore[no-untyped-def]
-    """Inverses of the edges' diagonal into the flat form of inverse (n_rows, 3); 0 of 0."""
+    """inverse (n_rows, 3), flattened = inverses of the edges' diagonal entries; 0 for entries of 0."""
     flat = inverse.reshape(-1)
     for edge in range(Index(len(flat))):
         value = numbers[Index(indptr[edge]), 0]
@@ -66,7 +66,7 @@ def invert_numbers(indptr, numbers, inverse):  # type: ignore[no-untyped-def]
 
 @cached()
 def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
-    """Sum of the traces of blocks (n_blocks, 9), the first ones times weights (n,)."""
+    """Weighted sum of the traces of the first n of blocks (n_blocks, 9), weight (n,)."""
     total = 0.0
     for k in range(Index(len(weight))):
         total += weight[k] * (blocks[k, 0] + blocks[k, 4] + blocks[k, 8])
@@ -77,8 +77,8 @@ def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
 def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
     """``gauss_seidel.backward`` over the owned edges, from place ``first`` on, in x and r (n_local, 3).
 
-    Each edge waits for the one before it, which is mostly the nearest that it couples to: that one is taken
-    last, here and in ``forward_edges``.
+    An edge depends on the edge processed before it, which is mostly its first coupling: that one is added
+    last, here and in ``forward_edges``, so that the processor need not wait.
     """
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     n, first = Index(len(inverses)), Index(first)
@@ -89,15 +89,15 @@ def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: igno
         for k in range(hi - lo):
             s -= numbers[hi - Index(1) - k, 0] * flat[Index(others[hi - Index(1) - k])]
         y = flushed(inverses[edge] * s)
-        less = flat[at] - y
+        decrement = flat[at] - y
         flat[at], rest[at] = y, 0.0
         for k in range(lo, hi):
-            rest[Index(others[k])] += numbers[k, 0] * less
+            rest[Index(others[k])] += numbers[k, 0] * decrement
 
 
 @cached(fastmath=True)
 def forward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
-    """``gauss_seidel.forward`` over the owned edges; r has what ghosts make of them taken off."""
+    """``gauss_seidel.forward`` over the owned edges; couplings to ghosts are already subtracted from r."""
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     first = Index(first)
     for edge in range(Index(len(inverses))):
@@ -134,20 +134,20 @@ def backward_vertices(  # type: ignore[no-untyped-def]
         t0, t1, t2 = gather_edges(groups, places, x, first, last, -AHEAD_EDGES)
         r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
         y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
-        less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
+        decrement = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
-        scatter(blocks, columns, r, lo, hi, less)
-        scatter_edges(groups, places, of_edges, first, last, less)
+        scatter(blocks, columns, r, lo, hi, decrement)
+        scatter_edges(groups, places, of_edges, first, last, decrement)
 
 
 @cached(fastmath=True)
 def forward_vertices(  # type: ignore[no-untyped-def]
     indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r, of_edges
 ):
-    """``gauss_seidel.forward`` over the owned vertices; r of them and of the edges becomes b − L x.
+    """``gauss_seidel.forward`` over the owned vertices; r and of_edges become b − L x.
 
-    Before another such sweep that is of no use, and ``of_edges`` may be None.
+    ``of_edges`` may be None if another forward sweep over the vertices follows at once.
     """
     n, n_owned = Index(len(inverse)), Index(len(ends))
     for row in range(n):
@@ -170,19 +170,19 @@ def forward_vertices(  # type: ignore[no-untyped-def]
 
 @cached(fastmath=True)
 def backward_again(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, moved, x, r, of_edges
+    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, increment, x, r, of_edges
 ):
-    """As ``backward_vertices``, from where the residuals r and of_edges are those of x, b − A x.
+    """Like ``backward_vertices``, but r and of_edges are the full residual b − A x.
 
-    moved (n_vertices, 3) gets what is added to x.
+    increment (n_vertices, 3) is what the sweep adds to x.
     """
     n = Index(len(inverse))
     for below in range(n):
         row = n - Index(1) - below
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
-        s0, s1, s2 = gather(blocks, columns, moved, lo, hi, -AHEAD)
+        s0, s1, s2 = gather(blocks, columns, increment, lo, hi, -AHEAD)
         y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
-        moved[row, 0], moved[row, 1], moved[row, 2] = y0, y1, y2
+        increment[row, 0], increment[row, 1], increment[row, 2] = y0, y1, y2
         x[row, 0] += y0
         x[row, 1] += y1
         x[row, 2] += y2
@@ -193,26 +193,26 @@ def backward_again(  # type: ignore[no-untyped-def]
 
 
 class SweepsWithEdges:
-    """``gauss_seidel.BlockSweeps`` where edges carry unknowns.
+    """``gauss_seidel.BlockSweeps`` with unknowns on edges.
 
     Parameters
     ----------
     pattern : BlockPattern
     couplings : EdgeCouplings
     memory : (n,) float64, optional
-        First the copy of rows, in single precision, then the vectors (`room`). Between two calls of ``store``
-        and from that to the next ``begin`` the vectors' part may serve for something else.
+        Holds the copy of the rows in single precision, then the vectors (`memory_sizes`). The vectors' part
+        may be used for something else between a call of ``store`` and the next one of ``begin``.
 
     Attributes
     ----------
-    b, x, moved : (n_local, 3)
-        Right-hand side and solution; room for what is added to it.
+    b, x, increment : (n_local, 3)
+        Right-hand side, solution, and increment of the solution by a sweep.
     r : (n_local, 4)
-        Residual of vertices, and numbers without a meaning.
+        Residual of vertices; the fourth column is padding.
     of_edges : (n_local, 3)
         Residual of edges.
     flops : float
-        Of a sweep.
+        Operations of a sweep.
     """
 
     def __init__(
@@ -226,24 +226,27 @@ class SweepsWithEdges:
         self._groups = couplings.groups
         self._numbers, self._first = couplings.numbers, 3 * couplings.n_vertices
         n, n_local = couplings.n_vertices, pattern.n_local
-        beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
-        self._weight = self._of_all_alike(pattern, n)
-        of_rows, of_vectors = room(pattern)
+        with_ghosts = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._with_ghosts, self._edges_with_ghosts = (
+            with_ghosts[with_ghosts < n],
+            with_ghosts[with_ghosts >= n],
+        )
+        self._weight = self._translation_weights(pattern, n)
+        of_rows, of_vectors = memory_sizes(pattern)
         memory = np.empty(of_rows + of_vectors) if memory is None else memory
         self._copy = memory[:of_rows].view(np.float32)[: 9 * pattern.n_stored].reshape(-1, 9)
         self._values = couplings.parts(self._copy, pattern.n_blocks)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         vectors = memory[of_rows : of_rows + of_vectors].view(np.float32)
-        self._changing = vectors[: 13 * n_local]  # what a cycle row_pointers with is in the rest
+        self._changing = vectors[: 13 * n_local]  # all but b
         self._clean = False
         self.r = vectors[: 4 * n_local].reshape(-1, 4)
-        self.x, self.of_edges, self.moved, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
+        self.x, self.of_edges, self.increment, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
         self.flops = 18.0 * pattern.n_couplings
 
-    def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
-        """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
+    def _translation_weights(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
+        """Weights of the blocks of n vertices in the product tᵀ A t with a translation t of all vertices."""
         of_edges = np.zeros(pattern.n_local, dtype=bool)
         for part in pattern.edges.values():
             of_edges[part.edges // 3] = True
@@ -254,7 +257,7 @@ class SweepsWithEdges:
         return weight
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
-        """What is inverted (n, 9) of rows (n,) of block rows (n_stored, 9): of edges the diagonal alone."""
+        """Blocks (n, 9) of rows (n,) that sweeps invert, from (n_stored, 9); for edges only the diagonal."""
         found, edges = np.zeros((len(rows), 9)), rows >= len(self._inverse)
         found[~edges] = values[self._rows[0][rows[~edges]]]
         own = self._couplings.diagonal(self._n_blocks).reshape(-1, 3)[rows[edges] - len(self._inverse)]
@@ -262,27 +265,28 @@ class SweepsWithEdges:
         return found
 
     def inertia(self, values: Array) -> Array:
-        """Sums (2,) over owned vertices: inertia, and what all resists them in their softest direction.
+        """Sums (2,) over owned vertices of inertia, and of the stiffness in their softest directions.
 
-        Moving all vertices alike meets nothing else than inertia. ``values`` (n_stored, 9) as ``invert`` got.
+        A translation of all vertices is only resisted by inertia. ``values`` (n_stored, 9) are those of
+        ``invert``.
         """
         together = _sum_of_traces(self._weight, values)
         softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
         return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
     def invert(self, values: Array) -> None:
-        """Take the inverses of the diagonal of block rows (n_stored, 9)."""
+        """Invert the diagonal of block rows (n_stored, 9)."""
         begin = self._rows[0][: len(self._inverse) + 1]
         invert_diagonal(begin, values, self._inverse)
         numbers = self._couplings.parts(values, self._n_blocks).numbers
         invert_numbers(self._numbers.indptr, numbers, self._inverse_of_edges)
 
     def store(self, values: Array) -> None:
-        """Take block rows (n_stored, 9), which may be where the copy will be."""
+        """Copy block rows (n_stored, 9), which may overlap the memory of the copy."""
         begin = self._rows[0][: len(self._inverse) + 1]
         own = values.reshape(-1)[self._couplings.diagonal(self._n_blocks)]
-        least = NEGLIGIBLE * float(own.min(initial=np.inf, where=own > 0.0))
-        store(values, min(least, negligible_size(begin, values)), self._copy)
+        smallest = NEGLIGIBLE * float(own.min(initial=np.inf, where=own > 0.0))
+        store(values, min(smallest, negligible_size(begin, values)), self._copy)
         self._clean = False
 
     def shrink(self, rows: Ints, factor: Array) -> None:
@@ -292,14 +296,14 @@ class SweepsWithEdges:
         self._inverse_of_edges[rows[edges] - len(self._inverse)] /= factor[edges]
 
     def begin(self, b: Floats) -> None:
-        """Let the residual be b (n_local, 3): x is zero."""
+        """Set the residual to b (n_local, 3), that of x = 0."""
         n, n_owned = len(self._inverse), len(self._rows[1])
         if not self._clean:
             self._changing[:] = 0.0
             self._clean = True
         begin(b, self.r[:n])
         self.of_edges[n:n_owned] = b[n:n_owned]
-        self.r[n_owned:] = 0.0  # to which turns of edges are added
+        self.r[n_owned:] = 0.0  # ``EdgeTurns.gather`` adds to ghosts
 
     def add(self, rows: Ints, more: Floats) -> None:
         """Add to the residual of rows (n,)."""
@@ -317,21 +321,21 @@ class SweepsWithEdges:
     def backward_again(self, x: Floats, number: int) -> None:
         """Sweep over the vertices once more, and if ``number`` is even over the edges before that."""
         if number % EDGES_EVERY == 0:
-            self.moved[:] = 0.0
-            self.backward(self.moved)
-            x += self.moved
+            self.increment[:] = 0.0
+            self.backward(self.increment)
+            x += self.increment
             return
         blocks, groups, _ = self._values
         rows = *self._rows, *self._groups, blocks, groups
-        backward_again(*rows, self._inverse, self.moved, x, self.r, self.of_edges)
+        backward_again(*rows, self._inverse, self.increment, x, self.r, self.of_edges)
 
     def subtract_ghosts(self, x: Floats) -> None:
-        """As the function, of both residuals."""
-        subtract_ghosts(self._beside, *self._rows, self._values.blocks, x, self.r)
-        subtract_ghosts(self._edges_beside, *self._rows, self._values.blocks, x, self.of_edges)
+        """``gauss_seidel.subtract_ghosts`` for both residuals."""
+        subtract_ghosts(self._with_ghosts, *self._rows, self._values.blocks, x, self.r)
+        subtract_ghosts(self._edges_with_ghosts, *self._rows, self._values.blocks, x, self.of_edges)
 
     def correct(self, x: Floats) -> bool:
-        """Add to x (n_local, 3) the residual of owned edges over the diagonal; True, as x has changed."""
+        """Add the residual of owned edges over their diagonal to x (n_local, 3); True, as x has changed."""
         correct_edges(self._first, self._inverse_of_edges, x, self.of_edges)
         return True
 
@@ -343,9 +347,9 @@ class SweepsWithEdges:
             forward_vertices(*rows, self._inverse, b, x, self.r, None)
             return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
-        beside = self._edges_beside
-        before = self.of_edges[beside]
-        subtract_ghosts(beside, *self._rows, blocks, x, self.of_edges)
-        beyond = before - self.of_edges[beside]
+        with_ghosts = self._edges_with_ghosts
+        before = self.of_edges[with_ghosts]
+        subtract_ghosts(with_ghosts, *self._rows, blocks, x, self.of_edges)
+        of_ghosts = before - self.of_edges[with_ghosts]
         forward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
-        self.of_edges[beside] += beyond  # which stays in the residual, as of vertices
+        self.of_edges[with_ghosts] += of_ghosts  # the residual of vertices does not contain ghosts either

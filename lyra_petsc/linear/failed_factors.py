@@ -1,9 +1,9 @@
-"""A factorisation that failed is forgotten, as PETSc would report its failure ever after.
+"""Replacement of a PC whose factorisation failed, since PETSc keeps reporting the failure for new matrices.
 
-So it does for incomplete factors, MUMPS, and all that holds another solver (block Jacobi, redundant factors),
-whatever the matrix becomes. MUMPS estimates its
-workspace before it factors; on several ranks the order of events decides what it needs, and its margin of
-20 % is not always enough (MUMPS users' guide, ICNTL(14) and INFOG(1) = -8, -9, -17, -20).
+This holds for incomplete factors, MUMPS, and preconditioners with inner solvers (block Jacobi, redundant).
+MUMPS estimates its workspace before it factors; on several ranks the amount needed depends on the order of
+events, and its margin of 20 % is not always enough (MUMPS users' guide, ICNTL(14) and INFOG(1) = -8, -9, -17,
+-20).
 """
 
 from __future__ import annotations
@@ -13,20 +13,19 @@ from petsc4py import PETSc
 FACTOR_TYPES = frozenset(
     {"lu", "cholesky", "ilu", "icc", "bjacobi", "asm", "gasm", "redundant", "telescope", "ksp"}
 )
-"""Preconditioners that options alone make again; multigrid would lose its levels."""
+"""Preconditioners that can be created again from options alone; multigrid would lose its levels."""
 
 WORKSPACE_ERRORS = (-8, -9, -17, -20)
-"""INFOG(1) where a larger ICNTL(14) helps."""
+"""Values of INFOG(1) for which a larger ICNTL(14) helps."""
 
 MARGIN, MORE, LARGEST = 20, 4, 2000
-"""ICNTL(14) that MUMPS row_pointers with [%], the factor by which it grows, and where that ends."""
+"""Initial ICNTL(14) of MUMPS [%], the factor by which it grows, and its largest value."""
 
 
 def replace_failed(ksp: PETSc.KSP) -> bool:
-    """Begin anew with a solver whose preconditioner could not be set up; operators must be set again.
+    """Replace the PC of a KSP if its set-up failed; the KSP's operators must then be set again; collective.
 
-    Returns whether another solve may succeed with the same matrix, since MUMPS has more workspace now;
-    collective.
+    Returns whether another solve with the same matrix may succeed, as MUMPS has more workspace now.
     """
     old = ksp.getPC()
     failed = ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED

@@ -1,4 +1,4 @@
-"""Block rows of a coarse matrix: interpolationᵀ · symmetric block rows · interpolation."""
+"""Galerkin products: coarse matrix Pᵀ A P of symmetric block rows A and interpolation P."""
 
 from __future__ import annotations
 
@@ -16,48 +16,49 @@ from lyra_petsc.mesh.points import Points
 from lyra_petsc.phases import GALERKIN, logged
 
 CHUNK_ROWS = 1 << 13
-"""Fine rows whose products are looked at together while the coarse pattern is made."""
+"""Fine rows whose products are processed together when the coarse pattern is built."""
 
 CHUNK_PRODUCTS = 1 << 20
+"""Products whose offsets are computed together."""
 
 FAR = 255
-"""In place of an offset that does not fit into a byte, or of a block elsewhere than in the coarse rows."""
+"""Replaces an offset that does not fit into a byte, or that of a block outside the owned coarse rows."""
 
 
 @cached()
 def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type: ignore[no-untyped-def]
-    """Of fine rows lo..hi: where a row's product with the interpolation is summed, and what it adds to.
+    """Slots of the products A P of fine rows lo..hi, and keys of the coarse blocks that Pᵀ adds them to.
 
-    A row of blocks times the interpolation has a block for each coarse point met, in the order in which
-    they are met, first over owned and then over ghost columns; ``slots`` are their numbers. Of ``keys``
-    there is one for each parent of the row and each of these. Blocks of owned columns stand for their
-    transpose too: smaller · width + larger coarse point, ~ of it if the product is to be transposed. Those
-    of ghosts do not: width² + row · width + column.
+    A row of A P has one block, in a *slot*, for each coarse point of its columns, in order of appearance,
+    first over owned and then over ghost columns. ``slots`` has the slot of each product A_ij P_jc. ``keys``
+    has one key for each parent of the row and each slot: for owned columns, whose blocks also represent
+    their transpose, smaller · width + larger coarse point, or ~ of this if the product must be transposed;
+    for ghost columns width² + row · width + column.
     """
     n_owned = len(indptr) - 1
-    seen, at = np.full(width, -1, np.int64), np.zeros(width, np.int64)
-    met = np.empty(2 * width, np.int64)
+    seen, slot_of = np.full(width, -1, np.int64), np.zeros(width, np.int64)
+    points = np.empty(2 * width, np.int64)  # coarse point of each slot
     s = q = 0
     for row in range(lo, hi):
-        m = own = 0
+        m = n_own = 0
         mark = 2 * row
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] >= n_owned and mark == 2 * row:
-                mark, own = mark + 1, m
+                mark, n_own = mark + 1, m
             for p in range(start[columns[k]], start[columns[k] + 1]):
                 c = parents[p]
                 if seen[c] != mark:
-                    seen[c], at[c], met[m] = mark, m, c
+                    seen[c], slot_of[c], points[m] = mark, m, c
                     m += 1
-                slots[s] = at[c]
+                slots[s] = slot_of[c]
                 s += 1
         if mark == 2 * row:
-            own = m
+            n_own = m
         for p in range(start[row], start[row + 1]):
             a = parents[p]
             for t in range(m):
-                c = met[t]
-                if t >= own:
+                c = points[t]
+                if t >= n_own:
                     keys[q] = (width + a) * width + c
                 else:
                     keys[q] = a * width + c if c >= a else ~(c * width + a)
@@ -66,7 +67,7 @@ def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type
 
 @cached()
 def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignore[no-untyped-def]
-    """Of each fine row, how many slots and keys it has."""
+    """Numbers of slots and of keys of each fine row."""
     n_owned = len(indptr) - 1
     seen = np.full(width, -1, np.int64)
     for row in range(n_owned):
@@ -83,16 +84,15 @@ def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignor
 
 
 @cached(fastmath=True)
-def _project(indptr, columns, start, parents, weights, slots, most, first, offset, far, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Add what fine rows give to the coarse ones (C, 9); diagonal blocks are half what they are to be.
+def _project(indptr, columns, start, parents, weights, slots, n_slots, first, offset, far, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add the products of the fine rows to the coarse blocks out (C, 9); diagonal blocks get one half.
 
-    The products of a row and of a parent go, one after the other, to the block ``offset`` behind the
-    ``first`` one of the lesser coarse point's row; where that is FAR, to the next of ``far``, ~ of it if
-    transposed.
-    Rows and columns of coordinates that are not free are decoupled: only their diagonal must not count.
-    Unsigned indices, and no views: numba looks at the sign of others, which takes four times as long.
+    The product of a slot and a parent is added to the block ``offset`` behind the ``first`` one of the
+    smaller coarse point's row; if offset is FAR, to the next block of ``far``, ~ of it if transposed.
+    Coordinates that are not free are decoupled in the fine rows, so that only their diagonal is skipped.
+    Indices are unsigned and there are no views, as checks of the sign would take four times as long.
     """
-    sums, met = np.empty((most, 9)), np.empty(most, np.int64)
+    sums, points = np.empty((n_slots, 9)), np.empty(n_slots, np.int64)
     s = q = f = 0
     for row in range(len(indptr) - 1):
         m = 0
@@ -109,7 +109,7 @@ def _project(indptr, columns, start, parents, weights, slots, most, first, offse
                 w, t = half * weights[p], Index(slots[s])
                 s += 1
                 if t == Index(m):
-                    met[m] = parents[p]
+                    points[m] = parents[p]
                     m += 1
                     sums[t, 0], sums[t, 1], sums[t, 2] = w * b0, w * b1, w * b2
                     sums[t, 3], sums[t, 4], sums[t, 5] = w * b3, w * b4, w * b5
@@ -130,10 +130,10 @@ def _project(indptr, columns, start, parents, weights, slots, most, first, offse
                 if offset[q] == FAR:
                     k = far[f]
                     f += 1
-                elif a <= met[u]:
+                elif a <= points[u]:
                     k = first[a] + offset[q]
                 else:
-                    k = ~(first[met[u]] + offset[q])
+                    k = ~(first[points[u]] + offset[q])
                 q += 1
                 b0, b1, b2 = w * sums[u, 0], w * sums[u, 1], w * sums[u, 2]
                 b3, b4, b5 = w * sums[u, 3], w * sums[u, 4], w * sums[u, 5]
@@ -155,7 +155,7 @@ def _project(indptr, columns, start, parents, weights, slots, most, first, offse
 
 @cached()
 def _finish_diagonal(indptr, values):  # type: ignore[no-untyped-def]
-    """Add the transposed half to the diagonal blocks of values (n_blocks, 9)."""
+    """Add the transpose to the diagonal blocks, of which values (n_blocks, 9) hold half."""
     for row in range(len(indptr) - 1):
         k = indptr[row]
         for i in range(3):
@@ -166,7 +166,7 @@ def _finish_diagonal(indptr, values):  # type: ignore[no-untyped-def]
 
 @cached()
 def _fill_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
-    """A one, and 0 in free (n, 3), where nothing is interpolated from a coordinate."""
+    """Set the diagonal to 1 and free (n, 3) to 0 for coordinates that nothing is interpolated from."""
     for row in range(len(indptr) - 1):
         for i in range(3):
             free[row, i] = 1.0
@@ -175,31 +175,30 @@ def _fill_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
 
 
 class Galerkin:
-    """The coarse rows of a rank.
+    """Galerkin product of a rank's fine rows with the interpolation.
 
     Parameters
     ----------
     points : Points
-        The fine ones.
+        Fine points.
     pattern : BlockPattern
-        Of the fine rows.
+        Pattern of the fine rows.
     start : (n_owned + 1,)
-        Where each fine point's parents begin.
+        Row pointers of the interpolation of the fine points.
     parents, weights : (P,)
-        Coarse points, in global numbers, that it is interpolated from.
+        Coarse points in global numbers from which a fine point is interpolated, and weights.
     bounds : (ranks + 1,)
         First coarse point of each rank.
 
     Attributes
     ----------
     points : Points
-        The coarse ones, with those of other ranks that the rows couple to, or are interpolated from, as
-        ghosts.
+        Coarse points; ghosts are those of other ranks in the coarse rows or the interpolation.
     pattern : BlockPattern
-        Of the coarse rows.
+        Pattern of the coarse rows.
     interpolation : (n_local + 1,), (P,) int32, (P,)
-        Where the parents of each fine point begin, those of ghosts too, in the coarse points' local numbers,
-        and their weights.
+        Compressed rows of the interpolation of all local fine points: row pointers, parents in local numbers
+        of coarse points, weights.
     """
 
     def __init__(
@@ -227,57 +226,57 @@ class Galerkin:
         self.interpolation = self._start, local, self._weights
         n_local = self.points.n_local
         own = one[inside] * n_local + other[inside]
-        came = (shared.rows - first) * n_local + local_numbers(shared.columns, ghosts, first, end)
-        final = union(diagonal_keys(n, n_local), own, came)
+        received = (shared.rows - first) * n_local + local_numbers(shared.columns, ghosts, first, end)
+        final = union(diagonal_keys(n, n_local), own, received)
         self.pattern = BlockPattern.of_keys(final, n, n_local)
-        shared.into(np.searchsorted(final, came))
-        place = np.empty(len(keys), dtype=np.int64)
-        place[inside] = np.searchsorted(final, own)
-        place[mixed] = len(final) + np.arange(len(pairs))
-        self._offset, self._far = self._where(target, place)
+        shared.set_targets(np.searchsorted(final, received))
+        blocks = np.empty(len(keys), dtype=np.int64)
+        blocks[inside] = np.searchsorted(final, own)
+        blocks[mixed] = len(final) + np.arange(len(pairs))
+        self._offset, self._far = self._offsets(target, blocks)
         self._n_sums = len(final) + len(pairs)
 
-    def _where(self, target: Ints, place: Ints) -> tuple[NDArray[np.uint8], Ints]:
-        """Where products go that add to these keys, whose blocks stand at ``place``."""
+    def _offsets(self, target: Ints, blocks: Ints) -> tuple[NDArray[np.uint8], Ints]:
+        """``offset`` and ``far`` of `_project` for the keys ``target`` of products, and each key's block."""
         counts = np.diff(self.pattern.indptr)
-        behind = np.arange(self.pattern.n_blocks) - np.repeat(self.pattern.indptr[:-1], counts)
-        short = np.full(len(place), FAR, dtype=np.uint8)
-        inside = place < len(behind)
-        short[inside] = np.minimum(behind[place[inside]], FAR)
+        in_row = np.arange(self.pattern.n_blocks) - np.repeat(self.pattern.indptr[:-1], counts)
+        short = np.full(len(blocks), FAR, dtype=np.uint8)
+        inside = blocks < len(in_row)
+        short[inside] = np.minimum(in_row[blocks[inside]], FAR)
         offset, far = np.empty(len(target), dtype=np.uint8), [np.empty(0, dtype=np.int64)]
         for lo in range(0, len(target), CHUNK_PRODUCTS):
             part = target[lo : lo + CHUNK_PRODUCTS]
             key = np.where(part < 0, ~part, part)
             offset[lo : lo + len(part)] = short[key]
             beyond = short[key] == FAR
-            at = place[key[beyond]]
-            far.append(np.where(part[beyond] < 0, ~at, at))
+            block = blocks[key[beyond]]
+            far.append(np.where(part[beyond] < 0, ~block, block))
         return offset, np.concatenate(far)
 
     def _products(self, width: int) -> tuple[Ints, Ints]:
-        """All keys, ascending, and which of them each product adds to; ~ of it if transposed."""
+        """All keys, ascending, and the index of the key of each product, ~ of it if transposed."""
         fine, n = self._fine, self._fine.n_owned
         rows = fine.indptr, fine.columns, self._start, self._parents
         n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         _counts(*rows, width, n_slots, n_keys)
-        self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
-        self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
+        self._max_slots = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
+        self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._max_slots < 2**15 else np.int32)
         firsts = row_pointers(n_slots)
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
 
-        def made(lo: int, hi: int) -> Ints:
+        def keys_of(lo: int, hi: int) -> Ints:
             keys = np.empty(int(n_keys[lo:hi].sum()), dtype=np.int64)
             _slots(lo, hi, *rows, self._slots[firsts[lo] :], keys, width)
             return keys
 
         keys = np.empty(0, dtype=np.int64)
         for lo, hi in chunks:
-            new = made(lo, hi)
+            new = keys_of(lo, hi)
             keys = union(keys, np.where(new < 0, ~new, new))
         target = np.empty(int(n_keys.sum()), dtype=index_type(2 * len(keys)))
         q = 0
         for lo, hi in chunks:
-            new = made(lo, hi)
+            new = keys_of(lo, hi)
             found = np.searchsorted(keys, np.where(new < 0, ~new, new))
             target[q : q + len(new)] = np.where(new < 0, ~found, found)
             q += len(new)
@@ -285,9 +284,9 @@ class Galerkin:
 
     @logged(GALERKIN)
     def project(self, values: Array, free: Array) -> tuple[Array, Array]:
-        """Make coarse block rows of fine ones (n_blocks, 3, 3); collective.
+        """Coarse block rows of fine ones (n_blocks, 3, 3); collective.
 
-        ``free`` (n_owned, 3) is 0 for coordinates that nothing is interpolated to, 1 for others; those are
+        ``free`` (n_owned, 3) is 1 for coordinates to which is interpolated, 0 for others, which must be
         decoupled in ``values``.
 
         Returns
@@ -295,15 +294,15 @@ class Galerkin:
         values : (n_blocks, 3, 3)
             The coarse rows.
         free : (n_owned, 3)
-            1 for coarse coordinates that something is interpolated from, else 0.
+            1 for coarse coordinates from which is interpolated, else 0.
         """
         fine, n = self._fine, self.pattern.n_blocks
         sums, coarse_free = np.zeros((self._n_sums, 9)), np.empty((self.pattern.n_owned, 3))
         rows = fine.indptr, fine.columns, self._start, self._parents, self._weights
-        into = self.pattern.indptr, self._offset, self._far
-        _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, sums)
+        targets = self.pattern.indptr, self._offset, self._far
+        _project(*rows, self._slots, self._max_slots, *targets, values.reshape(-1, 9), free, sums)
         _finish_diagonal(self.pattern.indptr, sums)
-        # products with the interpolation, and of its transpose with these
+        # A P, and Pᵀ (A P)
         PETSc.Log.logFlops(18.0 * (len(self._slots) + len(self._offset)))
         self._shared.add(sums[n:], sums[:n])
         _fill_diagonal(self.pattern.indptr, sums, coarse_free)
@@ -311,7 +310,7 @@ class Galerkin:
 
 
 def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:
-    """Parents and weights of all local points, and where those of each begin; collective."""
+    """Parents, weights and row pointers of all local points, from those of the owned ones; collective."""
     if points.comm.size == 1:
         return parents, weights, start
     counts = np.zeros((points.n_local, 3))
@@ -323,12 +322,12 @@ def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> 
     all_parents[: len(parents)], all_weights[: len(weights)] = parents, weights
     row = np.zeros((points.n_local, 3))
     for nth in range(points.comm.allreduce(int(number.max(initial=0)), MPI.MAX)):
-        there = number > nth
-        own = there[: points.n_owned]
+        has = number > nth
+        own = has[: points.n_owned]
         at = start[:-1][own] + nth
         row[: points.n_owned][own, 0], row[: points.n_owned][own, 1] = parents[at], weights[at]
         points.update_ghosts(row)
-        ghosts = np.flatnonzero(there[points.n_owned :]) + points.n_owned
+        ghosts = np.flatnonzero(has[points.n_owned :]) + points.n_owned
         all_parents[everywhere[ghosts] + nth] = row[ghosts, 0].astype(np.int64)
         all_weights[everywhere[ghosts] + nth] = row[ghosts, 1]
     return all_parents, all_weights, everywhere

@@ -1,11 +1,11 @@
-"""Gauss-Seidel over symmetric block rows of which one half is stored: each sweep reads the matrix once.
+"""Gauss-Seidel on symmetric block rows of which one half is stored; each sweep reads the matrix once.
 
-A = L + D + Lᵀ with the stored upper half Lᵀ; a sweep gathers with it and, as each unknown is found, scatters
-with it, so that no second pass is needed for the other half or for the residual. Sweeps of a rank see the
-values of others' points as they are given (block Jacobi between ranks). All in single precision: half the
-bytes, which are what a sweep costs, and a preconditioner need not be exact. Indices are unsigned: numba looks
-at the sign of others each time. Tiny numbers are zero, so that no product is below 1.2e-38, the like of which
-takes processors a hundred times longer: a flat sheet's couplings across its plane are round-off.
+A = L + D + Lᵀ with the stored upper half Lᵀ. A sweep gathers with Lᵀ and, as soon as an unknown is known,
+scatters with it, so that neither the other half nor the residual needs a second pass. Between ranks the
+sweeps are block Jacobi: ghosts keep their values. Single precision halves the memory traffic, which limits
+the speed of a sweep, and suffices for a preconditioner. Indices are unsigned, as numba checks the sign
+of signed ones. Tiny numbers are set to zero to avoid subnormal products (below 1.2e-38), which take a hundred
+times longer; they occur as round-off in the out-of-plane couplings of a flat sheet.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 TINY = np.float32(1e-20)
-"""Velocities [m/s] below it are none."""
+"""Velocities [m/s] below it are set to zero."""
 
 NEGLIGIBLE = 1e-12
-"""Entries below this fraction of the least on the diagonal are none."""
+"""Entries below this fraction of the smallest diagonal entry are set to zero."""
 
 
 @cached(inline="always")
@@ -38,30 +38,30 @@ def flushed(value):  # type: ignore[no-untyped-def]
 
 @cached()
 def negligible_size(indptr, values):  # type: ignore[no-untyped-def]
-    """What entries of values (n_blocks, 9) must exceed to count."""
-    least = np.float64(np.inf)
+    """Size up to which entries of values (n_blocks, 9) are negligible."""
+    smallest = np.float64(np.inf)
     for row in range(Index(len(indptr) - 1)):
         k = Index(indptr[row])
         for i in (0, 4, 8):
-            if 0.0 < values[k, i] < least:
-                least = values[k, i]
-    return least * NEGLIGIBLE
+            if 0.0 < values[k, i] < smallest:
+                smallest = values[k, i]
+    return smallest * NEGLIGIBLE
 
 
 @cached()
-def store(values, least, blocks):  # type: ignore[no-untyped-def]
-    """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision, those up to ``least`` as 0."""
+def store(values, threshold, blocks):  # type: ignore[no-untyped-def]
+    """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision; 0 for sizes up to ``threshold``."""
     for block in range(Index(len(blocks))):
         for i in range(Index(9)):
             value = values[block, i]
-            blocks[block, i] = value if abs(value) > least else 0.0
+            blocks[block, i] = value if abs(value) > threshold else 0.0
 
 
 @cached()
 def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
-    """Inverses of the symmetric diagonal blocks of values (n_blocks, 9) into inverse (n, 9).
+    """inverse (n, 9) = inverses of the symmetric diagonal blocks of values (n_blocks, 9).
 
-    Of a singular block, of its diagonal.
+    Of a singular block only the diagonal is inverted.
     """
     for row in range(Index(len(inverse))):
         k = Index(indptr[row])
@@ -85,25 +85,25 @@ def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
 
 @cached()
 def invert_roots(rows, values, roots):  # type: ignore[no-untyped-def]
-    """L⁻¹ of the diagonal blocks L Lᵀ, values (n, 9), of rows (n,) into roots (n_local, 6).
+    """roots (n_local, 6) = L⁻¹ of the Cholesky factors of diagonal blocks, values (n, 9), of rows (n,).
 
-    Their lower half row by row. Directions without stiffness, or with a negative one, are left out.
+    The lower triangle is stored row by row; it is 0 in directions of zero or negative stiffness.
     """
     for number in range(Index(len(rows))):
         row, k = Index(rows[number]), number
-        least = 1e-12 * max(values[k, 0], values[k, 4], values[k, 8])
+        smallest = 1e-12 * max(values[k, 0], values[k, 4], values[k, 8])
         b, c, e = values[k, 1], values[k, 2], values[k, 5]
         d, f = values[k, 4], values[k, 8]
         p = q = r = l10 = l20 = l21 = 0.0
-        if values[k, 0] > least:
+        if values[k, 0] > smallest:
             p = 1.0 / np.sqrt(values[k, 0])
             l10, l20 = b * p, c * p
         d -= l10 * l10
-        if d > least:
+        if d > smallest:
             q = 1.0 / np.sqrt(d)
             l21 = (e - l10 * l20) * q
         f -= l20 * l20 + l21 * l21
-        if f > least:
+        if f > smallest:
             r = 1.0 / np.sqrt(f)
         roots[row, 0], roots[row, 1], roots[row, 2] = p, -q * l10 * p, q
         roots[row, 3], roots[row, 4], roots[row, 5] = r * (l21 * q * l10 - l20) * p, -r * l21 * q, r
@@ -111,9 +111,9 @@ def invert_roots(rows, values, roots):  # type: ignore[no-untyped-def]
 
 @cached()
 def relative_couplings(rows, indptr, ends, columns, values, roots, sums):  # type: ignore[no-untyped-def]
-    """Sums (n,) over each row's couplings C_ij to ghosts of a bound of ‖L_i⁻¹ C_ij L_j⁻ᵀ‖.
+    """sums (n,) = upper bounds of Σ_j ‖L_i⁻¹ C_ij L_j⁻ᵀ‖ over each row's couplings C_ij to ghosts.
 
-    The bound of a norm is the fourth root of the sum of the singular values' fourth powers.
+    A spectral norm is bounded by the fourth root of the sum of the fourth powers of the singular values.
     """
     m = np.empty((3, 3))
     for number in range(Index(len(rows))):
@@ -141,7 +141,7 @@ def relative_couplings(rows, indptr, ends, columns, values, roots, sums):  # typ
 
 @cached(inline="always")
 def solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
-    """A point's unknowns by the inverse of its block."""
+    """Unknowns of a point: the inverse of its block times the right-hand side (s0, s1, s2)."""
     y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
     y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
     y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
@@ -150,11 +150,11 @@ def solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
 
 @cached(fastmath=True)
 def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-untyped-def]
-    """A backward sweep from x (n_local, 3) over the owned points: (D + Lᵀ) x = r.
+    """A backward sweep over the owned points: solves (D + Lᵀ) x = r, starting from x (n_local, 3).
 
-    ``ends`` (n_owned,) says where a row's couplings to ghosts begin. r (n_owned, 4), whose last numbers mean
-    nothing, is what ``forward`` leaves, b − L x before (b, where x is zero), and b − A x after it; but
-    for what has changed in couplings to ghosts.
+    ``ends`` (n_owned,) is where a row's couplings to ghosts begin. r (n_owned, 4), whose fourth column is
+    padding, is b − L x on entry (as ``forward`` leaves it; b if x is zero) and b − A x on exit, both for
+    unchanged ghosts.
     """
     n = Index(len(ends))
     for below in range(n):
@@ -162,15 +162,15 @@ def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-u
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
         y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
-        less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
+        decrement = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
-        scatter(blocks, columns, r, lo, hi, less)
+        scatter(blocks, columns, r, lo, hi, decrement)
 
 
 @cached(fastmath=True)
 def subtract_ghosts(rows, indptr, ends, columns, blocks, x, r):  # type: ignore[no-untyped-def]
-    """r −= the couplings of owned rows (n,), those that have some, to ghosts times x (n_local, 3)."""
+    """r −= (couplings to ghosts) · x (n_local, 3), for the owned rows (n,) that have such couplings."""
     for number in range(Index(len(rows))):
         row = Index(rows[number])
         s0, s1, s2 = gather(blocks, columns, x, Index(ends[row]), Index(indptr[row + Index(1)]), AHEAD)
@@ -181,7 +181,7 @@ def subtract_ghosts(rows, indptr, ends, columns, blocks, x, r):  # type: ignore[
 
 @cached(fastmath=True)
 def forward(indptr, ends, columns, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
-    """A forward sweep from x (n_local, 3), ghosts as they are; r (n_owned, 4) becomes b − L x."""
+    """A forward sweep from x (n_local, 3) with fixed ghosts; r (n_owned, 4) becomes b − L x."""
     n = Index(len(ends))
     for row in range(n):
         r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
@@ -195,7 +195,7 @@ def forward(indptr, ends, columns, blocks, inverse, b, x, r):  # type: ignore[no
 
 @cached(fastmath=True)
 def restrict(start, parents, weights, free, r, out):  # type: ignore[no-untyped-def]
-    """out (C, 3) = interpolationᵀ · r (n, 3), without coordinates that are not free."""
+    """out (C, 3) = interpolationᵀ · r (n, 3), where only free coordinates count."""
     out[:] = 0.0
     for row in range(Index(len(start) - 1)):
         r0, r1, r2 = free[row, 0] * r[row, 0], free[row, 1] * r[row, 1], free[row, 2] * r[row, 2]
@@ -223,13 +223,13 @@ def add_interpolated(start, parents, weights, free, coarse, x):  # type: ignore[
 
 @cached()
 def begin(b, r):  # type: ignore[no-untyped-def]
-    """The first rows of b (n_local, 3) into r (n, 4)."""
+    """Copy the first n rows of b (n_local, 3) into r (n, 4)."""
     for row in range(Index(len(r))):
         r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
 
 
 class BlockSweeps:
-    """Sweeps over a pattern's rows, and their residual.
+    """Gauss-Seidel sweeps over a pattern's rows, and their residual.
 
     Parameters
     ----------
@@ -240,33 +240,33 @@ class BlockSweeps:
     b, x : (n_local, 3)
         Right-hand side and solution.
     r : (n_owned, 4)
-        Residual, and numbers without a meaning.
+        Residual; the fourth column is padding.
     flops : float
-        Of a sweep.
+        Operations of a sweep.
     """
 
     def __init__(self, pattern: BlockPattern) -> None:
         n = pattern.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
-        self._beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._with_ghosts = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
-        self._moved: Floats | None = None  # of use for more than one sweep
+        self._increment: Floats | None = None  # only needed for more than one sweep
         self.x, self.b = (np.zeros((pattern.n_local, 3), dtype=np.float32) for _ in range(2))
         self.r = np.zeros((n, 4), dtype=np.float32)
         self.flops = 18.0 * pattern.n_couplings
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
-        """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9)."""
+        """Blocks (n, 9) of rows (n,) that sweeps invert, from block rows (n_blocks, 9)."""
         found: Array = values[self._rows[0][rows]]
         return found
 
     def invert(self, values: Array) -> None:
-        """Take the inverses of the diagonal blocks of block rows (n_blocks, 9)."""
+        """Invert the diagonal blocks of block rows (n_blocks, 9)."""
         invert_diagonal(self._rows[0], values, self._inverse)
 
     def store(self, values: Array) -> None:
-        """Take block rows (n_blocks, 9)."""
+        """Copy block rows (n_blocks, 9)."""
         store(values, negligible_size(self._rows[0], values), self._blocks)
 
     def shrink(self, rows: Ints, factor: Array) -> None:
@@ -274,7 +274,7 @@ class BlockSweeps:
         self._inverse[rows] /= factor
 
     def begin(self, b: Floats) -> None:
-        """Let the residual be b (n_local, 3): x is zero."""
+        """Set the residual to b (n_local, 3), that of x = 0."""
         begin(b, self.r)
 
     def add(self, rows: Ints, more: Floats) -> None:
@@ -282,29 +282,29 @@ class BlockSweeps:
         self.r[rows, :3] += more
 
     def backward(self, x: Floats) -> None:
-        """Sweep; see the function."""
+        """One `backward` sweep."""
         backward(*self._rows, self._blocks, self._inverse, x, self.r)
 
     def inertia(self, values: Array) -> Array | None:
-        """None: more sweeps are not worth their time here."""
+        """None: more than one sweep does not pay without edges."""
         return None
 
     def backward_again(self, x: Floats, number: int) -> None:
-        """Sweep once more, from where the residual is that of x, b − A x; ``number`` does not matter."""
-        if self._moved is None:
-            self._moved = np.zeros_like(x)
-        self._moved[:] = 0.0
-        backward(*self._rows, self._blocks, self._inverse, self._moved, self.r)
-        x += self._moved
+        """Another `backward` sweep, from the full residual b − A x; ``number`` is not used."""
+        if self._increment is None:
+            self._increment = np.zeros_like(x)
+        self._increment[:] = 0.0
+        backward(*self._rows, self._blocks, self._inverse, self._increment, self.r)
+        x += self._increment
 
     def subtract_ghosts(self, x: Floats) -> None:
-        """See the function."""
-        subtract_ghosts(self._beside, *self._rows, self._blocks, x, self.r)
+        """Subtract the couplings to ghosts times x from the residual."""
+        subtract_ghosts(self._with_ghosts, *self._rows, self._blocks, x, self.r)
 
     def correct(self, x: Floats) -> bool:
-        """False: x (n_local, 3) needs no correction beside that of coarser levels."""
+        """False: coarser levels correct all unknowns of x (n_local, 3)."""
         return False
 
     def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
-        """Sweep; see the function. ``number`` does not matter."""
+        """One `forward` sweep; ``number`` is not used."""
         forward(*self._rows, self._blocks, self._inverse, b, x, self.r)

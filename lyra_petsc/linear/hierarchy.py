@@ -1,4 +1,4 @@
-"""The levels of geometric multigrid: coarse meshes, interpolation from them, and Galerkin products."""
+"""Levels of geometric multigrid: coarse meshes, interpolation from them, and Galerkin products."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 COARSEST = 100
-"""Vertices, over all ranks, at which a factorisation takes over."""
+"""Number of vertices, over all ranks, up to which a level is not coarsened further but factorised."""
 
-WORTH = 0.7
-"""Fraction of the vertices left by a coarsening above which another brings nothing."""
+MAX_RATIO = 0.7
+"""Largest ratio of coarse to fine vertices for which a level pays."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Surface:
     Attributes
     ----------
     x : (n_vertices, 3)
-        Positions [m] of the owned vertices that interpolation follows.
+        Positions [m] of the owned vertices, from which interpolation weights are computed.
     triangles : (F, 3)
         Local numbering.
     """
@@ -52,9 +52,9 @@ class InterpolationRows:
     bounds : (ranks + 1,)
         First coarse vertex of each rank.
     start : (n_owned + 1,)
-        Where each vertex' parents begin.
+        Row pointers.
     parents : (P,)
-        Coarse vertices that it is interpolated from, in global numbers.
+        Coarse vertices from which a vertex is interpolated, in global numbers.
     weights : (P,)
     """
 
@@ -65,38 +65,39 @@ class InterpolationRows:
 
 
 class WithoutEdges(Protocol):
-    """Stands for the finest level's matrix where coarser ones, without unknowns of edges, are made.
+    """Replaces the finest level's matrix in the Galerkin product, as coarse levels have no edges' unknowns.
 
     Attributes
     ----------
     pattern : BlockPattern
-        Of the same rows as the finest level's; those of edges are empty.
+        Has the same rows as the finest level's; those of edges are empty.
     turns : EdgeTurns
-        How edges follow vertices.
+        Interpolation from displacements of vertices to the unknowns of edges.
     """
 
     pattern: BlockPattern
     turns: EdgeTurns
 
     def values(self, held: Mask, memory: Array) -> Array:
-        """Its block rows (n_blocks, 3, 3) now, in ``memory``, and ``turns`` with them; held (n_local, 3) are
-        prescribed.
+        """Current block rows (n_blocks, 3, 3), in ``memory``; updates ``turns``.
+
+        held (n_local, 3) marks prescribed coordinates.
         """
 
 
 class Level:
-    """Points of one level, and, but for the coarsest, what makes the next coarser one.
+    """Points and pattern of a level, and its Galerkin product for the next coarser one.
 
     Attributes
     ----------
     points : Points
     pattern : BlockPattern
     galerkin : Galerkin or None
-        Interpolates from the next coarser level, and makes its block rows.
+        Interpolation from the next coarser level, and its block rows; None on the coarsest one.
     turns : EdgeTurns or None
-        How unknowns of edges, that nothing is interpolated to, follow the vertices.
+        Interpolation from displacements of vertices to the unknowns of edges.
     memory : (n,) float64 or None
-        Where edges carry unknowns, what the sweeps work in; before that, the block rows below are in it.
+        With unknowns on edges, work array of the sweeps, and before them of the next level's block rows.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
@@ -115,15 +116,15 @@ class Hierarchy:
     interpolations : sequence of InterpolationRows
         Between the levels, finest first.
     below : WithoutEdges, optional
-        Where edges carry unknowns.
+        Given if edges carry unknowns.
     spare : bool
-        The finest level's block rows are of no use once it has taken them.
+        Whether the finest level's block rows may be overwritten once its sweeps have copied them.
 
     Attributes
     ----------
     levels : list of Level
     rows : (n_stored, 3, 3) or None
-        Where ``below`` is given and rows are spare: where the finest level's should be, in its memory.
+        With ``below`` and ``spare``: array for the finest level's block rows, within its memory.
     """
 
     def __init__(
@@ -140,15 +141,15 @@ class Hierarchy:
         self.rows: Array | None = None
         self._spare, self._overwritten = spare, False
         if below is not None:
-            from lyra_petsc.linear.edge_sweeps import room  # of use for nothing else
+            from lyra_petsc.linear.edge_sweeps import memory_sizes  # only needed here
 
-            # copies of rows take the place of these, if they are spare, and then what is below that of the
-            # vectors; else what is below comes first of all
-            of_rows, of_vectors = room(pattern)
+            # if rows are spare, their copy overwrites them and the rows of ``below`` use the vectors' part;
+            # else the rows of ``below`` begin at 0, as they are projected before the sweeps copy anything
+            of_rows, of_vectors = memory_sizes(pattern)
             begin = of_rows if spare else 0
-            least = max(of_rows + of_vectors, begin + 9 * below.pattern.n_blocks)
-            level.memory = np.zeros(max(least, 9 * pattern.n_stored) if spare else least)
-            self._room_below = level.memory[begin:]
+            size = max(of_rows + of_vectors, begin + 9 * below.pattern.n_blocks)
+            level.memory = np.zeros(max(size, 9 * pattern.n_stored) if spare else size)
+            self._memory_below = level.memory[begin:]
             if spare:
                 self.rows = level.memory[: 9 * pattern.n_stored].reshape(-1, 3, 3)
         self.levels = [level]
@@ -160,11 +161,11 @@ class Hierarchy:
             self.levels.append(level)
 
     def rows_changed(self) -> None:
-        """``rows`` are those of a new matrix."""
+        """Tell that ``rows`` were set to those of a new matrix."""
         self._overwritten = False
 
     def entries(self) -> Array:
-        """What ``rows`` were set to, or what the sweeps keep of that, in single precision."""
+        """The last values of ``rows``; once they are overwritten, the sweeps' copy in single precision."""
         finest = self.levels[0]
         assert self.rows is not None
         assert finest.memory is not None
@@ -174,35 +175,34 @@ class Hierarchy:
         return kept.astype(np.float64)
 
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
-        """Of each level, finest first, the block rows that those of the finest make; collective.
+        """Block rows of each level, finest first, from those of the finest; collective.
 
-        Each is made when it is asked for, and the one before should be freed by then; in ``rows`` the finest
-        ones are overwritten.
+        Each is computed on demand, when the one before should be freed; those in ``rows`` are overwritten.
 
         Parameters
         ----------
         values : (n_blocks, 3, 3)
             Of the finest level.
         held : (n_local, 3)
-            Its prescribed coordinates.
+            Mask of its prescribed coordinates.
 
         Yields
         ------
         values : (n_blocks, 3, 3)
         free : (n_owned, 3)
-            0 for coordinates that take no part in interpolation, 1 for others; of the finest level those of
-            vertices alone, as edges take none.
+            1 for coordinates that take part in interpolation, 0 for others; on the finest level (n_vertices,
+            3), as edges take no part.
         """
         finest = self.levels[0]
         free = np.where(held[: finest.pattern.n_diagonal], 0.0, 1.0)
         below: tuple[Array, Array] | None = None
         if self._below is not None and not self._spare and finest.galerkin is not None:
-            below = finest.galerkin.project(self._below.values(held, self._room_below), free)
+            below = finest.galerkin.project(self._below.values(held, self._memory_below), free)
         for level in self.levels:
             yield values, free
             if self._below is not None and self._spare and level is finest:
                 self._overwritten = True
-                values = self._below.values(held, self._room_below)
+                values = self._below.values(held, self._memory_below)
             if below is not None:
                 (values, free), below = below, None
             elif level.galerkin is not None:
@@ -215,12 +215,11 @@ class Hierarchy:
         self.levels = []
 
 
-def interpolations(layout: Layout, surface: Surface, most: int) -> list[InterpolationRows]:
-    """This rank's rows of the interpolations between at most so many levels, finest first; collective.
+def interpolations(layout: Layout, surface: Surface, max_levels: int) -> list[InterpolationRows]:
+    """This rank's rows of the interpolations between at most max_levels levels, finest first; collective.
 
-    Rank 0 makes all coarse meshes, in the order in which one rank numbers vertices: so they do not depend on
-    the ranks, nor on the partition, which is another each time. Nothing is interpolated to the unknowns of
-    edges.
+    Rank 0 builds all coarse meshes, in the vertex numbering of a run on one rank, so that they depend neither
+    on the number of ranks nor on the partition, which varies. Rows of edges are empty.
     """
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
@@ -230,8 +229,8 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     if parts is not None:
         x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
         del parts
-        place = np.arange(len(x)) if comm.size == 1 else _places(triangles, original)
-        shares = _shares(x, triangles, place, layout.vertex_bounds, most)
+        serial = np.arange(len(x)) if comm.size == 1 else _serial_numbers(triangles, original)
+        shares = _shares(x, triangles, serial, layout.vertex_bounds, max_levels)
     share: list[InterpolationRows] = comm.scatter(shares)
     if share and layout.n_owned > n:
         start = share[0].start
@@ -239,36 +238,38 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     return share
 
 
-def _places(triangles: Ints, original: Ints) -> Ints:
-    """Number (N,) that each vertex has on one rank; ``original`` (N,) are their positions in the mesh."""
+def _serial_numbers(triangles: Ints, original: Ints) -> Ints:
+    """Number (N,) of each vertex in a run on one rank; ``original`` (N,) are its numbers in the mesh file."""
     position: Ints = locality_order(vertex_graph([original[triangles]], len(original)))[original]
     return position
 
 
-def _shares(x: Array, triangles: Ints, place: Ints, bounds: Ints, most: int) -> list[list[InterpolationRows]]:
-    """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers.
+def _shares(
+    x: Array, triangles: Ints, serial: Ints, bounds: Ints, max_levels: int
+) -> list[list[InterpolationRows]]:
+    """Rows of each rank, from all vertices x (N, 3) and triangles (F, 3) in global numbers.
 
-    ``place`` (N,) are the vertices' places in the order in which coarse meshes are made.
+    ``serial`` (N,) are the vertices' numbers in a run on one rank, in which coarse meshes are built.
     """
     shares: list[list[InterpolationRows]] = [[] for _ in bounds[1:]]
-    number = np.argsort(place)
-    x, triangles = x[number], place[triangles]
+    number = np.argsort(serial)
+    x, triangles = x[number], serial[triangles]
     triangles = triangles[np.lexsort(np.sort(triangles, axis=1).T[::-1])]
     levels = 1
-    while levels < most and (len(x) > COARSEST or levels == 1):
+    while levels < max_levels and (len(x) > COARSEST or levels == 1):
         coarse = coarsen(x, triangles)
-        if len(coarse.vertices) > WORTH * len(x):
+        if len(coarse.vertices) > MAX_RATIO * len(x):
             break
         kept = number[coarse.vertices]
-        below = np.searchsorted(np.sort(kept), bounds)
-        number_below = np.argsort(np.argsort(kept))
-        place = np.argsort(number)
+        coarse_bounds = np.searchsorted(np.sort(kept), bounds)
+        coarse_number = np.argsort(np.argsort(kept))
+        serial = np.argsort(number)
         for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
-            first, counts = coarse.start[place[lo:hi]], np.diff(coarse.start)[place[lo:hi]]
+            first, counts = coarse.start[serial[lo:hi]], np.diff(coarse.start)[serial[lo:hi]]
             start = row_pointers(counts)
             rows = np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
-            parents = number_below[coarse.parents[rows]]
-            share.append(InterpolationRows(below, start, parents, coarse.weights[rows]))
-        x, triangles, number, bounds = x[coarse.vertices], coarse.triangles, number_below, below
+            parents = coarse_number[coarse.parents[rows]]
+            share.append(InterpolationRows(coarse_bounds, start, parents, coarse.weights[rows]))
+        x, triangles, number, bounds = x[coarse.vertices], coarse.triangles, coarse_number, coarse_bounds
         levels += 1
     return shares

@@ -1,7 +1,7 @@
-"""Signs of the eigenvalues of a symmetric matrix, from the pivots of its factors; and its lowest mode.
+"""Signs of the eigenvalues of a symmetric matrix, from the pivots of its factorisation, and its lowest mode.
 
-Sylvester: a symmetric matrix has as many negative eigenvalues as its factors LDLᵀ have negative pivots. The
-factors are MUMPS's, of a solver of its own with the options prefix ``stability_``.
+By Sylvester's law of inertia a symmetric matrix has as many negative eigenvalues as its LDLᵀ factorisation
+has negative pivots. MUMPS factors it, in a KSP with the options prefix ``stability_``.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from lyra_petsc.mesh.points import Layout
 PREFIX = "stability_"
 
 NEUTRAL = 1e-10
-"""Size of a pivot over that of the largest diagonal entry below which it has no sign."""
+"""Size of a pivot, relative to the largest diagonal entry, below which its sign is round-off."""
 
 FIRST_SHIFT, MORE = 1e-8, 10.0
-"""Shift over the largest diagonal entry at which a positive-definite matrix is sought, and its growth."""
+"""First shift that is tried to make the matrix positive definite, relative to the largest diagonal entry, and
+the factor by which it grows."""
 
 SOLVES, SAME = 100, 1e-3
-"""Most inverse iterations, and the relative change of the eigenvalue at which they end."""
+"""Maximum number of inverse iterations, and the relative change of the eigenvalue at which they end."""
 
 
 @dataclass(frozen=True)
 class Pivots:
-    """How many pivots are negative, and how many are too small to have a sign."""
+    """Numbers of pivots that are negative, and that are too small to have a sign."""
 
     negative: int
     neutral: int
@@ -60,7 +61,7 @@ class Inertia:
         self._margin = 50
 
     def pivots(self, shift: float = 0.0) -> Pivots | None:
-        """Of the matrix plus shift times the identity; None if there is no memory for its factors.
+        """Pivots of the matrix plus shift times the identity; None if its factors do not fit into memory.
 
         Unknowns that no energy depends on have neutral pivots.
         """
@@ -87,8 +88,8 @@ class Inertia:
         pc.setFactorSolverType("mumps")
         pc.setFactorSetUpSolverType()
         factors = pc.getFactorMatrix()
-        factors.setOptionsPrefix(PREFIX)  # else it takes the options of the steps' factors
-        # unscaled; all pivots are counted, also those of the last dense block, and null ones apart
+        factors.setOptionsPrefix(PREFIX)  # without a prefix it would take the options of the steps' factors
+        # no scaling; count all pivots, also those of the last dense block, and null pivots separately
         for number, value in {6: 0, 8: 0, 13: 1, 14: self._margin, 24: 1}.items():
             factors.setMumpsIcntl(number, value)
         factors.setMumpsCntl(1, 0.01)
@@ -97,7 +98,7 @@ class Inertia:
         return factors
 
     def solve(self, right: Array) -> Array:
-        """Solution (n_owned, 3) for a right side by the factors of the last ``pivots``; collective."""
+        """Solution (n_owned, 3) for a right-hand side, by the factors of the last ``pivots``; collective."""
         assert self._ksp is not None
         x, b = self._matrix.mat.createVecs()
         b.setArray(right.ravel())
@@ -108,9 +109,9 @@ class Inertia:
         return found
 
     def lowest_mode(self, start: Array) -> tuple[float, Array] | None:
-        """Lowest eigenvalue [N/m] and its vector (n_owned, 3) of length one, by inverse iteration.
+        """Lowest eigenvalue [N/m] and its unit eigenvector (n_owned, 3), by inverse iteration.
 
-        From ``start`` (n_owned, 3), which is 0 in prescribed unknowns. None if the factors fail.
+        ``start`` (n_owned, 3) is the initial vector, 0 in prescribed unknowns. None if a factorisation fails.
         """
         shift = FIRST_SHIFT * self._largest
         while (pivots := self.pivots(shift)) is not None and pivots.negative:

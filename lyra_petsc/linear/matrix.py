@@ -1,4 +1,4 @@
-"""The PETSc matrices of a run: the operator, and what preconditioners are built from."""
+"""The PETSc matrices of a run: the operator, and the matrix from which preconditioners are built."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
 from lyra_petsc.mesh.points import Points
 
 SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)
-"""In which PETSc shows a matrix without its entries."""
+"""Viewer formats in which PETSc shows a matrix without its entries."""
 
-FILLED = ("aij", "baij", "sbaij")
-"""Matrix types with entries that block rows are put into."""
+ASSEMBLED = ("aij", "baij", "sbaij")
+"""Matrix types that can be assembled from block rows."""
 
 
 def _set_vec_type(mat: PETSc.Mat) -> None:
-    """Let vectors made for a matrix be of the type that ``-vec_type`` says."""
+    """Let vectors created for a matrix have the type ``-vec_type``."""
     kind = PETSc.Options().getString("vec_type", "")
     if kind:
         mat.setVecType(kind)
 
 
 class _Product:
-    """What PETSc calls of a matrix of type ``python``: the product with block rows of which one half is
-    stored.
+    """Python context of a matrix of type ``python``: products with symmetric block rows, stored by half.
 
-    PETSc's own for ``sbaij`` fetches each block past the caches, in which it takes two to three times as
-    long; that for ``baij`` works number by number, and takes twice as long in the caches.
+    PETSc's product for ``sbaij`` bypasses the caches and takes two to three times as long for matrices that
+    fit into them; that for ``baij`` is not vectorised, and takes twice as long there.
     """
 
     def __init__(
@@ -47,8 +46,8 @@ class _Product:
         summary: Callable[[], list[str]] | None,
         entries: Callable[[], Array] | None,
     ) -> None:
-        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: the methods'
-        # objects have PETSc objects of their own, and must not be freed then
+        # weak: PETSc may free the matrix, and with it this context, after the end of Python and MPI, when the
+        # objects of these methods, which own PETSc objects, must not be freed
         self._summary = None if summary is None else weakref.WeakMethod(summary)
         self._entries = None if entries is None else weakref.WeakMethod(entries)
         self._points = points if points.comm.size > 1 else None
@@ -69,10 +68,10 @@ class _Product:
         self._multiply(values, y.getArray().reshape(-1, 3))
         PETSc.Log.logFlops(self._operations)
 
-    multTranspose = mult  # it is symmetric
+    multTranspose = mult  # the matrix is symmetric
 
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        """Show the entries, as ``-ksp_view_mat`` asks, or for ``-ksp_view`` how they are kept; collective."""
+        """Show the entries (``-ksp_view_mat``) or a summary of their storage (``-ksp_view``); collective."""
         if viewer.getType() == PETSc.Viewer.Type.ASCII and viewer.getFormat() in SUMMARIES:
             summary = None if self._summary is None else self._summary()
             lines = ["block rows of the program, of which one half is stored"]
@@ -87,28 +86,27 @@ class _Product:
 
 
 class BlockMatrix:
-    """A symmetric matrix of 3×3 blocks whose entries are block rows of ours, of which PETSc only asks
-    products.
+    """A symmetric matrix of 3×3 blocks in this program's block rows, for which PETSc only calls products.
 
     Parameters
     ----------
     points : Points
     pattern : BlockPattern
     summary : method or None
-        Further lines of ``-ksp_view``; collective. Its object is not kept alive.
+        Further lines of ``-ksp_view``; collective. Its object is referenced weakly.
     rows : (n_stored, 3, 3) float64, optional
-        Where its block rows shall be.
+        Array for the block rows.
     entries : method, optional
-        Returns them where something else may have taken their place. Its object is not kept alive.
+        Returns the block rows if ``rows`` may have been overwritten. Its object is referenced weakly.
 
     Attributes
     ----------
     mat : PETSc.Mat
         Of type ``python``.
     rows : (n_stored, 3, 3) float64
-        Its block rows; ``set`` tells PETSc that they changed.
+        The block rows; ``set`` tells PETSc that they changed.
     observers : list of callables
-        Are given the block rows whenever they change.
+        Called with the block rows whenever they change.
     """
 
     kind = "python"
@@ -132,19 +130,18 @@ class BlockMatrix:
         self.mat.setPythonContext(_Product(points, pattern, self.rows, summary, entries))
         _set_vec_type(self.mat)
         self.mat.setUp()
-        # what PETSc frees when Python is gone must not call it
+        # a matrix that PETSc frees after the end of Python must not call Python
         self._detach = weakref.finalize(self, self.mat.setType, PETSc.Mat.Type.SHELL)
 
-    def set(self, values: Array, larger: float = 0.0) -> None:
-        """Replace all entries by block rows ``values`` (n_stored, 3, 3), mostly ``rows`` themselves;
-        collective.
+    def set(self, values: Array, shift: float = 0.0) -> None:
+        """Replace all entries by block rows ``values`` (n_stored, 3, 3), mostly ``rows`` itself; collective.
 
-        Diagonal blocks, and of edges their own entries, become ``larger`` by this fraction.
+        Diagonal blocks, and diagonal entries of edges, are multiplied by 1 + shift.
         """
         if values is not self.rows:
             self.rows[:] = values
-        if larger > 0.0:
-            self._blocks.scale_diagonal(self.rows, 1.0 + larger)
+        if shift > 0.0:
+            self._blocks.scale_diagonal(self.rows, 1.0 + shift)
         for observer in self.observers:
             observer(self.rows)
         self.mat.assemble()
@@ -152,30 +149,30 @@ class BlockMatrix:
 
     def destroy(self) -> None:
         """Free the matrix; collective."""
-        # solvers that Python has not freed yet hold it, perhaps until Python is gone
+        # solvers that are not freed yet may keep the matrix until the end of Python
         self._detach()
         self.mat.destroy()
 
 
 class AssembledMatrix:
-    """A symmetric matrix of 3×3 blocks with entries of PETSc's.
+    """A symmetric matrix of 3×3 blocks whose entries PETSc stores.
 
     Parameters
     ----------
     points : Points
     pattern : BlockPattern
     kind : str
-        PETSc matrix type without ``-mat_type`` (``baij``, ``aij``, ``sbaij``).
+        PETSc matrix type unless ``-mat_type`` is given (``baij``, ``aij``, ``sbaij``).
     prefix : str
-        Of the options that count, such as ``-mat_type``.
+        Prefix of its options, such as ``-mat_type``.
     diagonal : bool
-        Only diagonal blocks are stored.
+        Whether only diagonal blocks are stored.
 
     Attributes
     ----------
     mat : PETSc.Mat
     rows : (n_stored, 3, 3) float64
-        Where to put new block rows together for ``set``.
+        Work array in which new block rows may be assembled for ``set``.
     """
 
     def __init__(
@@ -201,15 +198,15 @@ class AssembledMatrix:
         self.mat.setPreallocationNNZ((inside, outside) if comm.size > 1 else inside)
         for option, value in (
             ("SYMMETRIC", True),
-            ("NO_OFF_PROC_ENTRIES", True),  # all rows are owned ones
-            ("ROW_ORIENTED", False),  # a block's values stand column by column
-            # set by the preallocation but on ranks without rows; the assembly is collective only without it
+            ("NO_OFF_PROC_ENTRIES", True),  # only owned rows are set
+            ("ROW_ORIENTED", False),  # blocks are stored column by column
+            # the preallocation sets it except on ranks without rows; assembly needs it equal on all ranks
             ("NEW_NONZERO_ALLOCATION_ERR", True),
         ):
             self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
         _set_vec_type(self.mat)
         self.mat.setUp()
-        # zeros that are never read or written take no memory
+        # (pages of np.zeros that are not touched take no memory)
         self._stored.insert(np.zeros((pattern.n_blocks, 3, 3)), self.mat)
         self._storage: Storage | None = None
         ascending = bool(np.all(np.diff(points.ghosts) > 0))
@@ -220,8 +217,8 @@ class AssembledMatrix:
     def _set_from_options(self, prefix: str) -> None:
         asked = PETSc.Options(prefix).getString("mat_type", self.mat.getType())
         self.mat.setOptionsPrefix(prefix)
-        # asked before PETSc, which crashes at some types
-        fits = asked.removeprefix("seq").removeprefix("mpi") in FILLED
+        # checked first, as PETSc crashes with some types
+        fits = asked.removeprefix("seq").removeprefix("mpi") in ASSEMBLED
         try:
             if fits:
                 self.mat.setFromOptions()
@@ -229,7 +226,7 @@ class AssembledMatrix:
             fits = False
         if not fits:
             self.mat.destroy()
-            allowed = ", ".join(FILLED)
+            allowed = ", ".join(ASSEMBLED)
             raise InputError(
                 f"'{asked}' cannot be filled by blocks here; take {allowed}", key=f"-{prefix}mat_type"
             )
@@ -240,23 +237,23 @@ class AssembledMatrix:
             self._rows = np.zeros((self._pattern.n_stored, 3, 3))
         return self._rows
 
-    def set(self, values: Array, larger: float = 0.0) -> None:
+    def set(self, values: Array, shift: float = 0.0) -> None:
         """Replace all entries by block rows ``values`` (n_stored, 3, 3); collective.
 
-        Diagonal blocks become ``larger`` by this fraction.
+        Diagonal blocks are multiplied by 1 + shift.
         """
         values = self._pattern.in_blocks(values)
-        kept = values[self._diagonal]
+        diagonal = values[self._diagonal]
         if self._only_diagonal:
-            values = (1.0 + larger) * kept
-        elif larger > 0.0:
-            values[self._diagonal] = (1.0 + larger) * kept
+            values = (1.0 + shift) * diagonal
+        elif shift > 0.0:
+            values[self._diagonal] = (1.0 + shift) * diagonal
         if self._storage is not None:
             self._storage.write(values)
         else:
             self._stored.insert(values, self.mat)
-        if larger > 0.0 and not self._only_diagonal:
-            values[self._diagonal] = kept
+        if shift > 0.0 and not self._only_diagonal:
+            values[self._diagonal] = diagonal
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

@@ -1,4 +1,4 @@
-"""Geometric multigrid where options ask for it: our V cycle on levels that follow a matrix."""
+"""Geometric multigrid as a PC: connects the V cycle of ``vcycle`` with a matrix and its coarse levels."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from lyra_petsc.linear.matrix import BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.linear.vcycle import VCycle
 
-MOST_LEVELS = 20
-"""Of them the fine one is one; ``-pc_mg_levels``."""
+MAX_LEVELS = 20
+"""Default of ``-pc_mg_levels``; includes the finest level."""
 
 
-def is_asked_for() -> bool:
-    """Whether options ask for our cycle: ``-pc_type mg``, or ``python`` with its name."""
+def is_requested() -> bool:
+    """Whether options choose this multigrid: ``-pc_type mg``, or ``python`` with the class of its cycle."""
     options = PETSc.Options()
     if options.getString("pc_type", "") == PETSc.PC.Type.MG:
-        # PETSc's own has no levels here
+        # PETSc's own PCMG would have no levels
         options.setValue("pc_type", PETSc.PC.Type.PYTHON)
         options.setValue("pc_python_type", PYTHON_TYPE)
     kind, name = (options.getString(key, "") for key in ("pc_type", "pc_python_type"))
     return bool(kind == PETSc.PC.Type.PYTHON and name == PYTHON_TYPE)
 
 
-def most_levels() -> int:
-    """What ``-pc_mg_levels`` allows."""
-    return max(1, int(PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS)))
+def max_levels() -> int:
+    """The largest number of levels, ``-pc_mg_levels``."""
+    return max(1, int(PETSc.Options().getInt("pc_mg_levels", MAX_LEVELS)))
 
 
 class Multigrid:
-    """Levels that follow ``matrix``, and the cycle of a KSP on them; collective.
+    """Levels that are updated with ``matrix``, and the cycle of a KSP on them; collective.
 
     Parameters
     ----------
     matrix : BlockMatrix
     hierarchy : Hierarchy
     held : callable
-        Returns the prescribed coordinates (n_local, 3) of the step.
+        Returns the mask (n_local, 3) of the step's prescribed coordinates.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class Multigrid:
         matrix.observers.append(self._follow)
 
     def attach(self, ksp: PETSc.KSP) -> None:
-        """Give the cycle, which PETSc made when it read the options, its levels; collective."""
+        """Give the levels to the cycle that PETSc created from the options; collective."""
         pc = ksp.getPC()
         if pc.getType() != PETSc.PC.Type.PYTHON:
             raise InputError(f"'{ksp.getType()}' takes no such preconditioner; take another", key="-ksp_type")
         self._pc = pc
-        # at the end of a program that destroys nothing PETSc would call Python when that is gone
+        # if a program destroys nothing, PETSc's finalisation would call Python after its end
         self._at_exit = weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
         self._cycle: VCycle = pc.getPythonContext()
         self._cycle.attach(self.hierarchy, self._renew)
@@ -72,14 +72,14 @@ class Multigrid:
         self.hierarchy.rows_changed()
 
     def _renew(self) -> Iterator[tuple[Array, Array]]:
-        """Block rows of all levels for the matrix as it is now; collective."""
+        """Block rows of all levels for the current matrix; collective."""
         return self.hierarchy.block_rows(self._values, self._held())
 
     def destroy(self, *, for_good: bool) -> None:
-        """Free the levels; collective. Unless it is for good, the PC will be given others."""
+        """Free the levels; collective. Unless ``for_good``, the PC will get other levels."""
         if self._pc is not None:
             if for_good:
-                self._at_exit()  # others may hold the PC until PETSc ends
+                self._at_exit()  # other objects may keep the PC until PETSc's finalisation
             else:
                 self._at_exit.detach()
                 self._cycle.detach()

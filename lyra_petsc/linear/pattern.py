@@ -1,8 +1,8 @@
-"""Block sparsity from the stencils of the active terms, and where each element block goes.
+"""Block sparsity from the stencils of the active terms, and the position of each element block in it.
 
-The matrices are symmetric: of two blocks that are each other's transpose one is stored. Where edges carry
-unknowns, those of owned edges are not in blocks, of which they would leave half zero, but behind these, one
-by one (``edge_couplings``).
+The matrices are symmetric, and only one of each two transposed blocks is stored. If edges carry unknowns,
+entries of owned edges are stored as scalars behind the blocks (``edge_couplings``), as half of each block
+would be zeros.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ MISSING = -2
 
 @cached(inline="always")
 def block_of(indptr, columns, row, column):  # type: ignore[no-untyped-def]
-    """The number of a block, or `MISSING`."""
+    """The index of a block, or `MISSING`."""
     lo, hi = indptr[row], indptr[row + 1]
-    if row == column:  # the first one, if there is one
+    if row == column:  # the diagonal block is the first one, if the row has one
         hi = min(hi, lo + 1)
     while hi - lo > 1:
         middle = (lo + hi) // 2
@@ -65,7 +65,7 @@ def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _lacks(offsets, acting):  # type: ignore[no-untyped-def]
+def _misses_block(offsets, acting):  # type: ignore[no-untyped-def]
     for e in range(len(offsets)):
         if acting[e]:
             for pair in range(offsets.shape[1]):
@@ -77,34 +77,34 @@ def _lacks(offsets, acting):  # type: ignore[no-untyped-def]
 class BlockPattern:
     """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
 
-    A row holds the columns from its own on: the upper triangle among owned points, and all ghosts. Values of
-    a block stand column by column, as PETSc keeps them. Of owned edges there are only blocks with ghosts.
+    A row holds the columns from the diagonal on: the upper triangle among owned points, and all ghosts. A
+    block is stored column by column, as in PETSc. Rows of owned edges only have blocks with ghosts.
 
     Parameters
     ----------
     couplings : mapping of name → (E, n) int, Across or WithEdges
-        Local rows that elements couple; only these get an entry, and the diagonal.
+        Local rows that elements couple; the pattern has their blocks and the diagonal.
     n_owned, n_local : int
     n_diagonal : int, optional
-        Rows, the first ones, that have a diagonal block, if others have none at all.
+        Number of rows, the first ones, that have a diagonal block; default n_owned.
 
     Attributes
     ----------
     n_owned, n_local : int
     n_diagonal : int
-        How many rows, the first ones, have a diagonal block: all but those of edges.
+        Number of rows, the first ones, with a diagonal block: all rows but those of edges.
     indptr : (n_owned + 1,) int64
-        The first block of such a row is the diagonal one.
+        The first block of a row with a diagonal block is that one.
     columns : (n_blocks,) int32
         Local column of each block, ascending within a row.
-    offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
-        Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
-        index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
-        both rows. Of `Across` (E,). Of `WithEdges` see ``edge_couplings.offsets_of``.
+    offsets : dict of name → (E, n (n + 1) / 2) int32, or int64 if needed
+        Block of each coupling (a, b), b ≥ a, of an element, ordered as (0, 0), (0, 1), …, (n − 1, n − 1):
+        2 · index of the block, + 1 if the block holds the transpose of (a, b); −1 if other ranks own both
+        rows. (E,) for `Across`; for `WithEdges` see ``EdgeCouplings.offsets_of``.
     edges : dict of name → WithEdges
         Elements that couple edges.
     edge_couplings : EdgeCouplings or None
-        Those of owned edges, where there are such elements.
+        Couplings of owned edges, if there are any.
     """
 
     def __init__(
@@ -114,20 +114,20 @@ class BlockPattern:
         self.edge_couplings: EdgeCouplings | None = None
         self.n_diagonal = n_owned if n_diagonal is None else n_diagonal
         if self.edges:
-            from lyra_petsc.linear.edge_couplings import EdgeCouplings  # of use for nothing else
+            from lyra_petsc.linear.edge_couplings import EdgeCouplings  # only needed here
 
             self.edge_couplings = EdgeCouplings(list(self.edges.values()), n_owned)
             self.n_diagonal = self.edge_couplings.n_vertices
-        keys = _with(couplings, diagonal_keys(self.n_diagonal, n_local), self.n_diagonal, n_owned, n_local)
+        keys = _all_keys(couplings, self.n_diagonal, n_owned, n_local)
         self._set(keys, n_owned, n_local)
         self.offsets: dict[str, Offsets] = {}
         for name, coupling in couplings.items():
-            # terms on the same triangles are wont to have them in the same order
+            # terms on the same triangles usually share one table
             alike = [other for other in self.offsets if _same(couplings.get(other), coupling)]
             self.offsets[name] = self.offsets[alike[0]] if alike else self.offsets_of(coupling)
 
     def missing(self, stencils: Iterable[NDArray[np.int32]], n_local: int) -> Ints:
-        """Keys row · n_local + column, ascending, of blocks that further elements couple and this has not."""
+        """Keys row · n_local + column, ascending, of blocks that further elements need and this lacks."""
         found = [np.empty(0, dtype=np.int64)]
         for stencil in stencils:
             one, other = (stencil[:, side] for side in np.array(_pairs(stencil)).T.reshape(2, -1))
@@ -136,16 +136,16 @@ class BlockPattern:
         return union(*found)
 
     def locate(self, stencils: Mapping[str, NDArray[np.int32]]) -> None:
-        """Take the offsets of further elements; `MISSING` where a coupling has no block."""
+        """Look up the offsets of further elements; `MISSING` for couplings without a block."""
         for name, stencil in stencils.items():
             self.offsets[name] = self.offsets_of(stencil)
 
-    def lacks(self, name: str, acting: NDArray[np.bool_]) -> bool:
-        """Whether a coupling of those elements of `locate` that act (E,) has no block."""
-        return bool(_lacks(self.offsets[name], acting))
+    def misses_block(self, name: str, acting: NDArray[np.bool_]) -> bool:
+        """Whether a coupling of an element of `locate` that acts, ``acting`` (E,), has no block."""
+        return bool(_misses_block(self.offsets[name], acting))
 
     def offsets_of(self, coupling: Coupling) -> Offsets:
-        """Offsets of elements; `MISSING` where a coupling has no block."""
+        """Offsets of elements; `MISSING` for couplings without a block."""
         if isinstance(coupling, WithEdges):
             assert self.edge_couplings is not None
             return self.edge_couplings.offsets_of(coupling, self)
@@ -156,18 +156,18 @@ class BlockPattern:
         return out[:, 1].copy() if isinstance(coupling, Across) else out
 
     def extended(self, more: Ints, n_local: int) -> tuple[BlockPattern, Ints]:
-        """The pattern with further blocks ``more``, keys as `missing` gives them, among more ghosts.
+        """The pattern with further blocks ``more``, keys of `missing`, for an n_local with further ghosts.
 
         Returns
         -------
         pattern : BlockPattern
-        place : (n_blocks,) int64
-            Which of its blocks each block of this pattern is.
+        positions : (n_blocks,) int64
+            Index in the new pattern of each block of this one.
         """
         own = self.keys(n_local)
-        place: Ints = np.arange(len(own)) + np.searchsorted(more, own)
+        positions: Ints = np.arange(len(own)) + np.searchsorted(more, own)
         keys = np.empty(len(own) + len(more), dtype=np.int64)
-        keys[place], keys[np.arange(len(more)) + np.searchsorted(own, more)] = own, more
+        keys[positions], keys[np.arange(len(more)) + np.searchsorted(own, more)] = own, more
         made = BlockPattern.of_keys(keys, self.n_owned, n_local)
         made.edges, made.edge_couplings, made.n_diagonal = self.edges, self.edge_couplings, self.n_diagonal
         kind = index_type(2 * len(keys))
@@ -179,13 +179,13 @@ class BlockPattern:
             if alike:
                 made.offsets[name] = made.offsets[alike[0]]
                 continue
-            moved = 2 * place[offsets >> 1] + (offsets & 1)
+            moved = 2 * positions[offsets >> 1] + (offsets & 1)
             made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
-        return made, place
+        return made, positions
 
     @classmethod
     def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:
-        """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""
+        """The pattern without elements that has the blocks of ascending keys row · n_local + column."""
         made = cls.__new__(cls)
         made._set(keys, n_owned, n_local)
         made.offsets, made.edges, made.edge_couplings, made.n_diagonal = {}, {}, None, n_owned
@@ -198,7 +198,7 @@ class BlockPattern:
         self.indptr: Ints = row_pointers(np.bincount(rows, minlength=n_owned))
 
     def keys(self, n_local: int) -> Ints:
-        """Of all blocks, ascending: row · n_local + column."""
+        """Keys row · n_local + column of all blocks, ascending."""
         rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
         return rows * n_local + self.columns
 
@@ -208,7 +208,7 @@ class BlockPattern:
 
     @cached_property
     def ends(self) -> Ints:
-        """Where (n_owned,) the blocks of a row in columns of ghosts begin."""
+        """Index (n_owned,) of each row's first block in a ghost column."""
         owned = self.columns < self.n_owned
         if owned.all():
             return self.indptr[1:]
@@ -217,29 +217,27 @@ class BlockPattern:
 
     @property
     def n_stored(self) -> int:
-        """How many blocks (3 × 3) take as much room as all values, those of edges too."""
-        return self.n_blocks if self.edge_couplings is None else self.edge_couplings.room(self.n_blocks)
+        """Number of 3 × 3 blocks that take as much memory as all values, including those of edges."""
+        return self.n_blocks if self.edge_couplings is None else self.edge_couplings.n_stored(self.n_blocks)
 
     @property
     def n_couplings(self) -> int:
-        """Blocks of the whole rows, both of those that are each other's transpose; of couplings of edges as
-        many as have so many numbers.
-        """
+        """Blocks in both halves of the owned rows; nine entries of edges count as a block."""
         found = self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_diagonal
-        return found if self.edge_couplings is None else found + self.edge_couplings.n_numbers // 9
+        return found if self.edge_couplings is None else found + self.edge_couplings.n_entries // 9
 
     @cached_property
     def whole(self) -> BlockPattern:
-        """The pattern of blocks alone, in which owned edges are in rows of three."""
+        """The equivalent pattern of 3 × 3 blocks only, in which rows of owned edges hold three edges."""
         return self if self.edge_couplings is None else self.edge_couplings.whole(self)
 
     def in_blocks(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values (n_stored, 3, 3) as ``whole`` has them."""
+        """Values (n_blocks, 3, 3) of the pattern ``whole`` from values (n_stored, 3, 3)."""
         return values if self.edge_couplings is None else self.edge_couplings.in_blocks(self, values)
 
 
 def row_pointers(counts: NDArray[Any]) -> Ints:
-    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
+    """Compressed-row pointers (n + 1,) of rows with ``counts`` (n,) entries."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
@@ -249,12 +247,12 @@ def diagonal_keys(n_owned: int, n_local: int) -> Ints:
 
 
 def index_type(largest: int) -> np.dtype[Any]:
-    """The smaller kind of offsets that counts so far."""
+    """The smaller integer type that can hold ``largest``."""
     return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
 
 
 def _pairs(coupling: Coupling) -> list[tuple[int, int]]:
-    """Which rows (a, b), b ≥ a, of elements are coupled."""
+    """Pairs (a, b), b ≥ a, of an element's rows that are coupled."""
     if isinstance(coupling, Across):
         return [(0, 1)]
     n = _stencil(coupling).shape[1]
@@ -278,8 +276,9 @@ def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Int
     return key
 
 
-def _with(couplings: Couplings, keys: Ints, n_diagonal: int, n_owned: int, n_local: int) -> Ints:
-    """The keys, and those of couplings that this rank has blocks for: row · n_local + column, ascending."""
+def _all_keys(couplings: Couplings, n_diagonal: int, n_owned: int, n_local: int) -> Ints:
+    """Keys of the diagonal blocks and of all couplings stored on this rank, ascending."""
+    keys = diagonal_keys(n_diagonal, n_local)
 
     def stored(part: Ints) -> Ints:
         part = part[part < n_owned * n_local]
@@ -290,7 +289,7 @@ def _with(couplings: Couplings, keys: Ints, n_diagonal: int, n_owned: int, n_loc
 
     for coupling in couplings.values():
         stencil = _stencil(coupling)
-        # one row of elements after the other: all couplings at once take much memory
+        # row by row of the elements, as all pairs at once take much memory
         for _, pairs in groupby(_pairs(coupling), key=itemgetter(0)):
             found = (_keys(stencil[:, a], stencil[:, b], n_local) for a, b in pairs)
             keys = union(keys, *(stored(part) for part in found))
@@ -298,7 +297,7 @@ def _with(couplings: Couplings, keys: Ints, n_diagonal: int, n_owned: int, n_loc
 
 
 def union(*parts: Ints) -> Ints:
-    """All numbers, ascending, each once; as ``np.unique``, with one copy less."""
+    """The sorted unique numbers of all parts, as ``np.unique`` with one copy less."""
     numbers = np.concatenate(parts)
     numbers.sort()
     return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers

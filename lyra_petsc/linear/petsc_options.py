@@ -1,8 +1,8 @@
-"""The PETSc options database: who wins, and what was never used.
+"""Access to the PETSc options database: defaults, numbers, and unused options.
 
-Precedence: our defaults < scene ``petsc:`` < ``.petscrc`` < ``PETSC_OPTIONS`` < command line. PETSc has
-read the last three by the time a scene is known, so that a scene and our defaults only fill gaps. The
-database is never cleared.
+Precedence: program's defaults < scene ``petsc:`` < ``.petscrc`` < ``PETSC_OPTIONS`` < command line. PETSc
+reads the last three before the scene is known, so that a scene and the defaults only set options that are not
+set yet. The database is never cleared.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from lyra_petsc.linear.reasons import error_message
 Value = str | int | float | bool | None
 
 READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidump", "get_total_flops"})
-"""What PETSc asks for only while it leaves."""
+"""Options that PETSc only reads in its finalisation."""
 
-FOREIGN = ("python_type", "monitor_python")
-"""How the names of options end that have PETSc call Python."""
+PYTHON_SUFFIXES = ("python_type", "monitor_python")
+"""Suffixes of options that make PETSc call Python."""
 
 CHOICES = ("ksp_type", "pc_type", "mat_type", "snes_linesearch_type")
-"""What most errors are about that quote no option's value."""
+"""Options that most errors are about if they quote no option's value."""
 
 
 def fill_gaps(options: Mapping[str, Value]) -> list[str]:
@@ -40,7 +40,7 @@ def fill_gaps(options: Mapping[str, Value]) -> list[str]:
 
 
 def is_set(name: str) -> bool:
-    """Whether an option stands in the database."""
+    """Whether an option is in the database."""
     return bool(PETSc.Options().hasName(name))
 
 
@@ -50,7 +50,7 @@ def petsc_number(name: str, default: float) -> float:
     Raises
     ------
     InputError
-        If something else stands there.
+        If its value is no number.
     """
     value = PETSc.Options().getString(name, "")
     if is_set(name) and not value:
@@ -62,17 +62,17 @@ def petsc_number(name: str, default: float) -> float:
 
 
 def refused(error: Exception) -> InputError:
-    """What PETSc has against an option."""
+    """An input error for an option that PETSc rejects with ``error``."""
     return InputError(f"PETSc refuses it: {error_message(error)}", key=culprits(error))
 
 
 def quoted(error: Exception) -> list[str]:
     """The options that an error of PETSc names, or whose value it quotes."""
-    told = re.split(r"[\s;:,']+", error_message(error))
+    words = re.split(r"[\s;:,']+", error_message(error))
     options = {f"-{name}": (value or "").strip() for name, value in PETSc.Options().getAll().items()}
-    named = [name for name in options if name in told]
-    named = named or [name for name, value in options.items() if value and value in told]
-    numbers = set(map(_number, told)) - {None}  # PETSc quotes -1 as -1. and 1e30 as 1e+30
+    named = [name for name in options if name in words]
+    named = named or [name for name, value in options.items() if value and value in words]
+    numbers = set(map(_number, words)) - {None}  # PETSc quotes -1 as -1. and 1e30 as 1e+30
     return named or [name for name, value in options.items() if _number(value) in numbers]
 
 
@@ -84,9 +84,9 @@ def _number(text: str) -> float | None:
 
 
 def culprits(error: Exception) -> str:
-    """The options that an error is about: those whose value it quotes, as it does not tell their names."""
+    """The options that an error is probably about, for a message: those it quotes, else likely ones."""
     options = PETSc.Options().getAll()
-    names = quoted(error) or [f"-{name}" for name in options if name.endswith(FOREIGN)]
+    names = quoted(error) or [f"-{name}" for name in options if name.endswith(PYTHON_SUFFIXES)]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
     return " or ".join(sorted(names)) or "PETSc options"
 
@@ -97,17 +97,17 @@ def _text(value: Value) -> str:
     return "false" if value is False else str(value)
 
 
-def unused(ours: list[str]) -> list[str]:
-    """Options in the database that nothing has asked for, but for those of ``ours``.
+def unused(defaults: list[str]) -> list[str]:
+    """Options in the database that were never read, without those in ``defaults``.
 
-    petsc4py has no call for this, the C library has: ``PetscOptionsLeftGet``.
+    Calls ``PetscOptionsLeftGet`` of the C library, which petsc4py does not offer.
     """
     try:
         library = ctypes.CDLL(PETSc.__file__)
         get = library.PetscOptionsLeftGet
     except (AttributeError, OSError):
         return []
-    count = ctypes.c_int64(0)  # PetscInt is 32 or 64 bits wide; little end first
+    count = ctypes.c_int64(0)  # also holds a 32-bit PetscInt on little-endian machines
     names = ctypes.POINTER(ctypes.c_char_p)()
     values = ctypes.POINTER(ctypes.c_char_p)()
     get.argtypes = [ctypes.c_void_p] * 4
@@ -117,4 +117,4 @@ def unused(ours: list[str]) -> list[str]:
     restore = library.PetscOptionsLeftRestore
     restore.argtypes = [ctypes.c_void_p] * 4
     restore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
-    return sorted(set(found) - set(ours) - READ_AT_THE_END)
+    return sorted(set(found) - set(defaults) - READ_AT_THE_END)

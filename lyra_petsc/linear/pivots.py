@@ -1,38 +1,38 @@
-"""Whether a preconditioner that is built from the very matrix it is for lets negative curvature be seen.
+"""Whether negative curvature of a matrix is detected with a given preconditioner built from that matrix.
 
-Conjugate gradients meet it with a preconditioner that only resembles the matrix. Exact factors are the
-matrix: the solve ends after an iteration, whatever its signs, and only their pivots tell.
+With a preconditioner that only approximates the matrix conjugate gradients detect it. With exact factors the
+solve ends after one iteration whatever the signs of the eigenvalues, and only the pivots show them.
 """
 
 from __future__ import annotations
 
 from petsc4py import PETSc
 
-RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg", "mg", "python"})
-"""Preconditioners that leave conjugate gradients something to find."""
+APPROXIMATE = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg", "mg", "python"})
+"""Preconditioners with which conjugate gradients detect negative curvature."""
 
 
 def shows_negative_curvature(pc: PETSc.PC) -> bool:
-    """Whether it would be noticed, by conjugate gradients or by ``negative_pivots``."""
-    return _kind(pc) in RESEMBLING or _counts_pivots(pc)
+    """Whether negative curvature is detected, by conjugate gradients or by ``negative_pivots``."""
+    return _local_type(pc) in APPROXIMATE or _counts_pivots(pc)
 
 
 def is_incomplete(pc: PETSc.PC) -> bool:
-    """Whether it is made of incomplete factors."""
-    return _kind(pc) in ("ilu", "icc")
+    """Whether the preconditioner is an incomplete factorisation, also of each rank's block."""
+    return _local_type(pc) in ("ilu", "icc")
 
 
-def _kind(pc: PETSc.PC) -> str:
-    """Its type, or that of its blocks."""
+def _local_type(pc: PETSc.PC) -> str:
+    """Type of the preconditioner, or with block Jacobi that of its blocks."""
     if pc.getType() == "bjacobi":
         return str(PETSc.Options().getString("sub_pc_type", "ilu"))
     return str(pc.getType())
 
 
 def negative_pivots(pc: PETSc.PC) -> int:
-    """Negative pivots of the factors in use, by Sylvester's law the matrix's negative eigenvalues.
+    """Number of negative pivots, by Sylvester's law of inertia that of negative eigenvalues; collective.
 
-    0 for what has no factors; collective.
+    0 if the preconditioner does not count pivots.
     """
     return int(pc.getFactorMatrix().getMumpsInfog(12)) if _counts_pivots(pc) else 0
 

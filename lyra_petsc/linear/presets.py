@@ -1,6 +1,6 @@
-"""Named linear solvers, each a set of PETSc options, and which one a problem starts with.
+"""Named linear solvers (presets), each a set of PETSc options, and their order for a problem.
 
-``-pc_type`` on the command line replaces them. When a preset breaks down, the next takes over.
+``-pc_type`` on the command line replaces them. If a preset fails, the next one takes over.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from lyra_petsc.linear.petsc_options import Value, is_set
 
 PYTHON_TYPE = "lyra_petsc.linear.vcycle.VCycle"
-"""Our V cycle as ``-pc_python_type`` wants it."""
+"""The program's V cycle as a value of ``-pc_python_type``."""
 
 _CYCLE: dict[str, Value] = {
     "ksp_type": "cg",
@@ -25,10 +25,10 @@ _CYCLE: dict[str, Value] = {
 }
 
 PRESETS: dict[str, dict[str, Value]] = {
-    # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last four
-    # have all pivots counted, leave out scaling and pivoting (an indefinite matrix is given up anyway) and
-    # order by minimum degree. The factors are of the regularised Hessian where the exact one is indefinite;
-    # where they are too unlike, more regularisation costs less than more iterations
+    # for equilibria, where bending is a millionth of the membrane stiffness, and steps of stiff sheets. The
+    # last four options count all pivots, omit scaling and pivoting (an indefinite matrix is discarded anyway)
+    # and order by minimum degree. Factored is the regularised Hessian if the exact one is indefinite; if they
+    # differ too much, more regularisation costs less than more iterations
     "direct": {
         "ksp_type": "cg",
         "ksp_max_it": 50,
@@ -39,26 +39,26 @@ PRESETS: dict[str, dict[str, Value]] = {
         "mat_mumps_cntl_1": 0.0,
         "mat_mumps_icntl_7": 6,
     },
-    # where PETSc was built without MUMPS; one rank
+    # if PETSc was built without MUMPS; one rank only
     "cholesky": {
         "ksp_type": "cg",
         "ksp_max_it": 50,
         "pc_type": "cholesky",
         "pc_factor_mat_ordering_type": "qmd",
     },
-    # a fifth of the iterations of block Jacobi for a few times the price; ``stepping.shift`` helps
+    # a fifth of the iterations of block Jacobi, each at a few times the cost; ``stepping.shift`` helps
     "ilu": {"ksp_type": "cg", "pc_type": "ilu"},
     "block-ilu": {"ksp_type": "cg", "pc_type": "bjacobi", "sub_pc_type": "ilu"},
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"ksp_type": "cg", "pc_type": "pbjacobi"},
-    # iterations that hardly grow with the mesh. Hundreds of them mean a matrix close to singular, and another
-    # one is needed
+    # iterations hardly grow with the mesh. Hundreds of them mean that the matrix is nearly singular, and that
+    # another preset is needed
     "multigrid": _CYCLE,
-    # with levels from the second coarser one on visited twice: a sixth more for a cycle, and iterations that
-    # do not grow where there are many, by size or stiffness
+    # visits levels from the second coarser one on twice: a cycle takes a sixth longer, and iterations of
+    # large or stiff problems do not grow
     "multigrid-w": _CYCLE | {"pc_mg_w_from": 2},
-    # symmetric sweeps instead of PETSc's Chebyshev default, whose bounds age within a step. No
-    # rigid-body modes: held vertices are aggregates of their own, on which six modes are dependent
+    # symmetric sweeps instead of PETSc's default, Chebyshev, whose eigenvalue bounds become outdated within a
+    # step. No rigid-body modes: on a held vertex, an aggregate of its own, six modes are linearly dependent
     "gamg": {
         "ksp_type": "cg",
         "pc_type": "gamg",
@@ -68,57 +68,57 @@ PRESETS: dict[str, dict[str, Value]] = {
 }
 
 BETWEEN_RANKS: dict[str, dict[str, Value]] = {
-    # sweeps are Jacobi's between ranks: undamped they diverge where each has but a few vertices
+    # between ranks sweeps are Jacobi, which without damping diverges if ranks have few vertices
     "gamg": {"mg_levels_ksp_richardson_scale": 0.5},
 }
-"""What a preset needs besides on more than one rank."""
+"""Further options of a preset on more than one rank."""
 
 WITH_CHOSEN: dict[str, dict[str, Value]] = {
-    # the kind that is symmetric, without which conjugate gradients hardly converge
+    # the symmetric variants: with others conjugate gradients hardly converge
     "asm": {"pc_asm_type": "basic"},
     "gasm": {"pc_gasm_type": "basic"},
-    # else the shell DM of the SNES is asked for fields, which has none
+    # otherwise PETSc asks the shell DM of the SNES for fields, which it does not have
     "fieldsplit": {"pc_fieldsplit_dm_splits": False},
 }
-"""Further options with a ``-pc_type`` that the user chose."""
+"""Further options for a ``-pc_type`` that the user chose."""
 
 CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
-"""Krylov methods that only multiply by their operator, and can monitor the true residual."""
+"""Krylov methods that only use products with the operator, and can monitor the true residual."""
 
 INCOMPLETE = ("ilu", "block-ilu")
 FACTORISATIONS = ("direct", "cholesky")
 
 MULTIGRID_FROM = {True: 2000, False: 3000}
-"""Vertices from which multigrid is tried first; with Newton iterations, and with one linear solve a step."""
+"""Vertices from which multigrid is tried first, with Newton iterations and with one linear solve a step."""
 
 BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
-"""What is built from a matrix of type ``baij``; every other ``-pc_type`` of the user's gets ``aij``."""
+"""Preconditioners built from a matrix of type ``baij``; any other ``-pc_type`` of a user gets ``aij``."""
 
 READS_DIAGONAL = frozenset({"none", "jacobi", "pbjacobi"})
-"""What reads of its matrix no more than the diagonal blocks."""
+"""Preconditioners that only read the diagonal blocks of their matrix."""
 
 DIRECT_UNTIL = 30_000
-"""Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
+"""Vertices up to which a direct factorisation is used, for equilibria and if iterations become too many."""
 
 FACTOR_COST = 200.0, 6.5
-"""Iterations of block Jacobi that a factorisation costs: the first plus the second times √vertices.
+"""Cost of a factorisation in iterations of block Jacobi: the first number plus the second times √vertices.
 
-Measured are 300 to 400 for 1000 to 5000 vertices; a buckling sheet needs more than one for an iteration.
+Measured are 300 to 400 for 1000 to 5000 vertices; a buckling sheet needs several factorisations an iteration.
 """
 
-WORTH, WORTH_INCOMPLETE = 4.0, 2.0
-"""How many iterations of block Jacobi one of multigrid, or of incomplete factors, is worth at least."""
+GAIN, GAIN_INCOMPLETE = 4.0, 2.0
+"""Iterations of block Jacobi that one of multigrid, or of incomplete factors, replaces at least."""
 
-PRICE, PRICE_INCOMPLETE = 4.0, 2.0
-"""How many of them it costs."""
+COST, COST_INCOMPLETE = 4.0, 2.0
+"""Cost of such an iteration, in iterations of block Jacobi."""
 
 INCOMPLETE_FROM = 1.0
-"""Iterations that are expected of block Jacobi (it then takes some thirty) from which a small sheet's Newton
-iterations use incomplete factors."""
+"""Expected iterations of block Jacobi (about thirty in fact) from which Newton iterations of a small sheet
+use incomplete factors."""
 
 TWICE_FROM = 300.0
-"""Iterations of block Jacobi from which coarser levels are visited twice. With 50,000 vertices that was no
-faster up to 600, but iterations of stiff sheets then hardly grow with the mesh."""
+"""Expected iterations of block Jacobi from which coarser levels are visited twice. With 50,000 vertices that
+was no faster up to 600, but iterations of stiff sheets then hardly grow with the mesh."""
 
 
 def candidates(
@@ -130,25 +130,25 @@ def candidates(
     iterations: float = 0.0,
     contact: bool = False,
 ) -> list[str]:
-    """Presets to try in order; only ``user`` when the user chose the preconditioner.
+    """Presets to try in this order; only ``user`` if the user chose the preconditioner.
 
-    ``newton`` says that a step is more than one linear solve; ``iterations`` is what conjugate gradients
-    with block Jacobi are expected to take while there is no ``contact``.
+    ``newton``: a step takes more than one linear solve. ``iterations``: expected number of conjugate gradient
+    iterations with block Jacobi without ``contact``.
     """
     if is_set("pc_type"):
         return ["user"]
     factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
     cycle = "multigrid-w" if static or iterations > TWICE_FROM else "multigrid"
-    last = [cycle, "gamg", "block-jacobi"]  # where nothing else is known to be better
+    last = [cycle, "gamg", "block-jacobi"]
     if static:
         return [*factors, *last]
     if n_vertices > DIRECT_UNTIL:
         return last
-    # what matrices of one rank can, those for several cannot
+    # PETSc's parallel matrix types have no incomplete factors of their own, only block by block
     several = ranks > 1 or PETSc.Options().getString("mat_type", "").startswith("mpi")
     incomplete = "block-ilu" if several else "ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
-    if iterations > _factor_cost(n_vertices) * (WORTH_INCOMPLETE if small else WORTH):
+    if iterations > _factor_cost(n_vertices) * (GAIN_INCOMPLETE if small else GAIN):
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
@@ -158,34 +158,34 @@ def candidates(
 
 
 def _factorisations(ranks: int) -> list[str]:
-    """Those that this PETSc has."""
+    """Factorisation presets that this PETSc offers."""
     if PETSc.Sys.hasExternalPackage("mumps"):
         return ["direct"]
     return ["cholesky"] if ranks == 1 else []
 
 
 def break_even_iterations(n_vertices: int, presets: Sequence[str]) -> float:
-    """Linear iterations per Newton iteration from which the factorisation that is next pays."""
+    """Linear iterations per Newton iteration above which a factorisation, if it is the next preset, pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        prices = {"block-jacobi": 1.0} | dict.fromkeys(INCOMPLETE, PRICE_INCOMPLETE)
-        return _factor_cost(n_vertices) / prices.get(presets[0], PRICE)
+        costs = {"block-jacobi": 1.0} | dict.fromkeys(INCOMPLETE, COST_INCOMPLETE)
+        return _factor_cost(n_vertices) / costs.get(presets[0], COST)
     return math.inf
 
 
 def _factor_cost(n_vertices: int) -> float:
-    """Iterations of conjugate gradients with block Jacobi that cost as much as a factorisation."""
-    first, more = FACTOR_COST
-    return first + more * math.sqrt(n_vertices)
+    """Cost of a factorisation in conjugate gradient iterations with block Jacobi."""
+    constant, slope = FACTOR_COST
+    return constant + slope * math.sqrt(n_vertices)
 
 
 def options_of(name: str, ranks: int) -> dict[str, Value]:
-    """The options of a preset; ``user`` adds what goes with the ``-pc_type`` that was chosen."""
+    """Options of a preset; for ``user`` the defaults that suit the chosen ``-pc_type``."""
     if name != "user":
         return PRESETS[name] | (BETWEEN_RANKS.get(name, {}) if ranks > 1 else {})
     chosen = PETSc.Options().getString("pc_type", "")
     if chosen in ("lu", "cholesky") and not is_set("mat_type"):
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
-    if chosen == PETSc.PC.Type.MG:  # which means our cycle
+    if chosen == PETSc.PC.Type.MG:  # replaced by the program's cycle
         return PRESETS["multigrid"]
     for preset in ("block-jacobi", "gamg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
@@ -194,6 +194,6 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
 
 
 def matrix_type(preset: str) -> str:
-    """PETSc matrix type that a preset's preconditioner is built from, without ``-mat_type``."""
+    """PETSc matrix type from which a preset's preconditioner is built unless ``-mat_type`` is given."""
     blocks = PETSc.Options().getString("pc_type", "") in BAIJ_PRECONDITIONERS or preset == "block-ilu"
     return "baij" if blocks else "aij"

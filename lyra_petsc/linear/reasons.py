@@ -1,14 +1,14 @@
-"""Why PETSc stopped, in words."""
+"""Messages for PETSc's converged reasons and errors."""
 
 from __future__ import annotations
 
 from petsc4py import PETSc
 
 NOT_A_NUMBER = -4
-"""SNES reason of a residual that is not a number; its name changed in PETSc 3.25."""
+"""SNES reason for a residual that is not a number; its name changed in PETSc 3.25."""
 
-NO_REASON = ("error code", "See https://")
-"""How lines of PETSc's errors begin that do not say what went wrong."""
+UNINFORMATIVE = ("error code", "See https://")
+"""Prefixes of lines in PETSc's errors that do not name the cause."""
 
 _NOT_A_NUMBER = "the residual is not a finite number"
 _SNES = {
@@ -41,13 +41,13 @@ _PRECONDITIONER = {
 
 
 def failure_reason(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
-    """Why a nonlinear solve failed."""
+    """Message that says why a nonlinear solve failed."""
     reason = snes.getConvergedReason()
-    words = _SNES.get(reason, f"SNES stopped with reason {reason}")
+    message = _SNES.get(reason, f"SNES stopped with reason {reason}")
     linear = ksp.getConvergedReason()
     if linear < 0:
-        words += f": {_KSP.get(linear, f'KSP stopped with reason {linear}')}"
-    return words
+        message += f": {_KSP.get(linear, f'KSP stopped with reason {linear}')}"
+    return message
 
 
 def preconditioner_failed(ksp: PETSc.KSP) -> bool:
@@ -58,5 +58,5 @@ def preconditioner_failed(ksp: PETSc.KSP) -> bool:
 def error_message(error: Exception) -> str:
     """The innermost message of an error from within PETSc, in one line."""
     lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]
-    told = [line for line in lines if line and "() at " not in line and not line.startswith(NO_REASON)]
-    return "; ".join(told[-2:]) if told else " ".join(str(error).split())
+    causes = [line for line in lines if line and "() at " not in line and not line.startswith(UNINFORMATIVE)]
+    return "; ".join(causes[-2:]) if causes else " ".join(str(error).split())

@@ -1,6 +1,6 @@
-"""PETSc's options that no run can follow: refused in words, before anything is made.
+"""PETSc options that this program does not support: refused with a message before a run starts.
 
-Whatever else PETSc itself refuses becomes an error where it does so (``petsc_options.refused``).
+Options that PETSc itself rejects become errors at that point (``petsc_options.refused``).
 """
 
 from __future__ import annotations
@@ -23,35 +23,34 @@ WITHOUT_GRID = (
     *("snes_grid_sequence", "snes_convergence_estimate", "snes_monitor_fields", "snes_fd_function"),
     *("ts_convergence_estimate", "ksp_view_diagonal_scale"),
 )
-LEFT_OUT = {
+UNSUPPORTED = {
     **dict.fromkeys(WITHOUT_GRID, "PETSc crashes by it where it has no grid of its own"),
     **dict.fromkeys(JACOBIANS, "regularisation needs the entries of the exact Jacobian"),
 }
-"""Flags that may not be on, and why: those by which PETSc reads what belongs to grids of its own (DM), and
-those that replace the assembled Jacobian."""
+"""Flags that are refused, and why: flags that need a DM, and flags that replace the assembled Jacobian."""
 
-NEEDS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
-"""Preconditioners that without an option take for ever (sweeps that are not symmetric), or crash (an operator
-without entries)."""
+REQUIRED_OPTIONS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
+"""Preconditioners that need a further option, as they would not converge (sweeps are not symmetric) or crash
+(the operator has no entries) without it."""
 
-MOST_DENSE = 3000
-"""Unknowns up to which work on dense matrices of that size is done."""
+MAX_DENSE = 3000
+"""Largest number of unknowns for options that use dense matrices."""
 
 FLAGS_AT_END = ("options_view", "mpidump", "get_total_flops")
 FILES_AT_END = ("log", "log_view", "malloc_view", "citations")
-"""What PETSc reads only when a run is over."""
+"""Options that PETSc only reads in its finalisation."""
 
 DENSE = ("pc_type svd", "snes_test_jacobian")
-"""What is done with dense matrices."""
+"""Options that use dense matrices."""
 
 
 def check_options() -> None:
-    """Look at the options of all sources together, as they stand in the database.
+    """Check all options in the database, whatever their source.
 
     Raises
     ------
     InputError
-        For numbers that are not finite, and for what has no meaning here.
+        For numbers that are not finite, and for options that are not supported.
     """
     options = PETSc.Options()
     for name, value in options.getAll().items():
@@ -65,20 +64,20 @@ def check_options() -> None:
             _check_class(name, value or "")
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
-            # -pc_type python alone is the program's multigrid
+            # -pc_type python alone chooses the program's multigrid
             if name not in ("pc_type", "mat_type") and not is_set(f"{stem}python_type"):
                 raise InputError(f"python needs -{stem}python_type package.module.Class", key=f"-{name}")
     _check_end()
     if is_set("ts_init_time"):
         raise InputError(
-            "a run row_pointers at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
+            "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
         )
     if is_set("snes_convergence_test"):
         raise InputError(
             "is by solver.force_tolerance and solver.step_tolerance; leave it out",
             key="-snes_convergence_test",
         )
-    for name, why in LEFT_OUT.items():
+    for name, why in UNSUPPORTED.items():
         if _is_on(name):
             raise InputError(f"{why}; leave it out", key=f"-{name}")
     kind = options.getString("snes_type", "")
@@ -89,25 +88,25 @@ def check_options() -> None:
             key="-snes_type",
         )
     kind = options.getString("pc_type", "")
-    if kind in NEEDS and not is_set(NEEDS[kind]):
-        raise InputError(f"'{kind}' needs -{NEEDS[kind]} as well here", key="-pc_type")
+    if kind in REQUIRED_OPTIONS and not is_set(REQUIRED_OPTIONS[kind]):
+        raise InputError(f"'{kind}' needs -{REQUIRED_OPTIONS[kind]} as well here", key="-pc_type")
 
 
 def check_size(unknowns: int) -> None:
-    """Refuse work on dense matrices of so many unknowns.
+    """Refuse options that would use dense matrices of more than `MAX_DENSE` unknowns.
 
     Raises
     ------
     InputError
     """
-    for words in DENSE:
-        name, _, value = words.partition(" ")
-        asked = PETSc.Options().getString(name, "") == value if value else _is_on(name)
-        if asked and unknowns > MOST_DENSE:
+    for option in DENSE:
+        name, _, value = option.partition(" ")
+        is_used = PETSc.Options().getString(name, "") == value if value else _is_on(name)
+        if is_used and unknowns > MAX_DENSE:
             raise InputError(
-                f"works on a dense matrix, here of {unknowns} unknowns: none above {MOST_DENSE}; "
+                f"works on a dense matrix, here of {unknowns} unknowns: none above {MAX_DENSE}; "
                 "take a coarser mesh, or leave it out",
-                key=f"-{words}",
+                key=f"-{option}",
             )
 
 
@@ -117,16 +116,17 @@ def _is_on(name: str) -> bool:
 
 
 def _check_end() -> None:
-    """Refuse what PETSc would stumble over at its end, which must not see it either."""
+    """Refuse wrong values of options that PETSc reads in its finalisation, and delete these options."""
     options = PETSc.Options()
     for name in (*FLAGS_AT_END, *FILES_AT_END):
         value = options.getString(name, "")
-        if why := _wrong_at_end(name, value):
+        if why := _error_at_end(name, value):
             options.delValue(name)
             raise InputError(why, key=f"-{name}")
 
 
-def _wrong_at_end(name: str, value: str) -> str:
+def _error_at_end(name: str, value: str) -> str:
+    """What is wrong with the value of such an option, or an empty text."""
     if name in FLAGS_AT_END:
         known = value.lower() in ("", "1", "0", "true", "false", "yes", "no", "on", "off")
         return "" if known else f"is true or false, not '{value}'"
@@ -140,7 +140,7 @@ def _wrong_at_end(name: str, value: str) -> str:
 
 
 def _finite(text: str) -> bool:
-    """Whether a text is no number, or a finite one."""
+    """Whether a text is a finite number, or no number at all."""
     try:
         return math.isfinite(float(text))
     except ValueError:

@@ -1,6 +1,7 @@
-"""The arrays in which a PETSc matrix keeps its entries, so that new values reach them in one pass.
+"""Direct access to the arrays of a PETSc matrix, so that new values are written in one pass.
 
-petsc4py has no calls for them, the C library has. ``MatSetValues`` looks for every entry's place each time.
+``MatSetValues`` would search for the position of each entry every time. The arrays are obtained by calls of
+the C library, which petsc4py does not offer.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from lyra_petsc.linear.pattern import BlockPattern, index_type, row_pointers
 from lyra_petsc.mesh.points import Points
 
 KINDS = {"aij": "AIJ", "baij": "BAIJ"}
-"""Matrix types whose storage is known here, as the C library spells them."""
+"""Matrix types whose arrays can be written, with their names in the C library."""
 
 PORTIONS = 16
-"""In which transposed blocks go through ``MatSetValues``: it is given a copy of them."""
+"""Number of portions in which transposed blocks are copied for ``MatSetValues``, to limit the memory."""
 
 
 @cached(inline="always")
-def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
-    """Rows of a block as it is stored ``across`` apart, columns ``along``."""
+def _put(block, out, at, row_stride, column_stride):  # type: ignore[no-untyped-def]
+    """Copy a stored block to ``out`` from index ``at`` on, with these strides of its rows and columns."""
     for i in range(3):
         for j in range(3):
-            out[at + across * i + along * j] = block[i, j]
+            out[at + row_stride * i + column_stride * j] = block[i, j]
 
 
 @cached()
 def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
-    """Blocks column by column; those of owned columns apart from those of ghosts."""
+    """Fill the arrays of a BAIJ matrix, column by column of blocks; owned and ghost columns are separate."""
     n, p, q = len(indptr) - 1, 0, 0
     blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
     for row in range(n):
@@ -53,7 +54,7 @@ def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: i
 
 @cached()
 def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
-    """Three scalar rows for each row of blocks; owned columns apart from ghosts."""
+    """Fill the arrays of an AIJ matrix, three scalar rows a block row; ghost columns are separate."""
     n, p, q = len(indptr) - 1, 0, 0
     for row in range(n):
         width, beyond = 3 * (begin[row + 1] - begin[row]), 0
@@ -81,7 +82,7 @@ def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ig
 
 @cached()
 def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
-    """Blocks of the upper triangle by columns; ``place`` (n_owned,) is where those of each begin."""
+    """below = blocks of the upper triangle ordered by columns; ``place`` (n_owned,) is where each begins."""
     n = len(indptr) - 1
     for row in range(n):
         for k in range(indptr[row] + 1, indptr[row + 1]):
@@ -92,7 +93,7 @@ def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
 
 
 class StoredRows:
-    """The rows that a PETSc matrix of a pattern stores: whole ones, or of ``sbaij`` the upper triangle.
+    """The rows that a PETSc matrix of a pattern stores: full rows, or with ``sbaij`` the upper triangle.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ class StoredRows:
     inside, outside : (n_owned,) int
         Blocks of each row in owned columns, and in columns of ghosts.
     begin, below : (n_owned + 1,) int64, (n_below,) int
-        Compressed rows of what stands before the diagonal: blocks of the pattern, to be transposed.
+        Compressed rows of the lower triangle: blocks of the pattern that must be transposed.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
@@ -134,7 +135,7 @@ class StoredRows:
         for lo, hi in itertools.pairwise(edges):
             part = self.below[lo:hi]
             rows = np.searchsorted(self._pattern.indptr, part, side="right") - 1
-            # all rows, most of them empty: petsc4py takes no others
+            # petsc4py requires all rows, most of which are empty here
             _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
         mat.assemble()
 
@@ -145,7 +146,7 @@ def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
 
 
 def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
-    """How many blocks (n_blocks,) of each row are flagged."""
+    """Number of flagged blocks, flags (n_blocks,), in each row."""
     counts: Ints = np.diff(row_pointers(flags)[indptr])
     return counts
 
@@ -156,7 +157,7 @@ class Storage:
     Parameters
     ----------
     mat : PETSc.Mat
-        With the entries of the pattern and no others; assembled. Columns of ghosts ascend as the ghosts do.
+        Assembled with exactly the entries of the pattern. Ghosts must ascend, as PETSc's columns do.
     kind : str
         A key of ``KINDS``.
     pattern : BlockPattern
@@ -195,7 +196,7 @@ class Storage:
         return np.ctypeslib.as_array(pointer, (size,)) if size else np.empty(0)
 
     def _parts(self) -> list[ctypes.c_void_p]:
-        """This rank's matrices of entries in owned columns and in ghosts'."""
+        """This rank's sequential matrices of owned and of ghost columns."""
         whole = ctypes.c_void_p(self._mat.handle)
         if self._split is None:
             return [whole]

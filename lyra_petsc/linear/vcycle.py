@@ -1,14 +1,14 @@
-"""Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
+"""The geometric multigrid cycle, ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
 
-A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
-is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) three are visited twice,
-as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle. Where edges
-carry unknowns the vertices of the mesh are swept ``-pc_mg_vertex_sweeps`` times before and after; unless that
-is given, as often as their bending is worth (``edge_sweeps``).
+A symmetric V cycle: one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level.
+From level ``-pc_mg_w_from`` on (1 is the next coarser than the mesh) three levels are visited twice, as in a
+W cycle. One half of the matrix is stored, in single precision, and read twice a cycle. If edges carry
+unknowns, vertices of the mesh are swept ``-pc_mg_vertex_sweeps`` times before and after, by default depending
+on the bending stiffness (``edge_sweeps``).
 
-Between ranks the sweeps are Jacobi's, which diverge where three or more ranks meet in strongly coupled
-unknowns. There the diagonal is increased as in the l1 smoothers of Baker, Falgout, Kolev and Yang
-(SIAM J. Sci. Comput. 33, 2011), so that the cycle is positive definite on any number of ranks.
+Between ranks the sweeps are Jacobi, which diverges if strongly coupled unknowns belong to three or more
+ranks. There the diagonal is increased as in the l1 smoothers of Baker, Falgout, Kolev and Yang (SIAM J. Sci.
+Comput. 33, 2011), so that the cycle is positive definite on any number of ranks.
 """
 
 from __future__ import annotations
@@ -34,41 +34,41 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 
-TWICE = 3
-"""Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
-
+MAX_TWICE = 3
+"""Largest number of levels visited twice: each doubles the visits of coarser ones, where ranks mostly
+wait."""
 
 HUGE = 1e30
-"""No preconditioner has such entries."""
+"""Factor of a result that marks a failed cycle; no preconditioner has entries of this size."""
 
-SAFE = 0.9
-"""What couplings to other ranks may reach in sum, relative to the diagonal blocks."""
+MAX_COUPLING = 0.9
+"""Largest sum of a row's couplings to other ranks, relative to the diagonal blocks, without an increase."""
 
 
-def _sweeps_of(level: Level) -> sweeps.BlockSweeps | SweepsWithEdges:
+def _make_sweeps(level: Level) -> sweeps.BlockSweeps | SweepsWithEdges:
     pattern = level.pattern
     if pattern.edge_couplings is None:
         return sweeps.BlockSweeps(pattern)
-    from lyra_petsc.linear.edge_sweeps import SweepsWithEdges  # of use for nothing else
+    from lyra_petsc.linear.edge_sweeps import SweepsWithEdges  # only needed here
 
     return SweepsWithEdges(pattern, pattern.edge_couplings, level.memory)
 
 
 class Smoother:
-    """The arrays that a level's sweeps and its interpolation work on.
+    """Smoothing on a level, and transfer to and from the next coarser one.
 
     Parameters
     ----------
     level : Level
     vertex_sweeps : int
-        Over the vertices, where edges carry unknowns; 0: as many as are worth it.
+        Sweeps over the vertices if edges carry unknowns; 0 chooses their number by the stiffness.
 
     Attributes
     ----------
     n_sweeps : int
-        Before and after the coarser level.
+        Sweeps before and after the coarser level.
     coarse_sweeps : tuple of int
-        What that should be on the next coarser level and on those below.
+        Sweeps that suit the next coarser level, and those below.
     b, x : (n_local, 3)
         Right-hand side and solution.
     """
@@ -77,86 +77,86 @@ class Smoother:
         pattern, points = level.pattern, level.points
         self.points, self.n_couplings = points, pattern.n_couplings
         self._rows = pattern.indptr, pattern.ends, pattern.columns
-        self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        self._turns, self._sweeps = level.turns, _sweeps_of(level)
+        self._with_ghosts = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._turns, self._sweeps = level.turns, _make_sweeps(level)
         self.x, self.b = self._sweeps.x, self._sweeps.b
-        self._asked_sweeps, self.n_sweeps, self.coarse_sweeps = vertex_sweeps, 1, (1, 1)
+        self._vertex_sweeps, self.n_sweeps, self.coarse_sweeps = vertex_sweeps, 1, (1, 1)
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
         self._parents = start[: len(self._sweeps.r) + 1], parents, weights.astype(np.float32)
         self._all_parents = start, *self._parents[1:]
-        self._transfer_flops = 6.0 * len(parents)  # of three coordinates of each parent
+        self._transfer_flops = 6.0 * len(parents)
         self._free = np.ones((points.n_local, 3), dtype=np.float32)
-        self._lagged = np.empty(0, dtype=np.int64)
+        self._increased = np.empty(0, dtype=np.int64)  # rows with an increased diagonal
         self._increase = np.empty((0, 3, 3), dtype=np.float32)
-        self._seen = np.empty((0, 3), dtype=np.float32)
+        self._in_residual = np.empty((0, 3), dtype=np.float32)  # x for which the residual has the increase
 
     def set(self, values: Array, free: Array) -> None:
-        """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
+        """Set the block rows (n_blocks, 3, 3) and the free coordinates (n_owned, 3); collective."""
         values = values.reshape(-1, 9)
         self._sweeps.invert(values)
         if (inertia := self._sweeps.inertia(values)) is not None:
             self._choose_sweeps(inertia)
         self._increase_diagonal(values)
-        self._sweeps.store(values)  # after which the values of the mesh are perhaps no more
+        self._sweeps.store(values)  # may overwrite ``values`` on the finest level
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
 
     def _choose_sweeps(self, own: Array) -> None:
-        """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
+        """Choose more sweeps if bending is stiff compared with inertia, ``own`` (2,) here; collective."""
+        from lyra_petsc.linear.edge_sweeps import SWEEPS  # only needed here
 
-        inertia, resistance = self.points.comm.allreduce(own)
-        found = (numbers for until, numbers in SWEEPS if inertia < until * resistance)
-        worth, *coarse = next(found, (1, 1, 1))
-        self.n_sweeps, self.coarse_sweeps = self._asked_sweeps or worth, (coarse[0], coarse[1])
+        inertia, stiffness = self.points.comm.allreduce(own)
+        found = (numbers for bound, numbers in SWEEPS if inertia < bound * stiffness)
+        n_sweeps, *coarse = next(found, (1, 1, 1))
+        self.n_sweeps, self.coarse_sweeps = self._vertex_sweeps or n_sweeps, (coarse[0], coarse[1])
 
     def _increase_diagonal(self, values: Array) -> None:
-        """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
+        """Increase D so that D + Dᵀ − (couplings to other ranks) is positive definite; collective.
 
-        With D = L Lᵀ a coupling C of rows i and j is at most n (xᵢᵀ Dᵢ xᵢ + xⱼᵀ Dⱼ xⱼ) / 2, n the norm of
-        Lᵢ⁻¹ C Lⱼ⁻ᵀ. Where a row's n exceed 1 in sum, its diagonal block grows by half of what is too much.
+        With D = L Lᵀ a coupling C of rows i and j is bounded by n (xᵢᵀ Dᵢ xᵢ + xⱼᵀ Dⱼ xⱼ) / 2 with n =
+        ‖Lᵢ⁻¹ C Lⱼ⁻ᵀ‖. If the sum of a row's n exceeds the limit, its diagonal block grows by half the excess.
         """
         if self.points.comm.size == 1:
             return
-        packed = np.empty((self.points.n_local, 3))  # six numbers in single precision: one message
+        packed = np.empty((self.points.n_local, 3))  # six float32 numbers a row, sent in one message
         roots = packed.view(np.float32)
-        diagonal = self._sweeps.diagonal(values, self._edge)
-        sweeps.invert_roots(self._edge, diagonal, roots)
+        diagonal = self._sweeps.diagonal(values, self._with_ghosts)
+        sweeps.invert_roots(self._with_ghosts, diagonal, roots)
         self.points.update_ghosts(packed)
-        sums = np.empty(len(self._edge))
-        sweeps.relative_couplings(self._edge, *self._rows, values, roots, sums)
-        found = np.flatnonzero(sums > SAFE)
-        self._lagged = rows = self._edge[found]
+        sums = np.empty(len(self._with_ghosts))
+        sweeps.relative_couplings(self._with_ghosts, *self._rows, values, roots, sums)
+        found = np.flatnonzero(sums > MAX_COUPLING)
+        self._increased = rows = self._with_ghosts[found]
         if len(found):
-            growth = (sums[found, None] - SAFE) / 2.0
+            growth = (sums[found, None] - MAX_COUPLING) / 2.0
             self._sweeps.shrink(rows, 1.0 + growth)
             self._increase = (growth * diagonal[found]).astype(np.float32).reshape(-1, 3, 3)
-        self._seen = np.zeros((len(found), 3), dtype=np.float32)
+        self._in_residual = np.zeros((len(found), 3), dtype=np.float32)
 
-    def before(self, coarse: Floats, *, again: bool) -> None:
-        """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
+    def sweep_down(self, coarse: Floats, *, again: bool) -> None:
+        """Sweep before the coarser level; ``coarse`` (n_local coarse, 3) = restricted residual; collective.
 
-        From zero, or again from where ``after`` ended.
+        Starts from zero, or again from the result of `sweep_up`.
         """
         if again:
             self._subtract_ghosts(np.zeros_like(self.x[self.points.n_owned :]))
         else:
             self.x[:] = 0.0
             self._sweeps.begin(self.b)
-            self._seen[:] = 0.0
-        seen = self.x[self.points.n_owned :].copy()
+            self._in_residual[:] = 0.0
+        ghosts = self.x[self.points.n_owned :].copy()
         with SWEEP:
             self._sweeps.backward(self.x)
             PETSc.Log.logFlops(self._sweeps.flops)
-        self._subtract_ghosts(seen)
+        self._subtract_ghosts(ghosts)
         for number in range(1, self.n_sweeps):
-            seen = self.x[self.points.n_owned :].copy()
+            ghosts = self.x[self.points.n_owned :].copy()
             with SWEEP:
                 self._sweeps.backward_again(self.x, number)
                 PETSc.Log.logFlops(self._sweeps.flops)
-            self._subtract_ghosts(seen)
+            self._subtract_ghosts(ghosts)
         with TRANSFER:
             if self._turns is not None:
                 assert not isinstance(self._sweeps, sweeps.BlockSweeps)
@@ -165,26 +165,23 @@ class Smoother:
             PETSc.Log.logFlops(self._transfer_flops)
             self._coarse.add_to_owners(coarse)
 
-    def _subtract_ghosts(self, seen: Floats) -> None:
-        """Let the residual follow the ghosts, of which it has seen these values; collective."""
+    def _subtract_ghosts(self, old: Floats) -> None:
+        """Update the ghosts, and the residual from their old values; collective."""
         if self.points.comm.size > 1:
             self.points.update_ghosts(self.x)
             ghosts = self.x[self.points.n_owned :]
-            ghosts -= seen
+            ghosts -= old
             self._sweeps.subtract_ghosts(self.x)
-            ghosts += seen
-        if len(self._lagged):
-            self._add_increase(self.x[self._lagged] - self._seen)
+            ghosts += old
+        if len(self._increased):
+            change = self.x[self._increased] - self._in_residual
+            self._sweeps.add(self._increased, np.einsum("nij,nj->ni", self._increase, change))
+            self._in_residual = self._in_residual + change
 
-    def _add_increase(self, moved: Floats) -> None:
-        """Let the residual follow what the increased diagonal makes of own values that have moved so far."""
-        self._sweeps.add(self._lagged, np.einsum("nij,nj->ni", self._increase, moved))
-        self._seen = self._seen + moved
+    def sweep_up(self, coarse: Floats) -> None:
+        """Add the coarser level's correction and sweep; collective.
 
-    def after(self, coarse: Floats) -> None:
-        """Add what the coarser level found, and sweep; collective.
-
-        Ghosts are interpolated here as by their owners, without a message: ``before`` left them up to date.
+        Ghosts are interpolated here as by their owners, without a message: `sweep_down` left them current.
         """
         with TRANSFER:
             self._coarse.update_ghosts(coarse)
@@ -196,32 +193,32 @@ class Smoother:
         self._sweep_after(0)
 
     def _sweep_after(self, number: int) -> None:
-        lagged = self._lagged
-        if len(lagged):
-            right, self._seen = self.b[lagged], self.x[lagged]
-            self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
+        rows = self._increased
+        if len(rows):
+            b, self._in_residual = self.b[rows], self.x[rows]
+            self.b[rows] += np.einsum("nij,nj->ni", self._increase, self._in_residual)
         with SWEEP:
             self._sweeps.forward(self.b, self.x, number)
             PETSc.Log.logFlops(self._sweeps.flops)
-        if len(lagged):
-            self.b[lagged] = right
+        if len(rows):
+            self.b[rows] = b
 
     def _add_interpolated(self, coarse: Floats) -> None:
         if self._turns is None:
             sweeps.add_interpolated(*self._all_parents, self._free, coarse, self.x)
         else:
             assert not isinstance(self._sweeps, sweeps.BlockSweeps)
-            more = self._sweeps.moved
-            more[:] = 0.0
-            sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
-            self._turns.follow(more)
-            self.x += more
+            correction = self._sweeps.increment
+            correction[:] = 0.0
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, correction)
+            self._turns.follow(correction)
+            self.x += correction
         if self._sweeps.correct(self.x):
-            self.points.update_ghosts(self.x)  # of edges' unknowns only owners know these
+            self.points.update_ghosts(self.x)  # only owners know the corrections of edges
 
 
 class Coarsest:
-    """The last level, solved by a KSP of its own (``-mg_coarse_``)."""
+    """The coarsest level, solved by a KSP with the options prefix ``mg_coarse_``."""
 
     def __init__(self, level: Level) -> None:
         self.points, self.n_couplings = level.points, level.pattern.n_couplings
@@ -234,13 +231,13 @@ class Coarsest:
         self._ksp.setFromOptions()
 
     def set(self, values: Array, free: Array) -> None:
-        """Take new block rows (n_blocks, 3, 3); collective."""
+        """Set new block rows (n_blocks, 3, 3); collective."""
         failed_factors.replace_failed(self._ksp)
         self.matrix.set(values)
         self._ksp.setOperators(self.matrix.mat)
 
     def solve(self) -> None:
-        """x of b; collective."""
+        """Solve for x; collective."""
         n = self.points.n_owned
         self._rhs.getArray()[:] = self.b[:n].ravel()
         self._ksp.solve(self._rhs, self._solution)
@@ -257,7 +254,7 @@ class Coarsest:
 
 
 class VCycle:
-    """What PETSc's PC of type python makes and calls; its levels are given to it by ``attach``."""
+    """Context of a PC of type ``python``, created by PETSc; ``attach`` gives it the levels."""
 
     def __init__(self) -> None:
         self._levels: list[Smoother | Coarsest] = []
@@ -271,18 +268,18 @@ class VCycle:
         self._vertex_sweeps = max(0, options.getInt("pc_mg_vertex_sweeps", 0))
 
     def attach(self, hierarchy: Hierarchy, renew: Callable[[], Iterator[tuple[Array, Array]]]) -> None:
-        """Work on these levels, whose present block rows ``renew`` makes; collective."""
+        """Set the levels, and the function that computes their current block rows; collective."""
         *finer, coarsest = hierarchy.levels
         self._levels = [*(Smoother(level, self._vertex_sweeps) for level in finer), Coarsest(coarsest)]
         self._renew = renew
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Take the levels' new block rows, when the matrix has changed; collective.
+        """Compute the levels' block rows, after the matrix has changed; collective.
 
         Raises
         ------
         InputError
-            As a part of another preconditioner, which has no levels to give.
+            If this is part of another preconditioner, and has no levels.
         """
         if self._renew is None:
             prefix = pc.getOptionsPrefix() or ""
@@ -294,7 +291,7 @@ class VCycle:
                 level.n_sweeps = finest.coarse_sweeps[min(number, 2) - 1]
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """x = one cycle on b; collective."""
+        """x = result of one cycle for b; collective."""
         finest, n = self._levels[0], b.getLocalSize() // 3
         finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
         self._visit(0)
@@ -302,21 +299,21 @@ class VCycle:
         if math.isfinite(float(np.vdot(found, found))):
             x.getArray()[:] = found.ravel()
         else:
-            # sweeps over an indefinite matrix can grow without bound; of this PETSc says just that
+            # sweeps of an indefinite matrix may diverge; with this result PETSc reports an indefinite PC
             x.getArray()[:] = -HUGE * b.getArray(readonly=True)
 
     def _visit(self, number: int, *, again: bool = False) -> None:
-        """Let x of a level be what it finds for its b, from zero or going on; collective."""
+        """Compute x of a level for its b, from zero or, if ``again``, from the present x; collective."""
         level, coarser = self._levels[number], number + 1
         if isinstance(level, Coarsest):
             level.solve()
             return
         below = self._levels[coarser]
-        level.before(below.b, again=again)
+        level.sweep_down(below.b, again=again)
         self._visit(coarser)
-        if 0 < self._twice_from <= coarser < min(self._twice_from + TWICE, len(self._levels) - 1):
+        if 0 < self._twice_from <= coarser < min(self._twice_from + MAX_TWICE, len(self._levels) - 1):
             self._visit(coarser, again=True)
-        level.after(below.x)
+        level.sweep_up(below.x)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
@@ -325,7 +322,7 @@ class VCycle:
             return
         comm = self._levels[0].points.comm
         couplings = [comm.allreduce(level.n_couplings) for level in self._levels]
-        twice = range(self._twice_from, min(self._twice_from + TWICE, len(self._levels) - 1))
+        twice = range(self._twice_from, min(self._twice_from + MAX_TWICE, len(self._levels) - 1))
         visited = [number for number in twice if self._twice_from > 0]
         kind = f"W (visits below {', '.join(map(str, visited))} twice)" if visited else "V"
         between = "" if comm.size == 1 else ", between ranks Jacobi with an increased diagonal"

@@ -148,7 +148,7 @@ class Arcs:
         couplings = np.einsum("eak,ebk->eab", self._slopes, self._slopes)
         blocks = couplings[:, :, :, None, None] * np.eye(3)
         add_elements(self._area, blocks, self._pattern.offsets[self._term.name], values)
-        rows.constrain(values, mask, rows.beside(mask))
+        rows.constrain(values, mask, rows.constrained_entries(mask))
         self._matrix = AssembledMatrix(layout, self._pattern, "aij", prefix=PREFIX)
         self._matrix.set(values)
         self._ksp = ksp = PETSc.KSP().create(layout.comm)

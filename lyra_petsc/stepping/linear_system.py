@@ -175,7 +175,7 @@ class LinearSystem:
         self._regularised = iterates and hessian != "regularised" and not direct and not self._one_matrix
         self._shifts = not direct
         self.factors = PETSc.Options().getString("pc_type", "") in ("cholesky", "lu")
-        self.cycles = multigrid.is_asked_for()
+        self.cycles = multigrid.is_requested()
         # multigrid set up for earlier positions takes many more iterations
         asked = is_set("snes_lag_preconditioner")
         new = iterates or self.factors or direct or self._one_matrix or self.cycles or asked
@@ -222,7 +222,7 @@ class LinearSystem:
         discretisation = self._equations.discretisation
         found = self._interpolations
         if found is None:
-            found = interpolations(discretisation.layout, self._surface, multigrid.most_levels())
+            found = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
         if discretisation.stencils_change:
             self._interpolations = found
         below = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.linear.block_rows import Beside, BlockRows
+from lyra_petsc.linear.block_rows import BlockRows, ConstrainedEntries
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.terms.prescribed_handles import Held
@@ -35,7 +35,7 @@ class Prescribed:
         self._discretisation, self.held, self._reference = discretisation, held, reference
         self._active: tuple[int, ...] | None = None
         self._span = (0.0, 0.0)
-        self._beside: tuple[BlockRows, Beside] | None = None
+        self._constrained: tuple[BlockRows, ConstrainedEntries] | None = None
         own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
         own.ravel()[discretisation.layout.padding] = True
         self._set(own)
@@ -51,19 +51,19 @@ class Prescribed:
         self.mask: Mask = flags > 0.5
         self.free: Mask = ~own
         self.indices: Ints = np.flatnonzero(own)
-        self._beside = None
+        self._constrained = None
 
     def resize(self) -> None:
         """Follow the layout to other ghosts; collective."""
         self._set(~self.free)
 
     @property
-    def beside(self) -> Beside:
-        """What the present matrix has of prescribed unknowns and of couplings to them."""
+    def constrained(self) -> ConstrainedEntries:
+        """Entries of the present matrix in rows and columns of prescribed unknowns."""
         rows = self._discretisation.rows
-        if self._beside is None or self._beside[0] is not rows:
-            self._beside = rows, rows.beside(self.mask)
-        return self._beside[1]
+        if self._constrained is None or self._constrained[0] is not rows:
+            self._constrained = rows, rows.constrained_entries(self.mask)
+        return self._constrained[1]
 
     def begin_step(self, t0: float, t1: float, x: Array) -> bool:
         """Take the handles of the step t0..t1 [s] from x (n_owned, 3); whether they changed; collective."""

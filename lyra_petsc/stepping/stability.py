@@ -90,8 +90,8 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
     following = [*active.following, *active.viscous]
     loads = FollowingLoads(following, system.x, force_of, system.applied.factor)
     loads.add_hessian(1.0, rows.pattern, values)
-    if len(prescribed.beside.changing):
-        rows.constrain(values, prescribed.mask, prescribed.beside)
+    if len(prescribed.constrained.changed):
+        rows.constrain(values, prescribed.mask, prescribed.constrained)
 
 
 class Examination:

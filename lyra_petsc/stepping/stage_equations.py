@@ -630,12 +630,12 @@ class StageEquations:
         self, springs: Mapping[Elastic, Springs], stiffness: Mapping[Elastic, Array], values: Array
     ) -> None:
         """Add springs with these stiffnesses [N/m] to the Jacobian's block rows (n_blocks, 3, 3)."""
-        rows, beside = self.discretisation.rows, self.prescribed.beside
+        rows, constrained = self.discretisation.rows, self.prescribed.constrained
         for term, each in springs.items():
             reach = self.stage.c
             each.add_stiffness(reach * stiffness[term], rows.pattern.offsets[term.name], values)
-        if len(beside.changing):
-            rows.constrain(values, self.prescribed.mask, beside)
+        if len(constrained.changed):
+            rows.constrain(values, self.prescribed.mask, constrained)
 
     def release_contact_springs(self, length: Mapping[Elastic, Array]) -> None:
         """End the use of `contact_springs`; ``length`` [m] is theirs after the increment taken.
@@ -953,8 +953,8 @@ class StageEquations:
         inertia = self.stage.sigma * self.mass
         if self.active.with_edges:
             inertia[self.points.n_vertices :] += reach * self._min_stiffness
-        beside = self.prescribed.beside
-        changing = beside.changing
+        constrained = self.prescribed.constrained
+        changing = constrained.changed
         if blend < 1.0 or not self.damping.assemble_with_stiffness(x, reach, inertia, values, changing):
             self.damping.assemble(values, inertia)
             for term in self.active.elastic:
@@ -965,4 +965,4 @@ class StageEquations:
         if self.applied.following is not None and blend < 1.0:
             self.applied.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
         if len(changing):
-            rows.constrain(values, self.prescribed.mask, beside)
+            rows.constrain(values, self.prescribed.mask, constrained)

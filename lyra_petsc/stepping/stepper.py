@@ -15,7 +15,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
-from lyra_petsc.linear.petsc_options import FOREIGN, Value, culprits, fill_gaps, is_set, refused
+from lyra_petsc.linear.petsc_options import PYTHON_SUFFIXES, Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.parallel import all_here
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
@@ -512,4 +512,6 @@ def _forget_python(ksp: PETSc.KSP) -> None:
 def _runs_foreign_python() -> bool:
     """Whether PETSc calls Python that is not this program's."""
     options = PETSc.Options().getAll()
-    return any(value != presets.PYTHON_TYPE for name, value in options.items() if name.endswith(FOREIGN))
+    return any(
+        value != presets.PYTHON_TYPE for name, value in options.items() if name.endswith(PYTHON_SUFFIXES)
+    )

@@ -52,7 +52,7 @@ class VertexEquations:
         """Keep what depends on the prescribed unknowns (n_local, 3): mostly they stay the same."""
         term = self._bent
         assert term.edges is not None
-        self._held, self._beside = held.copy(), self._rows.beside(held)
+        self._held, self._constrained = held.copy(), self._rows.constrained_entries(held)
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
         self.turns.hold(held)
 
@@ -76,7 +76,7 @@ class VertexEquations:
             wind.add_hessian(vs, equations.active.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, values)
-            rows.constrain(values, held, self._beside)
+            rows.constrain(values, held, self._constrained)
         return values
 
     def _add_clamps(self, x: Array, values: Array) -> None:

@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.api import waiting
-from lyra_petsc.api.waiting import Share, Waiting, in_words
+from lyra_petsc.api.waiting import Share, Waiting, note_on
 
 pytestmark = pytest.mark.parallel
 
@@ -35,19 +35,19 @@ def shares(*got: float, processors: int = 2, machine: str = "a") -> list[Share]:
     ],
 )
 def test_words(everyone: list[Share], words: str) -> None:
-    note = in_words(everyone)
+    note = note_on(everyone)
     assert words in note
     assert bool(note) == bool(words)
 
 
 def test_a_note_comes_once_and_not_for_one_rank(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waiting, "LEAST_SECONDS", 0.05)
+    monkeypatch.setattr(waiting, "MIN_SECONDS", 0.05)
     comm = MPI.COMM_WORLD
     counted, notes = Waiting(comm), []
     for step in range(20):
         with counted.step():
             time.sleep(0.01)  # as a rank that has no processor
-        notes.append(counted.look(last=step == 19))
+        notes.append(counted.check(last=step == 19))
     told = [step for step, note in enumerate(notes) if note]
     assert told == ([] if comm.size == 1 else [7])
     assert comm.allgather(counted.note) == [counted.note] * comm.size
@@ -57,4 +57,4 @@ def test_short_runs_are_not_judged() -> None:
     counted = Waiting(MPI.COMM_WORLD)
     with counted.step():
         time.sleep(0.01)
-    assert not counted.look(last=True)
+    assert not counted.check(last=True)

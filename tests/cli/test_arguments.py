@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from lyra_petsc.cli.arguments import help_asked, split
+from lyra_petsc.cli.arguments import move_help, split
 from lyra_petsc.cli.verbs import verbs
 
 
@@ -33,7 +33,7 @@ def test_splits(line: str, ours: str, petsc: str) -> None:
 
 @pytest.mark.parametrize("verb", [None, *verbs.commands])
 def test_help_of_every_verb_shows_an_example_that_can_be_parsed(verb: str | None) -> None:
-    ours, petsc = help_asked(*split([verb, "-help"] if verb else ["-help"]))
+    ours, petsc = move_help(*split([verb, "-help"] if verb else ["-help"]))
     assert (ours, petsc) == ([verb, "--help"] if verb else ["--help"], [])
     command = verbs.commands[verb] if verb else verbs
     text = command.get_help(click.Context(command, info_name="lyra-petsc", max_content_width=300))
@@ -47,5 +47,5 @@ def test_help_of_every_verb_shows_an_example_that_can_be_parsed(verb: str | None
 
 
 def test_help_beside_a_scene_to_run_is_petscs() -> None:
-    assert help_asked(*split(["run", "a.yaml", "-help"])) == (["run", "a.yaml"], ["-help"])
-    assert help_asked(*split(["render", "runs/a", "-help"])) == (["render", "--help"], [])
+    assert move_help(*split(["run", "a.yaml", "-help"])) == (["run", "a.yaml"], ["-help"])
+    assert move_help(*split(["render", "runs/a", "-help"])) == (["render", "--help"], [])

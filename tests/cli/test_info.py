@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.cli import info as module
-from lyra_petsc.cli.info import Installation, info, launched_ranks, misfits
+from lyra_petsc.cli.info import Installation, incompatibilities, info, launched_ranks
 
 
 def test_names_the_versions_in_use(comm):
@@ -59,7 +59,7 @@ def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
 
 def test_all_fits_when_nothing_is_wrong():
     facts = Installation(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
-    assert misfits(facts) == []
+    assert incompatibilities(facts) == []
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_all_fits_when_nothing_is_wrong():
     ],
 )
 def test_each_misfit_is_one_line(facts, words):
-    (line,) = misfits(facts)
+    (line,) = incompatibilities(facts)
     assert words in line
     assert "\n" not in line
 

@@ -45,13 +45,13 @@ def simulate(scene: Path, words: list[str]) -> int:
     from mpi4py import MPI
     from petsc4py import PETSc
 
-    from lyra_petsc.cli.arguments import petsc_cannot_start, split
+    from lyra_petsc.cli.arguments import split, start_error
     from lyra_petsc.errors import LyraError
     from lyra_petsc.scene.load import load_scene
     from lyra_petsc.stepping.simulation import SteppedScene
 
     ours, petsc = split(words)
-    why = petsc_cannot_start(petsc)
+    why = start_error(petsc)
     if why:
         print(f"lyra-petsc: {why}", file=sys.stderr)
         return 2

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lyra_petsc.linear.coarsening import Coarse, coarsen
+from lyra_petsc.linear.coarsening import CoarseMesh, coarsen
 from lyra_petsc.mesh.build import build_mesh, grid_sheet
 from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.scene.schema import Grid, MeshSource
@@ -26,7 +26,7 @@ def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return x, np.vstack([np.column_stack([a, a + 1, a + n + 1]), np.column_stack([a, a + n + 1, a + n])])
 
 
-def interpolation(coarse: Coarse) -> np.ndarray:
+def interpolation(coarse: CoarseMesh) -> np.ndarray:
     """(N, C) dense."""
     n = len(coarse.start) - 1
     matrix = np.zeros((n, len(coarse.vertices)))

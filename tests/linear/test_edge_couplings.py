@@ -8,7 +8,7 @@ from oracle import expanded
 from lyra_petsc.kernels.scatter import add_mixed_elements
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
-from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, room
+from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, memory_sizes
 from lyra_petsc.linear.gauss_seidel import store
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import WithEdges
@@ -75,7 +75,7 @@ def test_sums_and_multiples_are_the_dense_ones() -> None:
     check(sums, more)
     rows.add_blocks(values, np.arange(pattern.n_blocks), sums)
     check(sums, dense + more)
-    # beside couplings of vertices that were not there
+    # among couplings of vertices that were absent
     pair = np.array([[0, 19], [3, N_LOCAL]], dtype=np.int32)
     extended, place = pattern.extended(pattern.missing([pair], N_LOCAL + 1), N_LOCAL + 1)
     BlockRows(extended).add_blocks(values, place, sums := BlockRows(extended).zeros())
@@ -87,8 +87,8 @@ def test_prescribed_unknowns_are_decoupled() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     rows, mask = BlockRows(pattern), np.zeros((N_LOCAL, 3), dtype=bool)
     mask[[2, 5, N_VERTICES + 3, N_OWNED + 1, N_LOCAL - 1], [0, 1, 2, 0, 1]] = mask[[7, N_OWNED - 1]] = True
-    held, before, beside = mask.ravel(), values.copy(), rows.beside(mask)
-    rows.constrain(values, mask, beside)
+    held, before, constrained = mask.ravel(), values.copy(), rows.constrained_entries(mask)
+    rows.constrain(values, mask, constrained)
     found = expanded(pattern, values, N_LOCAL).reshape(dense.shape)
     free = ~held[: 3 * N_OWNED, None] & ~held[None, :]
     np.testing.assert_array_equal(found[free], dense[free])
@@ -97,7 +97,7 @@ def test_prescribed_unknowns_are_decoupled() -> None:
     assert np.count_nonzero(found[~free]) == len(own)
     # nothing else has changed
     flat, old = values.ravel(), before.ravel()
-    assert set(np.flatnonzero(flat != old)) <= set(beside.changing)
+    assert set(np.flatnonzero(flat != old)) <= set(constrained.changed)
 
 
 def test_larger_diagonals() -> None:
@@ -126,7 +126,7 @@ def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def sweeps_of(pattern: BlockPattern, values: np.ndarray) -> SweepsWithEdges:
     """Of block rows that are, as in a run, where the copy will be, in memory that something else had."""
-    memory = np.full(max(sum(room(pattern)), values.size), np.nan)
+    memory = np.full(max(sum(memory_sizes(pattern)), values.size), np.nan)
     rows = memory[: values.size].reshape(-1, 9)
     rows[:] = values.reshape(-1, 9)
     sweeps = SweepsWithEdges(pattern, couplings_of(pattern), memory)

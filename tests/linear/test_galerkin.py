@@ -56,7 +56,7 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
         rng = np.random.default_rng(comm.rank)
         values = symmetric(points, pattern)
         assembled = problem.discretisation.rows
-        assembled.constrain(values, mask, assembled.beside(mask))
+        assembled.constrain(values, mask, assembled.constrained_entries(mask))
         between = interpolations(points, problem.surface, 3)
         hierarchy = Hierarchy(points, pattern, between)
         assert len(hierarchy.levels) == 3

@@ -83,14 +83,14 @@ def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
     values, mask = rng.standard_normal((rows.pattern.n_blocks, 3, 3)), np.zeros((N_LOCAL, 3), dtype=bool)
     mask[[2, 5, N_OWNED + 1], [0, 1, 2]] = mask[7] = True
     before, free = values.copy(), ~mask
-    rows.constrain(values, mask, beside := rows.beside(mask))
+    rows.constrain(values, mask, constrained := rows.constrained_entries(mask))
     x = rng.standard_normal((N_LOCAL, 3))
     found = rows.product(values, x)
     # the free part as it was without the others, each of which is its own
     alone = rows.product(before, np.where(free, x, 0.0))
     np.testing.assert_allclose(np.where(free[:N_OWNED], found - alone, 0.0), 0.0, atol=1e-14)
     assert (found * x[:N_OWNED])[mask[:N_OWNED]].min() > 0.0
-    rows.constrain(everywhere := before, mask, beside._replace(rows=np.arange(N_OWNED)))
+    rows.constrain(everywhere := before, mask, constrained._replace(rows=np.arange(N_OWNED)))
     np.testing.assert_array_equal(values, everywhere)
 
 

@@ -84,7 +84,7 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert not system.active.loads
         assert not system.damping.active
         assert system.damping._values is None
-        assert len(system.prescribed.goal) == len(system.prescribed.beside.changing) == 0
+        assert len(system.prescribed.goal) == len(system.prescribed.constrained.changed) == 0
         assert simulation.problem.probes == {}
 
 
