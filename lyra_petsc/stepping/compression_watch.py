@@ -1,4 +1,4 @@
-"""Where the membrane model itself softens: seen in every step, said once in a run."""
+"""Warning of compression at which the membrane model itself softens."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.terms.stretch import SOFTENS_BELOW, principal_stretches
 
 
-class Compression:
-    """Watches the principal stretches of a model; collective.
+class CompressionWatch:
+    """Monitors the principal stretches of a problem; collective.
 
     Parameters
     ----------
@@ -19,15 +19,18 @@ class Compression:
     Attributes
     ----------
     smallest, largest : float
-        Principal stretches of the state looked at last; 1 before the first.
+        Extreme principal stretches of the last state checked; 1 before the first.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self.smallest = self.largest = 1.0
 
-    def look(self, when: str, *, told: bool) -> str | None:
-        """Measure the present state, ``when`` in words; what there is to tell, unless it is told already."""
+    def check(self, when: str, *, reported: bool) -> str | None:
+        """Measure the present state; the warning, if there is one and it has not been ``reported`` before.
+
+        ``when`` is the text that names the state.
+        """
         membrane, comm = self._problem.membrane, self._problem.points.comm
         n = membrane.n_owned
         stretches = principal_stretches(
@@ -39,7 +42,7 @@ class Compression:
         ends = np.array([local[0], -local[1]])
         comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
         self.smallest, self.largest = float(ends[0]), float(-ends[1])
-        if told or not membrane.softens or not self.smallest < SOFTENS_BELOW:
+        if reported or not membrane.softens or not self.smallest < SOFTENS_BELOW:
             return None
         mine = n > 0 and local[0] == self.smallest
         index = int(membrane.elements.index[np.argmin(stretches[:, 0])]) if mine else np.iinfo(np.int64).max

@@ -1,4 +1,4 @@
-"""How much stiffer than inertia a sheet is in a step, and what conjugate gradients make of it."""
+"""Ratio of stiffness to inertia in a step, and the linear iterations to expect from it."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
-from lyra_petsc.stepping.roundoff import roundoff_of_contact
+from lyra_petsc.stepping.roundoff import contact_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
@@ -132,7 +132,7 @@ class Convergence:
             )
         slow = iteration > 0 and residual > STALLED * before
         if slow and self._equations.discretisation.has_near_elements:
-            self._floor = max(self._least_floor, roundoff_of_contact(self._equations))
+            self._floor = max(self._least_floor, contact_roundoff(self._equations))
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0

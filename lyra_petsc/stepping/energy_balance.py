@@ -166,7 +166,7 @@ class Ledger:
         turned += system.obstacle_work() + system.move_targets_to_end()
         local = np.array([_work(external, x_before, system.x) + turned, damped])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
-        local[1] += system.damped.heat if system.damped else 0.0
+        local[1] += system.contact_impulses.heat if system.contact_impulses else 0.0
         del external  # energies need the room
         work, heat = system.points.global_sum(*local)
         self.budget.external_work += float(work)
@@ -188,8 +188,8 @@ class Ledger:
         system = self._system
         self._at = at = system.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
-        if system.damped:
-            self._reactions += system.damped.held
+        if system.contact_impulses:
+            self._reactions += system.contact_impulses.handle_force
         weight = np.zeros((system.points.n_local, 3))
         for load in system.active.loads:
             if load.registration.energy:  # it has a potential, and does no work from outside
@@ -261,9 +261,9 @@ class Ledger:
             found = term.obstacle_forces(system.x, system.active.frozen[term], count)
             if found is not None:
                 total += found
-        if damped := system.damped:
-            torque = np.cross(damped.at, damped.force)
-            np.add.at(total, damped.obstacle, np.column_stack([damped.force, torque]))
+        if impulses := system.contact_impulses:
+            torque = np.cross(impulses.position, impulses.force)
+            np.add.at(total, impulses.obstacle, np.column_stack([impulses.force, torque]))
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

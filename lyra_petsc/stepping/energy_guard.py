@@ -220,7 +220,7 @@ class EnergyGuard:
         """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
         the energy of springs at both ends."""
         system, rise, springs = self._system, 0.0, [0.0, 0.0]
-        work = system.damped.work if system.damped else 0.0
+        work = system.contact_impulses.work if system.contact_impulses else 0.0
         for term in system.active.pushing:
             for x, time in ((x0, system.t0), (x1, system.t1)):
                 work += 0.5 * term.work(x, time, system.t0, system.t1)
@@ -278,8 +278,8 @@ class EnergyGuard:
         for load in self._weights:
             load.add_force(x1, system.t0, system.t1, weight)
         force += 0.5 * targets[:n].take(at) - weight[:n].take(at) + works.damping
-        if system.damped:
-            force += system.damped.held
+        if system.contact_impulses:
+            force += system.contact_impulses.handle_force
         return float(np.vdot(force, way))
 
     @property

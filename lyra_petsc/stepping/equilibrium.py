@@ -186,8 +186,8 @@ class Equilibrium:
             return None
         system = self._system
         system.applied.factor = factor
-        guess = self._extrapolation.to(factor, before, system.x[: system.points.n_owned])
-        found = self._pressures.seek(before, factor, guess)
+        guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
+        found = self._pressures.find(before, factor, guess)
         if found is not None:
             self._in_vain, self._found, self._rate = 0, factor, None
         return found
@@ -201,10 +201,10 @@ class Equilibrium:
         anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.limits_motion
         contacts = system.active.contact_state()
-        self._integrator.predicted = self._extrapolation.to(factor, before, x) - x
+        self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
-        self._friction.begin()
+        self._friction.begin_step()
         attempt = Attempt(False, 0, 0, 0.0)
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
@@ -213,8 +213,8 @@ class Equilibrium:
                 anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
             balanced = arrived and self._balanced(force, last)
-            if balanced and self._friction.settled():
-                self._friction.found(factor - before)
+            if balanced and self._friction.is_settled():
+                self._friction.record_success(factor - before)
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo_dt, factor
                 linear += self._learn_rate(x, before, factor)
@@ -222,7 +222,13 @@ class Equilibrium:
             lessened = anew + _last_lessened([each.residual for each in history[anew:]])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
             farther = force > WORSE * history[lessened].residual
-            if not words and arrived and farther and solves - lessened >= SLIDING and self._friction.slides():
+            if (
+                not words
+                and arrived
+                and farther
+                and solves - lessened >= SLIDING
+                and self._friction.sliding_message()
+            ):
                 words = "no equilibrium: proximal steps lead farther off"
             if words:
                 break
@@ -241,7 +247,7 @@ class Equilibrium:
             leap = leaps and self._integrator.pseudo_dt > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
-                relaxation.solved_with(system.applied.force_at(system.x))
+                relaxation.record(system.applied.force_at(system.x))
             system.applied.override = system.applied.following = self._integrator.predicted = None
             self._integrator.alternatives = []
             solves += 1
@@ -265,7 +271,7 @@ class Equilibrium:
                 ceiling = self._integrator.pseudo_dt if touches else ceiling
                 self._integrator.pseudo_dt *= SHRINK
                 leaps = False
-        slides = self._friction.lost(factor - before) if words and arrived else ""
+        slides = self._friction.record_failure(factor - before) if words and arrived else ""
         if slides:
             words = f"{words}; {slides}"
         self._sufficed = 0.0
@@ -290,7 +296,7 @@ class Equilibrium:
             return
         self._pull = self._system.out_of_balance()[0] / (factor - before)
         if self._rate is not None:
-            self._integrator.alternatives = self._extrapolation.along(factor, self._rate)
+            self._integrator.alternatives = self._extrapolation.tangent_predictions(factor, self._rate)
 
     def _learn_rate(self, start: Array, before: float, factor: float) -> int:
         """How the equilibrium just found changes as loads do and handles go on from where they were in the
@@ -316,7 +322,7 @@ class Equilibrium:
         if self._pressures is None:
             self._rate, spent = self._stepper.tangent(pull)
         else:
-            self._rate, spent = self._pressures.tangent(pull, self._pressures.linearised(before, factor))
+            self._rate, spent = self._pressures.tangent(pull, self._pressures.linearise_loads(before, factor))
         if self._rate is not None:
             self._rate += moved / step
         return spent
@@ -328,9 +334,9 @@ class Equilibrium:
         """
         system, now = self._system, self._system.applied.force.copy()
         if self._pressures is None:
-            system.applied.override = relaxation.following(now)
+            system.applied.override = relaxation.relax(now)
             return 0
-        loads = system.applied.following = self._pressures.linearised(before, factor)
+        loads = system.applied.following = self._pressures.linearise_loads(before, factor)
         way, spent = None, 0
         if system.active.viscous:  # of wind no stiffness is known
             pass
@@ -339,7 +345,7 @@ class Equilibrium:
         elif self._integrator.alternatives and self._rate is not None:
             way = (factor - before) * self._rate
         if way is None:
-            system.applied.override = relaxation.following(now)
+            system.applied.override = relaxation.relax(now)
         else:
             system.applied.override = now + self._pressures.skew_force(loads, way)
         return spent
@@ -384,19 +390,21 @@ class Equilibrium:
                 found = examination.stability
                 if found.stable is not False:
                     break
-                mode, way = examination.mode(), None
+                mode, way = examination.lowest_mode(), None
                 if mode is None:
                     words = "its lowest mode was not found"
-                elif self._pressures is not None and self._pressures.holds(found, mode, factor):
+                elif self._pressures is not None and self._pressures.skew_part_stabilises(
+                    found, mode, factor
+                ):
                     found = Stability(reason=NO_POTENTIAL)
-                elif examination.wrinkles(mode):
+                elif examination.is_wrinkle(mode):
                     words = (
                         "sheets without bending wrinkle as finely as the mesh, which is not followed; give a "
                         "bending stiffness"
                     )
                 elif followed == MOST_DESCENTS:
                     words = f"its lowest mode was followed {followed} times"
-                elif (way := examination.way_down(mode)) is None:
+                elif (way := examination.descent(mode)) is None:
                     words = "nothing along its lowest mode has less energy"
                 if way is None:
                     break
@@ -422,7 +430,7 @@ class Equilibrium:
 
     def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers to go on with from the equilibrium at ``factor``; collective."""
-        self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned].copy())
+        self._extrapolation.record(factor, self._system.x[: self._system.points.n_owned].copy())
         arrays, past = self._extrapolation.memory()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
         numbers |= self._friction.memory()

@@ -1,4 +1,4 @@
-"""Where a solve starts: on a polynomial through past velocities in time, or equilibria in the load factor."""
+"""Polynomial extrapolation of past velocities in time, or of past equilibria in the load factor."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 
-MOST = 2
-"""Degree of the polynomial; the third gained no more, and each is an array to keep."""
+MAX_DEGREE = 2
+"""Largest degree of the polynomial. The third gained nothing, and each degree is one more array to keep."""
 
 
-def weights(times: list[float], at: float) -> list[float]:
-    """Of the values at ``times`` (n,), of the polynomial of degree n − 1 through them at another time."""
+def lagrange_weights(times: list[float], at: float) -> list[float]:
+    """Weights of values at ``times`` (n,) in the interpolation polynomial's value at another time."""
     return [math.prod((at - other) / (own - other) for other in times if other != own) for own in times]
 
 
 class Extrapolation:
-    """Extrapolates by the degree that would have been the best for the step before; collective.
+    """Extrapolates with the degree that would have been the best for the last step; collective.
 
-    After a jump that is the constant, the last velocity itself.
+    After a jump that is degree 0: the last velocity itself.
 
     Parameters
     ----------
@@ -35,36 +35,37 @@ class Extrapolation:
         self._values: list[Array] = []
         self._degree = 0
 
-    def to(self, t1: float, t0: float, v: Array) -> Array:
-        """Velocities (n, 3) [m/s] to expect at t1 [s], of ``v`` at t0, which are kept and must stay."""
-        self.learn(t0, v)
+    def extrapolate(self, t1: float, t0: float, v: Array) -> Array:
+        """Velocities (n, 3) [m/s] expected at t1 [s], after recording v (n, 3) at t0; v must not change."""
+        self.record(t0, v)
         return self._expected(t1, min(self._degree, len(self._times) - 1))
 
-    def along(self, t1: float, rate: Array) -> list[Array]:
-        """Ways (n, 3) to expect until t1 from the last values, which change at ``rate``: the tangent, and the
-        parabola from the values before.
+    def tangent_predictions(self, t1: float, rate: Array) -> list[Array]:
+        """Changes (n, 3) expected from the last values, which change at ``rate`` (n, 3), until t1.
+
+        The first is along the tangent, the second along the parabola through the values before.
         """
         after = t1 - self._times[-1]
-        ways = [after * rate]
+        changes = [after * rate]
         if len(self._times) > 1:
             before = self._times[-1] - self._times[-2]
-            bend = (self._values[-2] - self._values[-1]) / before + rate
-            ways.append(after * rate + (after * after / before) * bend)
-        return ways
+            curvature = (self._values[-2] - self._values[-1]) / before + rate
+            changes.append(after * rate + (after * after / before) * curvature)
+        return changes
 
-    def learn(self, t0: float, v: Array) -> None:
-        """Take the velocities at t0 [s], unless they are known; collective."""
+    def record(self, t0: float, v: Array) -> None:
+        """Record the velocities at t0 [s], unless they are known; collective."""
         if self._times and t0 <= self._times[-1]:
             return
         if self._times:
             errors = np.array([self._error(t0, v, degree) for degree in range(len(self._times))])
             self._comm.Allreduce(MPI.IN_PLACE, errors)
             self._degree = int(errors.argmin())
-        self._times = [*self._times[-MOST:], t0]
-        self._values = [*self._values[-MOST:], v]
+        self._times = [*self._times[-MAX_DEGREE:], t0]
+        self._values = [*self._values[-MAX_DEGREE:], v]
 
     def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
-        """Arrays (n, 3) and numbers to go on with after a restart; the newest velocities are the state's."""
+        """Arrays (n, 3) and numbers of a checkpoint, for `restore`, without the newest velocities."""
         past = list(zip(self._times[:-1], self._values[:-1], strict=True))
         arrays = {f"past_{number}": value for number, (_, value) in enumerate(past)}
         return arrays, {f"past_{number}": time for number, (time, _) in enumerate(past)} | {
@@ -72,7 +73,7 @@ class Extrapolation:
         }
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float], t0: float, v: Array) -> None:
-        """Go on with a memory from velocities v (n, 3) [m/s] at t0 [s]; an older one is empty."""
+        """Continue from a memory, empty in old checkpoints, and velocities v (n, 3) [m/s] at t0 [s]."""
         names = sorted(name for name in numbers if name.startswith("past_") and name in arrays)
         if not names:
             return
@@ -81,13 +82,13 @@ class Extrapolation:
         self._degree = int(numbers["degree"])
 
     def _error(self, t0: float, v: Array, degree: int) -> float:
-        """Square of the difference, on this rank, of v from what was to be expected at t0 [s]."""
-        wrong = (v - self._expected(t0, degree)).ravel()
-        return float(np.dot(wrong, wrong))
+        """Square, on this rank, of the difference of v from the extrapolation of this degree to t0 [s]."""
+        error = (v - self._expected(t0, degree)).ravel()
+        return float(np.dot(error, error))
 
     def _expected(self, t1: float, degree: int) -> Array:
         times, values = self._times[-degree - 1 :], self._values[-degree - 1 :]
         expected: Array = np.zeros_like(values[0])
-        for weight, value in zip(weights(times, t1), values, strict=True):
+        for weight, value in zip(lagrange_weights(times, t1), values, strict=True):
             expected += weight * value
         return expected

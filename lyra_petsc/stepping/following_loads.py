@@ -1,11 +1,12 @@
-"""Loads of an equilibrium that follow the shape: their stiffness, and what they are along it.
+"""Stiffness of loads that follow the shape, in equilibria.
 
-A pressure is known at a shape only, and changes with it. Where a solve takes it as it was, equilibria are
-found as a fixed point is: in many solves, and not at all where it changes by more than the sheet resists. So
-a solve takes it as linear in the displacement u from the shape it begins from, f + K u with the symmetric
-part of K, which has the potential −fᵀu − ½ uᵀK u that line searches need. Where all of K is symmetric, as for
-an even pressure on a closed sheet or one whose rim is held, that is Newton's method for the load. Beside free
-edges it is not: ``newton_way`` finds the displacement that all of K leads to, whose skew part f is given.
+A pressure depends on the shape. If solves take it as constant, equilibria are found by fixed-point iteration:
+in many solves, and not at all where the pressure's stiffness exceeds that of the sheet. A solve therefore
+takes it as linear in the displacement u from its initial shape, f + K u with the symmetric part of K, which
+has the potential −fᵀu − ½ uᵀK u for line searches. Where K is symmetric, as for an even pressure on a closed
+sheet or one with a fixed rim, that is Newton's method for the load. Beside free edges K is not symmetric:
+``newton_displacement`` finds the displacement with all of K, and the force of its skew part is given to the
+solve.
 
 Source: Schweizerhof & Ramm, Displacement dependent pressure loads in nonlinear finite element analyses,
 Computers & Structures 18 (1984) 1099-1114.
@@ -28,11 +29,11 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.terms.term import Term
 
-MOST_WAYS, ENOUGH = 10, 1e-3
-"""Iterations for a displacement, and the part of the force that it may leave."""
+MAX_ITERATIONS, TOLERANCE = 10, 1e-3
+"""Largest number of GMRES iterations for a displacement, and their relative tolerance."""
 
 STEP = 1e-5
-"""Displacement in a difference of forces, over the size of the elements."""
+"""Displacement of the finite differences, over the size of the elements."""
 
 Solve = Callable[[Array], "Array | None"]
 
@@ -40,27 +41,26 @@ Solve = Callable[[Array], "Array | None"]
 def following_stiffness(
     term: Term, x: Array, force: Callable[[Term, Array, Array], None]
 ) -> tuple[Array, Array]:
-    """Symmetric and skew part of −∂f/∂x of each element [N/m], each (E, n, n, 3, 3), at x (n_local, 3), by
-    differences of its force.
+    """Symmetric and skew part of −∂f/∂x of each element [N/m], both (E, n, n, 3, 3), at x (n_local, 3).
 
-    ``force`` adds the forces [N] of a term at positions to an array. The term's elements are pulled apart,
-    so that each of their points can be moved in all at once.
+    They are finite differences of ``force``, which adds the forces [N] of a term at positions to an array.
+    Elements get points of their own, so that a point can be moved in all elements at once.
     """
     n_elements, n = term.stencil.shape
-    apart = copy.copy(term)
+    separate = copy.copy(term)
     numbers = np.arange(n_elements * n, dtype=np.int32).reshape(n_elements, n)
-    apart.take(Elements(numbers, term.elements.data, term.n_owned))
-    here = x[term.stencil]
-    step = STEP * float(np.ptp(here, axis=1).max(initial=0.0)) or STEP
+    separate.take(Elements(numbers, term.elements.data, term.n_owned))
+    corners = x[term.stencil]
+    step = STEP * float(np.ptp(corners, axis=1).max(initial=0.0)) or STEP
     out = np.empty((n_elements, n, n, 3, 3))
     for point in range(n):
         for axis in range(3):
             change = np.zeros((n_elements * n, 3))
             for sign in (1.0, -1.0):
-                moved = here.copy()
+                moved = corners.copy()
                 moved[:, point, axis] += sign * step
                 forces = np.zeros_like(change)
-                force(apart, moved.reshape(-1, 3), forces)
+                force(separate, moved.reshape(-1, 3), forces)
                 change += sign * forces
             out[:, :, point, :, axis] = -change.reshape(n_elements, n, 3) / (2.0 * step)
     other = out.transpose(0, 2, 1, 4, 3)
@@ -68,18 +68,18 @@ def following_stiffness(
 
 
 class FollowingLoads:
-    """Linear in the displacement from a shape.
+    """Loads that are linear in the displacement from a shape.
 
     Parameters
     ----------
     loads : sequence of Term
-        Those that follow the shape.
+        Loads that follow the shape.
     x : (n_local, 3)
         The shape [m].
     force_of : callable
-        Adds the force [N] of one of them at positions to an array.
+        Adds the force [N] of a load at positions to an array.
     factor : float
-        On all of them.
+        Load factor.
     """
 
     def __init__(
@@ -96,16 +96,14 @@ class FollowingLoads:
             self._parts.append((load.stencil, factor * symmetric, factor * skew, load.n_owned))
 
     def _forces(self, x: Array) -> Iterator[tuple[NDArray[np.int32], Array, Array, int]]:
-        """Of each load its stencil, displacements u (E, n, 3) [m], K u (E, n, 3) [N], and how many elements
-        this rank counts.
-        """
-        ahead = x[: len(self._from)] - self._from
+        """Stencil, u (E, n, 3) [m], K u (E, n, 3) [N] and number of owned elements of each load."""
+        displacement = x[: len(self._from)] - self._from
         for stencil, blocks, _, n_owned in self._parts:
-            u = ahead[stencil]
+            u = displacement[stencil]
             yield stencil, u, -np.einsum("eabij,ebj->eai", blocks, u), n_owned
 
     def energy(self, x: Array) -> float:
-        """−½ uᵀK u [J] of the elements that this rank counts, at positions x (n_local, 3)."""
+        """−½ uᵀK u [J] of the owned elements at positions x (n_local, 3)."""
         return -sum(0.5 * float(np.vdot(u[:n], force[:n])) for _, u, force, n in self._forces(x))
 
     def add_force(self, x: Array, out: Array) -> None:
@@ -113,11 +111,12 @@ class FollowingLoads:
         for stencil, _, force, _ in self._forces(x):
             _scatter(stencil, force, out, len(x))
 
-    def skew_force(self, way: Array, n_owned: int) -> Array:
-        """Force (n_owned, 3) [N] by the skew part of K on a displacement (n_local, 3) [m]."""
+    def skew_force(self, displacement: Array, n_owned: int) -> Array:
+        """Force (n_owned, 3) [N] of the skew part of K for a displacement (n_local, 3) [m]."""
         out = np.zeros((n_owned, 3))
         for stencil, _, blocks, _ in self._parts:
-            _scatter(stencil, -np.einsum("eabij,ebj->eai", blocks, way[stencil]), out, len(way))
+            force = -np.einsum("eabij,ebj->eai", blocks, displacement[stencil])
+            _scatter(stencil, force, out, len(displacement))
         return out
 
     def add_hessian(self, weight: float, pattern: BlockPattern, values: Array) -> None:
@@ -133,29 +132,31 @@ def _scatter(stencil: NDArray[np.int32], force: Array, out: Array, n: int) -> No
 
 
 class _Preconditioned:
-    """Forces less those by the skew part on the displacements that the symmetric part has for them."""
+    """The operator force ↦ force − skew part × (symmetric part)⁻¹ × force."""
 
     def __init__(self, solve: Solve, skew: Callable[[Array], Array]) -> None:
         self._solve, self._skew = solve, skew
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         force = x.getArray(readonly=True).reshape(-1, 3)
-        way = self._solve(force)
-        y.setArray((force if way is None else force - self._skew(way)).ravel())
+        displacement = self._solve(force)
+        y.setArray((force if displacement is None else force - self._skew(displacement)).ravel())
 
 
-def newton_way(force: Array, solve: Solve, skew: Callable[[Array], Array], comm: MPI.Comm) -> Array | None:
-    """Displacement (n, 3) [m] to which a force (n, 3) [N] leads with a skew stiffness, too; None where there
-    are no factors; collective.
+def newton_displacement(
+    force: Array, solve: Solve, skew: Callable[[Array], Array], comm: MPI.Comm
+) -> Array | None:
+    """Displacement (n, 3) [m] for a force (n, 3) [N] with symmetric and skew stiffness; collective.
 
-    GMRES (``-loads_ksp_``), whose preconditioner from the right is the symmetric part.
+    It is found by GMRES (``-loads_ksp_``), preconditioned from the right with the symmetric part. None if
+    there are no factors.
 
     Parameters
     ----------
     solve : callable
-        The displacement that the symmetric part of the stiffness, loads included, has for a force.
+        The displacement for a force by the symmetric part of the stiffness, loads included.
     skew : callable
-        Force by the loads' skew part on a displacement.
+        Force of the loads' skew part for a displacement.
     """
     local = (force.size, None)
     matrix = PETSc.Mat().createPython((local, local), _Preconditioned(solve, skew), comm)
@@ -167,10 +168,10 @@ def newton_way(force: Array, solve: Solve, skew: Callable[[Array], Array], comm:
     ksp.setOptionsPrefix("loads_")
     ksp.setType("gmres")
     ksp.getPC().setType("none")
-    ksp.setTolerances(rtol=ENOUGH, max_it=MOST_WAYS)
+    ksp.setTolerances(rtol=TOLERANCE, max_it=MAX_ITERATIONS)
     ksp.setFromOptions()
     ksp.solve(b, u)
-    way = solve(u.getArray(readonly=True).reshape(-1, 3))
+    displacement = solve(u.getArray(readonly=True).reshape(-1, 3))
     for each in (ksp, b, u, matrix):
         each.destroy()
-    return way
+    return displacement

@@ -1,7 +1,7 @@
-"""Whether friction in an equilibrium is what normal forces there allow.
+"""Consistency of friction with the normal forces of an equilibrium.
 
-A sheet that comes to lie on something in a load step is held there by the forces found on the way. They are
-taken anew until they are near those that the equilibrium has; where all slides there may be none.
+Friction in a solve takes the normal forces of the solve before. A load step therefore repeats its solves
+until these are close to the normal forces in the equilibrium. If all contacts slide there may be none.
 """
 
 from __future__ import annotations
@@ -13,74 +13,74 @@ import numpy as np
 
 from lyra_petsc.stepping.stage_equations import StageEquations
 
-LAG, MOST_ROUNDS = 1e-3, 10
-"""Part of the friction that may be other than normal forces in the equilibrium allow; how often it is taken
-anew for that, at most."""
+LAG, MAX_ROUNDS = 1e-3, 10
+"""Fraction by which friction may differ from what the normal forces of the equilibrium allow, and largest
+number of updates to reach it."""
 
-SLIDES, MOST_SLID = 0.95, 3
-"""Part of the friction allowed from which on all slides; after how many load steps without an equilibrium
-where it does a smaller one is no help."""
+SLIDES, MAX_SLIDING = 0.95, 3
+"""Fraction of the allowed friction from which on all contacts slide, and number of failed load steps with
+sliding after which smaller ones are not tried."""
 
 
 class FrictionBalance:
-    """Friction of the load step that is taken, and whether all slid in those before; collective.
+    """The friction of a load step, and the number of failed steps in which all contacts slid; collective.
 
     Attributes
     ----------
     lag : float
-        Part of what normal forces allow that is not known of the friction in the last equilibrium.
+        Error of the friction in the last equilibrium, as a fraction of what its normal forces allow.
     in_vain : bool
-        Whether all slid in so many load steps that a smaller one is no help.
+        Whether so many load steps failed with sliding that a smaller one would not help.
     """
 
     def __init__(self, system: StageEquations) -> None:
         self._system = system
         self.lag = 0.0
-        self._rounds = self._slid = 0
-        self._slid_in = 0.0  # the last increment of the load factor in which all slid
+        self._rounds = self._sliding_steps = 0
+        self._sliding_increment = 0.0  # the last increment of the load factor in which all slid
 
-    def begin(self) -> None:
+    def begin_step(self) -> None:
         """Begin a load step."""
         self.lag, self._rounds = 0.0, 0
 
-    def settled(self) -> bool:
-        """Whether friction need not be taken anew in an equilibrium but for that."""
+    def is_settled(self) -> bool:
+        """Whether friction needs no further update in a state that is balanced otherwise; collective."""
         self.lag = self._sums()[0]
         self._rounds += 1
-        return self.lag <= LAG or self._rounds > MOST_ROUNDS
+        return self.lag <= LAG or self._rounds > MAX_ROUNDS
 
-    def found(self, increment: float) -> None:
-        """There is an equilibrium so much of the load factor farther on."""
-        if increment >= self._slid_in:
-            self._slid, self._slid_in = 0, 0.0
+    def record_success(self, increment: float) -> None:
+        """Note that a load step of this increment of the load factor found an equilibrium."""
+        if increment >= self._sliding_increment:
+            self._sliding_steps, self._sliding_increment = 0, 0.0
 
-    def lost(self, increment: float) -> str:
-        """There is none, since all slides, as these words tell; or for another reason."""
+    def record_failure(self, increment: float) -> str:
+        """Note that a load step of this increment failed; a message if all contacts slide, else ''."""
         self.lag = 0.0
-        words = self.slides()
-        if words:
-            self._slid, self._slid_in = self._slid + 1, increment
-        return words
+        message = self.sliding_message()
+        if message:
+            self._sliding_steps, self._sliding_increment = self._sliding_steps + 1, increment
+        return message
 
-    def slides(self) -> str:
-        """What slides now, in words."""
+    def sliding_message(self) -> str:
+        """Text that names the contacts which slide now, or an empty one; collective."""
         return self._sums()[1]
 
     @property
     def in_vain(self) -> bool:
-        return self._slid >= MOST_SLID
+        return self._sliding_steps >= MAX_SLIDING
 
     def memory(self) -> dict[str, Any]:
-        """What to go on with after a restart."""
-        return {"slid": self._slid, "slid_in": self._slid_in}
+        """Entries of a checkpoint, for `restore`."""
+        return {"slid": self._sliding_steps, "slid_in": self._sliding_increment}
 
     def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on with a memory; an older one is empty."""
-        self._slid = int(memory.get("slid", self._slid))
-        self._slid_in = float(memory.get("slid_in", self._slid_in))
+        """Continue from a memory; that of older checkpoints is empty."""
+        self._sliding_steps = int(memory.get("slid", self._sliding_steps))
+        self._sliding_increment = float(memory.get("slid_in", self._sliding_increment))
 
     def _sums(self) -> tuple[float, str]:
-        """Friction that normal forces now do not allow, over what they allow, and in words what slides."""
+        """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""
         sums = self._system.active.friction_lag(self._system.x)
         if not sums:
             return 0.0, ""
@@ -91,5 +91,5 @@ class FrictionBalance:
             if friction > SLIDES * allowed > 0.0
         ]
         wrong, friction, allowed = each.sum(axis=0)
-        words = f"{' and '.join(slides)}, with {friction:.3g} N of friction" if slides else ""
-        return float(wrong / max(allowed, np.finfo(float).tiny)), words
+        message = f"{' and '.join(slides)}, with {friction:.3g} N of friction" if slides else ""
+        return float(wrong / max(allowed, np.finfo(float).tiny)), message

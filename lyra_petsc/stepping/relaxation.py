@@ -1,4 +1,4 @@
-"""Loads that follow the shape, found by iteration: under-relaxed, so that it does not swing.
+"""Under-relaxation of loads that follow the shape, so that their fixed-point iteration does not oscillate.
 
 Source: Aitken's Δ² for vectors, Irons & Tuck, Int. J. Numer. Meth. Engng 1 (1969) 275-277.
 """
@@ -10,20 +10,20 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 
-LEAST, MOST = 0.02, 1.0
+MIN_FACTOR, MAX_FACTOR = 0.02, 1.0
 
 
 class Relaxation:
-    """The loads to solve with next, from those last solved with and those of the shape that came out."""
+    """Loads of the next solve, from the loads of the last solve and those at the shape that it found."""
 
     def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
-        self._share = MOST
+        self._factor = MAX_FACTOR
         self._loads: Array | None = None
         self._change: Array | None = None
 
-    def following(self, loads: Array) -> Array:
-        """Loads (n_owned, 3) [N] for the next solve; ``loads`` are those at the present shape; collective."""
+    def relax(self, loads: Array) -> Array:
+        """Loads (n_owned, 3) [N] for the next solve, from those at the present shape; collective."""
         if self._loads is None:
             return loads
         change = loads - self._loads
@@ -33,10 +33,10 @@ class Relaxation:
                 np.array([np.vdot(self._change, turn), np.vdot(turn, turn)], dtype=np.float64)
             )
             if square > 0.0:
-                self._share = min(MOST, max(LEAST, -self._share * dot / square))
+                self._factor = min(MAX_FACTOR, max(MIN_FACTOR, -self._factor * dot / square))
         self._change = change
-        return self._loads + self._share * change
+        return self._loads + self._factor * change
 
-    def solved_with(self, loads: Array) -> None:
-        """These loads (n_owned, 3) [N] were in balance, or nearly."""
+    def record(self, loads: Array) -> None:
+        """Note the loads (n_owned, 3) [N] of the last solve."""
         self._loads = loads

@@ -1,4 +1,4 @@
-"""What round-off alone may leave of a residual."""
+"""Estimates of the round-off of a residual."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ from lyra_petsc.stepping.conditioning import vertex_scales
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 ROUNDOFF = 10.0 * float(np.finfo(np.float64).eps)
-"""Part of the forces that differences of coordinates would make, were these not small."""
+"""Relative round-off of an internal force that is computed from differences of coordinates."""
 
 
 def residual_roundoff(system: StageEquations, size: float) -> float:
-    """Norm [N] that round-off may give the residual: 10 ε of the internal force scale; collective.
+    """Norm [N] of the residual's round-off: 10 ε times the scale of internal forces; collective.
 
-    ``size`` [m] is the largest coordinate: differences of such numbers make the strains.
+    ``size`` [m] is the largest coordinate; strains are differences of such numbers.
     """
     return _norm(system, vertex_scales(system, size))
 
 
-def roundoff_of_contact(system: StageEquations) -> float:
-    """The same of what touches where the equations were last evaluated, which stiffens without bound as it is
-    pressed; collective.
-    """
+def contact_roundoff(system: StageEquations) -> float:
+    """The same for contact at the positions last evaluated; its stiffness grows without bound; collective."""
     points, (x, _) = system.points, system.evaluated
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
     for term in system.active.limiting:
@@ -33,5 +31,5 @@ def roundoff_of_contact(system: StageEquations) -> float:
 
 
 def _norm(system: StageEquations, scale: Array) -> float:
-    """Of the round-off of forces [N] on owned rows (n_owned,)."""
+    """Norm [N] of the round-off for scales (n_owned,) [N] of the forces on owned rows; collective."""
     return ROUNDOFF * float(np.sqrt(system.points.comm.allreduce(float(np.sum(scale**2)))))

@@ -22,7 +22,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_memory
-from lyra_petsc.stepping.compression_watch import Compression
+from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, Ledger
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
@@ -177,7 +177,7 @@ class SteppedScene:
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
-        self.compression = Compression(self.problem)
+        self.compression = CompressionWatch(self.problem)
         self._told: set[str] = set()
         self.stability: dict[str, Any] = {}
         if scene.time.analysis == "static":
@@ -327,7 +327,7 @@ class SteppedScene:
             if self.guard is None:
                 self.ledger.record(x_before[:n])
             when = f"step {self.step_number} ({self._now()})"
-            note = self.compression.look(when, told="compression" in self._told)
+            note = self.compression.check(when, reported="compression" in self._told)
         if note:
             self._tell_once("compression", note)
         if attempt.at_roundoff and "roundoff" not in self._told:

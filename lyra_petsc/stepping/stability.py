@@ -1,8 +1,8 @@
-"""Whether an equilibrium is stable: the signs of the exact Hessian on the free unknowns, and where it leads.
+"""Stability of an equilibrium: the inertia of the exact Hessian on the free unknowns, and the unstable mode.
 
 The Hessian is that of all energies, plus the symmetric part of the stiffness of loads that follow the shape.
-Unknowns of edges need no care of their own: of a matrix with a positive-definite block of theirs the negative
-pivots are those of its Schur complement, on the vertices.
+Unknowns of edges need no special treatment: if their block is positive definite, the negative pivots are
+those of the Schur complement on the vertices.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from lyra_petsc.linear.inertia import Inertia
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Load, UpcomingStep, Viscous
 
-MOST_VERTICES = 200_000
-"""Above it no factors are computed."""
+MAX_VERTICES = 200_000
+"""Number of vertices above which no factors are computed."""
 
-FIRST_WAY, FARTHEST = 1e-3, 0.25
-"""Of the way along a mode: the first over the mean edge length, the longest over the mesh's size."""
+FIRST_DISPLACEMENT, MAX_DISPLACEMENT = 1e-3, 0.25
+"""Displacements along a mode: the first over the mean edge length, the largest over the mesh's size."""
 
 HALVINGS, DOUBLINGS = 10, 40
 
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
-"""Golden ratio, whose multiples fill the fractions evenly."""
+"""Inverse golden ratio, whose multiples modulo 1 are evenly distributed."""
 
 GAUSS = np.sqrt(3.0) / 6.0
-"""From the middle to the points of the quadrature with two of them, exact for cubics."""
+"""Distance of the two Gauss points from the middle of the unit interval; exact for cubics."""
 
-BENDS = 0.5
-"""Part of a mode that must be on vertices with bending stiffness for it not to be a wrinkle."""
+MIN_BENDING = 0.5
+"""A mode with less than this fraction on vertices with bending stiffness is a wrinkle."""
 
 
 @dataclass(frozen=True)
 class Stability:
-    """What the pivots say of an equilibrium.
+    """Stability of an equilibrium by the pivots of its Hessian.
 
     Attributes
     ----------
     stable : bool or None
-        Whether none is negative; None: not known.
+        Whether no pivot is negative; None: not known.
     negative, neutral : int or None
-        How many are negative, and how many too small to have a sign.
+        Number of negative pivots, and of pivots too small to have a sign.
     reason : str
-        Why it is not known.
+        Why the stability is not known.
     """
 
     stable: bool | None = None
@@ -67,11 +67,12 @@ class Stability:
 
 
 def add_exact_hessian(system: StageEquations, values: Array) -> None:
-    """Add to block rows (n_blocks, 3, 3) the exact Hessian [N/m] of all energies at the state.
+    """Add the exact Hessian [N/m] of all energies at the state to block rows (n_blocks, 3, 3).
 
-    And the symmetric part of the stiffness of loads that follow it; prescribed unknowns are decoupled.
+    The symmetric part of the stiffness of loads that follow the shape is added, too. Prescribed unknowns are
+    decoupled.
     """
-    from lyra_petsc.stepping.following_loads import FollowingLoads  # of no use in motions
+    from lyra_petsc.stepping.following_loads import FollowingLoads  # needed in equilibria only
 
     rows, active, prescribed = system.discretisation.rows, system.active, system.prescribed
     for term in active.elastic:
@@ -95,7 +96,7 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
 
 
 class Examination:
-    """Of the equilibrium that the equations are at, whose factors it holds until it ends; collective.
+    """Examination of the present equilibrium; a context that holds the factors of its Hessian; collective.
 
     Attributes
     ----------
@@ -112,9 +113,9 @@ class Examination:
         points = system.points
         if not PETSc.Sys.hasExternalPackage("mumps"):
             return Stability(reason="this PETSc has no MUMPS, whose factors give the inertia")
-        if points.n_vertices_global > MOST_VERTICES:
+        if points.n_vertices_global > MAX_VERTICES:
             return Stability(
-                reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
+                reason=f"{points.n_vertices_global} vertices are more than the {MAX_VERTICES} "
                 "that factors are made for"
             )
         system.update_pattern()
@@ -127,38 +128,40 @@ class Examination:
         return Stability(pivots.negative == 0, pivots.negative, pivots.neutral)
 
     def solve(self, force: Array) -> Array | None:
-        """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the exact Hessian, until ``mode`` is
-        called; None where there are no factors; collective."""
+        """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the exact Hessian; collective.
+
+        None if there are no factors. Not to be called after `lowest_mode`.
+        """
         return None if self.stability.stable is None or self._inertia is None else self._inertia.solve(force)
 
-    def mode(self) -> Array | None:
-        """The unstable mode (n_owned, 3) of length one with the lowest eigenvalue, if it can be had."""
+    def lowest_mode(self) -> Array | None:
+        """The unstable mode (n_owned, 3) of length one with the lowest eigenvalue, or None; collective."""
         assert self._inertia is not None
         points = self._system.points
-        # spread evenly over (-1/2, 1/2) by the number of the unknown: the same on any number of ranks
+        # a start vector evenly distributed in (-1/2, 1/2), the same on any number of ranks
         start = np.zeros((points.n_owned, 3))
         number = 3 * points.mesh_vertices[:, None] + np.arange(3)
         start[: points.n_vertices] = (number + 1) * GOLDEN % 1.0 - 0.5
         found = self._inertia.lowest_mode(np.where(self._system.prescribed.free, start, 0.0))
         return None if found is None or not found[0] < 0.0 else found[1]
 
-    def wrinkles(self, mode: Array) -> bool:
-        """Whether a mode is mostly where nothing resists bending."""
+    def is_wrinkle(self, mode: Array) -> bool:
+        """Whether a mode is mostly on vertices without bending stiffness."""
         system = self._system
-        bent = np.zeros(system.points.n_local, dtype=bool)
+        stiff = np.zeros(system.points.n_local, dtype=bool)
         for term in system.active.elastic:
             if term.registration.bends:
-                bent[term.stencil] = True
+                stiff[term.stencil] = True
         n = system.points.n_vertices
         square = (mode[:n] ** 2).sum(axis=1)
-        on_bent, all_of_it = system.points.global_sum(float(square[bent[:n]].sum()), float(square.sum()))
-        return bool(on_bent < BENDS * all_of_it)
+        on_stiff, total = system.points.global_sum(float(square[stiff[:n]].sum()), float(square.sum()))
+        return bool(on_stiff < MIN_BENDING * total)
 
-    def way_down(self, mode: Array) -> Array | None:
-        """The way (n_owned, 3) along a mode to about the lowest potential on it; None if none is lower."""
+    def descent(self, mode: Array) -> Array | None:
+        """Displacement (n_owned, 3) [m] along a mode to about the lowest potential; None if none is lower."""
         points = self._system.points
         largest = points.comm.allreduce(float(np.abs(mode).max(initial=0.0)), MPI.MAX)
-        first, most = FIRST_WAY * self._spacing / largest, FARTHEST * self._size / largest
+        first, maximum = FIRST_DISPLACEMENT * self._spacing / largest, MAX_DISPLACEMENT * self._size / largest
         here = self._potential(0.0 * mode)
         best, lowest = 0.0, here
         for sign in (1.0, -1.0):
@@ -171,34 +174,34 @@ class Examination:
                 continue
             for _ in range(DOUBLINGS):
                 farther = self._potential(2.0 * length * mode)
-                if not farther < value or abs(2.0 * length) > most:
+                if not farther < value or abs(2.0 * length) > maximum:
                     break
                 length, value = 2.0 * length, farther
             if value < lowest:
                 best, lowest = length, value
         if best == 0.0:
             return None
-        way, system = best * mode, self._system
+        displacement, system = best * mode, self._system
         if system.limits_steps:
-            way *= system.largest_step(np.zeros_like(mode), way / system.stage.c)
-        return way
+            displacement *= system.largest_step(np.zeros_like(mode), displacement / system.stage.c)
+        return displacement
 
-    def _potential(self, way: Array) -> float:
-        """Energies minus the work of the loads [J] at the end of a way from here."""
+    def _potential(self, displacement: Array) -> float:
+        """Energies minus the work of the loads [J] after a displacement (n_owned, 3) [m] from the state."""
         system = self._system
         x = system.x.copy()
-        x[: len(way)] += way
+        x[: len(displacement)] += displacement
         system.points.update_ghosts(x)
         stored = sum(
             float(term.energies(x, system.active.frozen[term]).sum()) for term in system.active.elastic
         )
         force = system.applied.force.copy()
         for load in system.active.following:
-            force += system.applied.factor * self._change(load, x, len(way))
-        return float(system.points.global_sum(stored - float(np.vdot(force, way)))[0])
+            force += system.applied.factor * self._mean_change(load, x, len(displacement))
+        return float(system.points.global_sum(stored - float(np.vdot(force, displacement)))[0])
 
-    def _change(self, load: Load, x: Array, n: int) -> Array:
-        """Mean on the way to x (n_local, 3) of a load's change from here (n, 3) [N], exact for a pressure."""
+    def _mean_change(self, load: Load, x: Array, n: int) -> Array:
+        """Mean change (n, 3) [N] of a load over the displacement to x (n_local, 3); exact for a pressure."""
         system = self._system
         total = np.zeros_like(x)
         for part in (0.5 - GAUSS, 0.5 + GAUSS):

@@ -43,7 +43,7 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, StepInterval, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.impacts import Damped
+    from lyra_petsc.stepping.impacts import ContactImpulses
     from lyra_petsc.terms.one_sided import Springs
 
 
@@ -171,7 +171,7 @@ class StageEquations:
         self._linearises_at_state = False
         self._uncorrected: Array | None = None
         self._squares: list[float] = []
-        self.damped: Damped | None = None
+        self.contact_impulses: ContactImpulses | None = None
 
     @property
     def points(self) -> Layout:
@@ -378,15 +378,15 @@ class StageEquations:
             if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
                 self._update_stencils(self._xs, self.x - self._xs, (1.0,))
             if not self.discretisation.has_near_elements:
-                self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
+                self.integrator.surplus, self.contact_impulses = max(self.integrator.surplus, 0.0), None
                 return
             if self.removes_contact_surplus:
                 left = self.integrator.surplus
-                self.integrator.surplus = impacts.surplus(self, self._contact_energy, before, left)
-            self.damped = impacts.damp_impacts(self)
+                self.integrator.surplus = impacts.remove_surplus(self, self._contact_energy, before, left)
+            self.contact_impulses = impacts.damp_impacts(self)
             for term in self.active.changing:
                 if term.slips:
-                    self.damped = impacts.make_up_friction(self, term, self.damped)
+                    self.contact_impulses = impacts.correct_friction(self, term, self.contact_impulses)
 
     def reopen(self, x_before: Array) -> None:
         """Let the equations of the step just accepted, from x_before (n_owned, 3), be evaluated again;
@@ -527,7 +527,7 @@ class StageEquations:
         """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
         at = self.t0 + self.stage.offset if self.integrator.dynamic else self.t1
         work = sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
-        return work + (self.damped.work if self.damped else 0.0)
+        return work + (self.contact_impulses.work if self.contact_impulses else 0.0)
 
     def move_targets_to_end(self) -> float:
         """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""

@@ -416,7 +416,7 @@ class Stepper:
         numbers: dict[str, Any] = {"preset": names[0], **newton}
         self.linear.reuse.discard()  # who goes on from here has none
         if not self._iterates or self._left is not None:
-            self._extrapolation.learn(time, self._equations.v[: self._shape[0]])
+            self._extrapolation.record(time, self._equations.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()
         return arrays, numbers
 
@@ -487,7 +487,7 @@ class Stepper:
         if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations
-            ahead = self._extrapolation.to(equations.t1, equations.t0, equations.v[: len(guess)])
+            ahead = self._extrapolation.extrapolate(equations.t1, equations.t0, equations.v[: len(guess)])
             equations.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 

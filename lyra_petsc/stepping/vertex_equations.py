@@ -1,8 +1,8 @@
-"""The Jacobian of vertices alone, that the coarse levels of multigrid are made of where edges carry unknowns.
+"""A Jacobian for vertices only, for the coarse levels of multigrid where edges have unknowns, too.
 
-Eliminating the edges would couple vertices far apart. In its place stands the Jacobian of the same sheet with
-hinges: the eliminated one lies between 0.23 and 1.67 times it, on any mesh, and what is left the sweeps over
-all unknowns see.
+Elimination of the edges' unknowns would couple distant vertices. The Jacobian of the same sheet with hinges
+is used instead: the eliminated one lies between 0.23 and 1.67 times it, on any mesh. The smoother on all
+unknowns reduces the error of the difference.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from lyra_petsc.terms.term import Coupling, Elastic, Viscous
 
 
 class VertexEquations:
-    """Block rows of the vertices, those of edges empty.
+    """Block rows of a Jacobian for vertices; rows of edges are empty.
 
     Parameters
     ----------
     equations : StageEquations
-        With terms in ``coarse``.
+        Those of a scene with terms in ``active.coarse``.
 
     Attributes
     ----------
     pattern : BlockPattern
     turns : EdgeTurns
-        How edges follow vertices.
+        The edges' unknowns as functions of the vertices.
     """
 
     def __init__(self, equations: StageEquations) -> None:
@@ -49,7 +49,7 @@ class VertexEquations:
         self._hold(np.zeros((layout.n_local, 3), dtype=bool))
 
     def _hold(self, held: Mask) -> None:
-        """Keep what depends on the prescribed unknowns (n_local, 3): mostly they stay the same."""
+        """Set the data that depend on the prescribed unknowns ``held`` (n_local, 3)."""
         term = self._bent
         assert term.edges is not None
         self._held, self._constrained = held.copy(), self._rows.constrained_entries(held)
@@ -57,8 +57,9 @@ class VertexEquations:
         self.turns.hold(held)
 
     def values(self, held: Mask, memory: Array) -> Array:
-        """Block rows (n_blocks, 3, 3), in ``memory``, at the stage last evaluated; held (n_local, 3) are
-        decoupled.
+        """Block rows (n_blocks, 3, 3) at the stage last evaluated, stored in ``memory``.
+
+        Prescribed unknowns ``held`` (n_local, 3) are decoupled.
         """
         equations, rows = self._equations, self._rows
         (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.active
@@ -80,9 +81,10 @@ class VertexEquations:
         return values
 
     def _add_clamps(self, x: Array, values: Array) -> None:
-        """Where a director is held its triangles resist as hinges do: to their third corner, at its height.
+        """Add the bending stiffness of triangles at prescribed directors.
 
-        No hinge does at the border, and a clamped sheet would swing freely about its clamp.
+        It acts on the third corner, at its height over the edge. There are no hinges at the border, and
+        without this stiffness a clamped sheet would rotate freely about its clamp.
         """
         term, data = self._bent, self._bent.elements.data
         triangle, corner = self._clamped

@@ -86,7 +86,7 @@ def test_the_monitor_tells_of_contact_and_friction(comm: MPI.Comm, capfd: pytest
         columns = simulation.ledger.columns()
         touching.append((columns["contacts"], columns["smallest_gap"]))
         # the monitor's are those of the barrier
-        damped = comm.allreduce(float(simulation.problem.system.damped.force[:, 2].sum()))
+        damped = comm.allreduce(float(simulation.problem.system.contact_impulses.force[:, 2].sum()))
         weights.append(simulation.ledger.obstacle_forces(1)[0, 2] - damped)
     PETSc.Sys.syncFlush(comm)
     out = capfd.readouterr().out

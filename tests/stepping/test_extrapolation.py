@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from physics import Simulation, grid
 
-from lyra_petsc.stepping.extrapolation import Extrapolation, weights
+from lyra_petsc.stepping.extrapolation import Extrapolation, lagrange_weights
 
 TIMES = [0.0, 0.1, 0.25, 0.3, 0.42, 0.5]  # unequal steps, as before a state is written
 
@@ -22,7 +22,7 @@ def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
     guess = np.empty(0)
     extrapolation = Extrapolation(comm)
     for t0, t1 in pairwise(TIMES):
-        guess = extrapolation.to(t1, t0, motion(t0) * SHAPE)
+        guess = extrapolation.extrapolate(t1, t0, motion(t0) * SHAPE)
     return guess
 
 
@@ -35,11 +35,11 @@ def test_polynomials_are_gone_on_with(motion: Callable[[float], float], comm: MP
 @pytest.mark.parallel(2)
 def test_tangents_and_parabolas_are_gone_on_with(comm: MPI.Comm) -> None:
     extrapolation = Extrapolation(comm)
-    extrapolation.learn(0.0, SHAPE)
-    (tangent,) = extrapolation.along(0.5, 3.0 * SHAPE)
+    extrapolation.record(0.0, SHAPE)
+    (tangent,) = extrapolation.tangent_predictions(0.5, 3.0 * SHAPE)
     np.testing.assert_allclose(tangent, 1.5 * SHAPE)
-    extrapolation.learn(0.2, (1.0 + 0.2 - 4.0 * 0.04) * SHAPE)
-    tangent, parabola = extrapolation.along(0.5, (1.0 - 8.0 * 0.2) * SHAPE)
+    extrapolation.record(0.2, (1.0 + 0.2 - 4.0 * 0.04) * SHAPE)
+    tangent, parabola = extrapolation.tangent_predictions(0.5, (1.0 - 8.0 * 0.2) * SHAPE)
     np.testing.assert_allclose(tangent, -0.18 * SHAPE)
     np.testing.assert_allclose(parabola, (0.5 - 4.0 * 0.25 - 0.2 + 4.0 * 0.04) * SHAPE)
 
@@ -49,23 +49,23 @@ def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
     extrapolation, sign = Extrapolation(comm), 1.0
     for step in range(6):
         v = sign * SHAPE
-        guess = extrapolation.to(step + 1.0, float(step), v)
+        guess = extrapolation.extrapolate(step + 1.0, float(step), v)
         sign = -sign
     np.testing.assert_allclose(guess, v)
 
 
 def test_a_repeated_step_is_no_new_one() -> None:
     extrapolation = Extrapolation(MPI.COMM_SELF)
-    extrapolation.to(1.0, 0.0, 1.0 * SHAPE)
-    extrapolation.to(2.0, 1.0, 2.0 * SHAPE)
-    extrapolation.to(3.0, 2.0, 3.0 * SHAPE)
+    extrapolation.extrapolate(1.0, 0.0, 1.0 * SHAPE)
+    extrapolation.extrapolate(2.0, 1.0, 2.0 * SHAPE)
+    extrapolation.extrapolate(3.0, 2.0, 3.0 * SHAPE)
     for _ in range(2):
-        np.testing.assert_allclose(extrapolation.to(2.5, 2.0, 3.0 * SHAPE), 3.5 * SHAPE)
+        np.testing.assert_allclose(extrapolation.extrapolate(2.5, 2.0, 3.0 * SHAPE), 3.5 * SHAPE)
 
 
 def test_weights_are_one_at_their_own_time() -> None:
-    assert weights([0.0, 1.0, 3.0], 1.0) == [0.0, 1.0, 0.0]
-    assert sum(weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
+    assert lagrange_weights([0.0, 1.0, 3.0], 1.0) == [0.0, 1.0, 0.0]
+    assert sum(lagrange_weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
 
 
 @pytest.mark.parallel(2)
@@ -96,15 +96,15 @@ def test_a_resumed_run_expects_the_same() -> None:
     times = [0.0, 0.1, 0.25, 0.3, 0.5]
     whole = Extrapolation(MPI.COMM_SELF)
     for before, after in pairwise(times):
-        whole.to(after, before, curved(before))
-    whole.learn(0.5, curved(0.5))
+        whole.extrapolate(after, before, curved(before))
+    whole.record(0.5, curved(0.5))
     arrays, numbers = whole.memory()
     resumed = Extrapolation(MPI.COMM_SELF)
     resumed.restore(arrays, numbers, 0.5, curved(0.5))
     assert numbers["degree"] > 0
     for before, after in pairwise([0.5, 0.6, 0.75, 0.8]):
-        guess = whole.to(after, before, curved(before))
-        np.testing.assert_array_equal(resumed.to(after, before, curved(before)), guess)
+        guess = whole.extrapolate(after, before, curved(before))
+        np.testing.assert_array_equal(resumed.extrapolate(after, before, curved(before)), guess)
 
 
 def curved(t: float) -> np.ndarray:

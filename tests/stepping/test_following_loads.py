@@ -17,7 +17,7 @@ from lyra_petsc.experiments.verification.cases.shells import symmetric
 from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.following_loads import FollowingLoads, newton_way
+from lyra_petsc.stepping.following_loads import FollowingLoads, newton_displacement
 from lyra_petsc.terms.term import Load
 
 
@@ -114,9 +114,11 @@ def test_a_skew_stiffness_is_solved_with() -> None:
     def of_skew(way: Array) -> Array:
         return (skew @ way.ravel()).reshape(2, 3)
 
-    way = newton_way(force, lambda force: force / size.reshape(2, 3), of_skew, MPI.COMM_SELF)
+    way = newton_displacement(force, lambda force: force / size.reshape(2, 3), of_skew, MPI.COMM_SELF)
     assert way is not None
-    assert newton_way(force, lambda force: None, of_skew, MPI.COMM_SELF) is None  # there are no factors
+    assert (
+        newton_displacement(force, lambda force: None, of_skew, MPI.COMM_SELF) is None
+    )  # there are no factors
     np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
 
 

@@ -249,7 +249,7 @@ class Accountant:
     @property
     def _solved(self) -> Array:
         """Velocities (n_local, 3) [m/s] that the step's equations led to, before dashpots of impacts."""
-        return self._system.v if self._system.damped is None else self._system.evaluated[1]
+        return self._system.v if self._system.contact_impulses is None else self._system.evaluated[1]
 
     def _fit(self) -> None:
         """Give the positions in which the step began the ghosts that contact needs now; collective."""
@@ -273,9 +273,9 @@ class Accountant:
         free = ~system.prescribed.mask[:n]
         parts = self._parts(report, dv / dt)
         reaction = self._simulation.ledger.reaction
-        if system.damped is not None:  # after the equations were solved
+        if system.contact_impulses is not None:  # after the equations were solved
             at = system.prescribed.indices
-            reaction.put(at, reaction.take(at) - system.damped.held)
+            reaction.put(at, reaction.take(at) - system.contact_impulses.handle_force)
         weight = self._gravity(report)
         moved = dx[:n]
         outside = -parts["loads"] + reaction
