@@ -112,7 +112,7 @@ def test_what_nothing_resists_is_neutral(comm: MPI.Comm) -> None:
 
 
 def test_too_many_vertices_are_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lyra_petsc.stepping.stability.MOST_VERTICES", 10)
+    monkeypatch.setattr("lyra_petsc.stepping.stability.MAX_VERTICES", 10)
     with finished(comm, strip(0.5)) as simulation:
         assert simulation.stability["stable"] is None
         assert simulation.stability["negative_pivots"] is None
