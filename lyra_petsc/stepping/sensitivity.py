@@ -35,7 +35,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.energy_balance import Ledger
-from lyra_petsc.stepping.equilibrium import LONGEST
+from lyra_petsc.stepping.equilibrium import MAX_GROWTH
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -417,7 +417,7 @@ class Sensitivities:
             before.time, self.simulation.time, system.x[:n].copy(), [term.frames for term in _edged(system)]
         )
         pseudo = integrator.pseudo_dt
-        integrator.pseudo_dt = math.sqrt(LONGEST) * self._slowest()
+        integrator.pseudo_dt = math.sqrt(MAX_GROWTH) * self._slowest()
         system.begin_step(now.before, now.factor)
         reach = system.stage.c
         with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:

@@ -118,13 +118,13 @@ def test_a_leap_that_runs_out_of_iterations_is_gone_on_with(monkeypatch: pytest.
         "time": {"analysis": "static", "step": 0.1},
         "petsc": {"ts_adapt_dt_max": 0.1},
     }
-    solve = equilibrium.Equilibrium._solve
+    solve = equilibrium.Equilibrium._proximal_step
 
     def watched(self: equilibrium.Equilibrium, before: float, factor: float, most: int | None) -> Any:
         starts.append(self._system.x.copy())
         return solve(self, before, factor, most)
 
-    monkeypatch.setattr(equilibrium.Equilibrium, "_solve", watched)
+    monkeypatch.setattr(equilibrium.Equilibrium, "_proximal_step", watched)
     found = []
     for most in (equilibrium.LEAP_ITERATIONS, 3):
         starts.clear()

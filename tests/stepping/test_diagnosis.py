@@ -177,7 +177,7 @@ def test_a_velocity_that_is_not_finite_stops_the_run_in_words(comm: MPI.Comm) ->
 
 
 def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(equilibrium, "MOST_SOLVES", 2)
+    monkeypatch.setattr(equilibrium, "MAX_SOLVES", 2)
     with failing(comm, {"time": {"analysis": "static"}}) as (simulation, error, failure):
         assert "(load factor 0) did not converge even with an increment of" in str(error)
         assert "no equilibrium within 2 proximal steps" in str(error)

@@ -58,7 +58,7 @@ def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
 
 
 def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(equilibrium, "MOST_DESCENTS", 0)
+    monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     with finished(comm, strip(1.5)) as simulation:
         assert simulation.stability == {"stable": False, "negative_pivots": 1, "neutral_pivots": 0}
         assert "unstable" in simulation.notes[0]
@@ -66,7 +66,7 @@ def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: py
 
 
 def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(equilibrium, "MOST_DESCENTS", 0)
+    monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     counts = []
     for terms in (registry.REGISTRY, IN_PLACE_OF_HINGES):
         monkeypatch.setattr(registry, "REGISTRY", terms)
