@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 python scripts/bending_models.py [--case "CFFF 0"] [--runs 3] [--out FILE.svg]
 
-Prints a Markdown table of the relative error of the deflection against Kirchhoff's plate, and of the seconds
-of a whole static analysis, set-up included: the median of the runs. Draws the same as an SVG where --out
-names one. Kernels are compiled before; the linear solver is direct, as in ``verify plate``.
+Prints a Markdown table of the relative error of the deflection against Kirchhoff's plate theory, and of the
+wall time of the static analysis with set-up (median of the runs). With --out it also draws them as an SVG.
+Kernels are compiled before the measurement; the linear solver is direct, as in ``verify plate``.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from lyra_petsc.experiments.verification.verification_case import data
 from lyra_petsc.show.report.plots import Series, work_precision
 
 PLATES = data("linear_plate")["deflection"]
-"""By edges (C clamped, S supported, F free) and Poisson's ratio."""
+"""Reference deflections by edge conditions (C clamped, S supported, F free) and Poisson's ratio."""
 
 KINDS = ("alternating", "gmsh")
 SIZES = (8, 16, 32, 64, 128)
 THICKNESS = 0.01  # m, of a plate of 1 m
-STIFFNESS = 1.0  # N m
+STIFFNESS = 1.0  # bending stiffness [N m]
 DEFLECTION = 1e-6
-"""[m] so small that the plate is linear."""
+"""Scale of the deflection [m], small enough for linear behaviour."""
 
 
 def measure(bench: Bench, name: str, model: str, kind: str, n: int) -> tuple[float, float]:

@@ -1,16 +1,16 @@
-"""Questions about a Python environment that scripts/environment.sh asks of an interpreter.
+"""Helper of scripts/environment.sh that examines a Python environment.
 
 ``probe [DIR…]``
-    Does this interpreter, with DIR… added to its path, see petsc4py and mpi4py?  Prints one
-    fact a line: executable, Python version, petsc4py version, whose packages they are
-    (``distribution`` or ``environment``), then the folders that hold them.  Exit 3 when not.
+    Checks that this interpreter, with DIR… added to its path, finds petsc4py and mpi4py, and
+    prints one fact a line: executable, Python version, petsc4py version, the owner of the packages
+    (``distribution`` or ``environment``), then the folders that hold them.  Exit code 3 if not.
 ``missing PYPROJECT EXTRA…``
-    The requirements of the project and of the extras that this interpreter does not meet.
+    Prints the requirements of the project and of the extras that this interpreter does not meet.
 ``layer PYTHON_OF_VENV DIR…``
-    Makes the virtual environment see the packages in DIR… below its own and prints the
-    constraints under which pip leaves them alone (``constraints`` prints these of itself).
+    Makes the packages in DIR… visible in the virtual environment, below its own, and prints the
+    constraints with which pip does not replace them (``constraints`` prints those of this interpreter).
 
-Standard library only, and nothing newer than Python 3.8: it runs in whatever is there.
+Uses the standard library of Python 3.8 only, as it runs in any interpreter that is found.
 """
 
 import importlib.metadata
@@ -21,10 +21,10 @@ import subprocess
 import sys
 import sysconfig
 
-# what pip must never replace: builds that fit one MPI, one PETSc and one NumPy
+# packages that pip must not replace: they are built for one MPI, one PETSc and one NumPy
 PINNED = ("numpy", "mpi4py", "petsc4py", "h5py", "gmsh")
 
-# packages whose modules have other names (beside a dash, which becomes an underscore)
+# packages whose modules have other names (apart from a dash, which becomes an underscore)
 MODULES = {"pillow": "PIL", "usd-core": "pxr", "mkdocs-material": "material"}
 
 
@@ -44,7 +44,7 @@ def package_folders():
 
 
 def version_of(package):
-    """Installed version of ``package``, or ``None`` where it left no metadata."""
+    """Installed version of ``package``, or ``None`` without metadata."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -100,7 +100,7 @@ def is_met(line):
         return False
     present = version_of(name)
     if present is None:
-        # no metadata: Debian's h5py and gmsh; anything else is left of an installation cut short
+        # no metadata: Debian's h5py and gmsh; other packages are remains of an interrupted installation
         return name in PINNED
     return numbers(present) >= numbers(least)
 
@@ -112,7 +112,7 @@ def layer(python, folders):
     with open(os.path.join(site, "lyra-petsc-stack.pth"), "w", encoding="ascii") as file:
         for folder in folders:  # !a, as a .pth file is read in the locale's encoding
             file.write(f"import site; site.addsitedir({folder!a})\n")
-    # asked of the new environment, which sees the layers as pip will
+    # run in the new environment, which sees the layers as pip does
     sys.stdout.write(
         subprocess.check_output([python, "-IB", os.path.abspath(__file__), "constraints"], text=True)
     )

@@ -1,11 +1,11 @@
-"""How often 95 % intervals of ``fit`` hold the true numbers: fits of synthetic measurements with noise.
+"""Coverage of the 95 % intervals of ``fit``: fits of synthetic measurements with noise.
 
     python scripts/fit_coverage.py [SEEDS]
 
-A hanging cloth of 36 vertices in the wind, its positions at eight vertices and four times with noise of 1 %
-of the largest displacement; four numbers are sought from starts up to 20 % beside the true ones. For each
-number the script prints in how many of the seeds (100) the true one lies inside its interval: 89 to 100 of
-100 is what chance allows (96, 95, 93, 92 in a hundred seeds, two minutes). A test runs a few seeds.
+A hanging cloth of 36 vertices in the wind is measured at eight vertices and four times, with noise of 1 % of
+the largest displacement; four numbers are fitted from starts up to 20 % off. For each number the script
+prints how many of the seeds (100) give an interval with the true value: 89 to 100 of 100 are to be expected
+(96, 95, 93, 92 in a hundred seeds, two minutes). A test runs a few seeds.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ WATCHED = (7, 9, 14, 20, 21, 30, 33, 35)
 
 
 def scene(sigma: float) -> dict[str, Any]:
-    """The scene of the fits: a square held at two corners, and its block ``fit``, whose values are still 0.
+    """The scene of the fits, a square held at two corners; measured values are 0.
 
-    Starts and bounds are over the true values.
+    Starts and bounds are relative to the true values.
     """
     return {
         "mesh": {
@@ -72,44 +72,44 @@ def scene(sigma: float) -> dict[str, Any]:
 
 
 def measured(model: Model, exact: NDArray[np.float64], sigma: float, seed: int) -> list[NDArray[np.float64]]:
-    """Values with noise, of each of a model's readings."""
+    """Exact values with noise, separated by the model's readings."""
     lengths = np.cumsum([len(reading.parts) for reading in model.readings])[:-1]
     noise = np.random.default_rng(seed).standard_normal(len(exact))
     return np.split(exact + sigma * noise, lengths)
 
 
 def count(seeds: int, comm: MPI.Comm = MPI.COMM_WORLD) -> dict[str, int]:
-    """In how many of the seeds the interval of each number holds the true one; collective."""
+    """Number of seeds for which the interval of each number contains the true value; collective."""
     loaded = lyra_petsc.load(scene(1.0))
     assert loaded.fit is not None
     model = Model(comm, loaded, TRUE, readings_of(loaded, loaded.fit.measurements))
     exact = model.evaluate(list(TRUE.values()), derivatives=False).values
     start = model.mesh.positions if model.mesh is not None else np.zeros((0, 3))
-    places = comm.bcast(
+    initial = comm.bcast(
         np.concatenate([start[int(r.name[1:])] for r in model.readings] if len(start) else [])
     )
-    sigma = NOISE * float(np.linalg.norm((exact - places).reshape(-1, 3), axis=1).max())
+    sigma = NOISE * float(np.linalg.norm((exact - initial).reshape(-1, 3), axis=1).max())
     loaded = lyra_petsc.load(scene(sigma))
-    held = dict.fromkeys(TRUE, 0)
+    covered = dict.fromkeys(TRUE, 0)
     for seed in range(seeds):
         fitted = fit_scene(comm, loaded, measured=measured(model, exact, sigma, seed))
         for key, (low, high) in fitted.intervals.items():
-            held[key] += low <= TRUE[key] <= high
+            covered[key] += low <= TRUE[key] <= high
         if comm.rank == 0 and "pytest" not in sys.modules:
             estimates = ", ".join(
                 f"{e.key} {e.value:.4g} ± {e.deviation:.2g}" for e in fitted.conclusion.estimates
             )
             print(f"seed {seed}: {estimates}; {len(fitted.trials)} evaluations", flush=True)
-    return held
+    return covered
 
 
 def main() -> None:
     """Print the counts."""
     began, seeds = time.perf_counter(), int(sys.argv[1]) if len(sys.argv) > 1 else 100
-    held = count(seeds)
+    covered = count(seeds)
     if MPI.COMM_WORLD.rank == 0:
-        for key, number in held.items():
-            print(f"{key}: {number} of {seeds} intervals hold {TRUE[key]:g}")
+        for key, number in covered.items():
+            print(f"{key}: {number} of {seeds} intervals contain {TRUE[key]:g}")
         print(f"{time.perf_counter() - began:.0f} s")
 
 

@@ -1,10 +1,10 @@
-"""Fits the law ``measured`` to the strained rows of the cloths' tables, and writes what it finds beside them.
+"""Fits the law ``measured`` to the strained rows of the cloths' tables, and writes the results into their
+file.
 
 ``python scripts/fit_membranes.py`` (a second). The tables are read as ARCSim does: c11, c12 and c22 count
-twice, C is linear in the larger principal strain up to its strained row and in the angle
-of that strain between rows. Sampled are six strains up to the measured one, in the five measured directions,
-with none and with ±0.3 of it across. The error is the root mean square of the stress that is wrong, over that
-of the stress.
+twice, and C is interpolated linearly in the larger principal strain, up to the strained row, and in its angle
+between rows. The samples are six strains up to the measured one in the five measured directions, with 0 and
+±0.3 of that strain across. The error is the root mean square of the stress error over that of the stress.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ def stiffness(row: list[float]) -> Array:
 
 
 def samples(rest: Array, strained: list[list[float]]) -> tuple[Array, Array]:
-    """Strains e (n, 3) and the stress (n, 3) [N/m] that the tables give."""
+    """Strains e (n, 3) and the tables' stresses (n, 3) [N/m]."""
     found = []
     for (number, angle), strain, across in product(enumerate(ANGLES), STRAINS, ACROSS):
         one = 0.5 * ((1.0 + strain) ** 2 - 1.0)
         two, c, s = across * one, np.cos(angle), np.sin(angle)
         e = [one * c * c + two * s * s, one * s * s + two * c * c, 2.0 * (one - two) * c * s]
-        there = stiffness(strained[number])
-        part = strain / measured.MEASURED
-        found.append((e, ((1.0 - part) * rest + part * there) @ e))
+        fraction = strain / measured.MEASURED
+        c_at = (1.0 - fraction) * rest + fraction * stiffness(strained[number])
+        found.append((e, c_at @ e))
     e, stress = zip(*found, strict=True)
     return np.array(e), np.array(stress)
 
@@ -66,17 +66,17 @@ def slopes(e: Array) -> Array:
 
 
 def fitted(name: str, strained: list[list[float]]) -> dict[str, object]:
-    """What the file says of a cloth."""
+    """The file's entry of a cloth."""
     rest = at_rest(resolve_material(Material(cloth=name))[0])
     e, stress = samples(rest, strained)
-    size, left = np.linalg.norm(stress * NORM), (stress - e @ rest) * NORM
-    basis = (slopes(e) * NORM[:, None]).reshape(left.size, -1)
-    stiffening, error = nnls(basis, left.ravel())
+    size, remainder = np.linalg.norm(stress * NORM), (stress - e @ rest) * NORM
+    basis = (slopes(e) * NORM[:, None]).reshape(remainder.size, -1)
+    stiffening, error = nnls(basis, remainder.ravel())
     return {
         "strained": strained,
         "stiffening": [float(f"{a:.5g}") for a in stiffening],
         "error": float(f"{error / size:.3f}"),
-        "error_of_stvk": float(f"{np.linalg.norm(left) / size:.3f}"),
+        "error_of_stvk": float(f"{np.linalg.norm(remainder) / size:.3f}"),
     }
 
 

@@ -2,7 +2,7 @@
 
     python scripts/fuzz.py --cases 5000 --seed 1 --keep /tmp/failures
 
-Ends with exit code 1 if a case ended otherwise than docs/fuzzing.md allows; its files are then kept.
+Exit code 1 if a case ends in a way that docs/fuzzing.md does not allow; the files of such cases are kept.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     .venv/bin/python scripts/gallery.py [NAME…] [--runs FOLDER] [--ranks P]
 
-Runs that are in the folder of runs (runs/gallery) already are not repeated. Ends with an error if the gallery
-grows beyond 5 MB.
+Runs that exist in the folder of runs (runs/gallery) are not repeated. Ends with an error if the gallery is
+larger than 5 MB.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Entry:
     at : float
         Time of the picture [s].
     options : tuple of str
-        Of ``render``, for picture and film.
+        Options of ``render``, for picture and film.
     settings : tuple of str
-        ``--set`` of the run.
+        Values of ``--set`` for the run.
     speed : float
-        Simulated seconds in a second of the film.
+        Simulated seconds per second of the film.
     """
 
     at: float
@@ -74,7 +74,7 @@ def lyra(*words: str, ranks: int = 1) -> None:
 
 
 def make(name: str, entry: Entry, runs: Path, ranks: int) -> None:
-    """The picture and the film of one scene."""
+    """Make the picture and the film of one scene."""
     run = runs / name
     if not (run / "summary.json").exists():
         settings = [word for setting in entry.settings for word in ("--set", setting)]
@@ -86,7 +86,7 @@ def make(name: str, entry: Entry, runs: Path, ranks: int) -> None:
 
 
 def main() -> None:
-    """Make what was asked for, and say how large the gallery is."""
+    """Make the pictures and films, and print the size of the gallery."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

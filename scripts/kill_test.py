@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Kills runs at random moments, checks what they left, resumes them, and compares with an undisturbed run.
+"""Kills runs at random times, checks their files, resumes them, and compares with an uninterrupted run.
 
     python scripts/kill_test.py --kills 100 --ranks 2 --seed 1
 
-A run is killed several times and continued with --resume each time until it reaches its end; then the next
-one begins, with another integrator. What is killed is random too: one rank, all ranks or the launcher
-(SIGKILL); or the launcher is asked to stop and gives its ranks a second (SIGTERM, SIGINT). After every kill
-all processes must be gone within 20 s and every state in states.xdmf must be complete; at the end states,
-history, probes and reactions must be those of an uninterrupted run.
+A run is killed several times and continued with --resume until it reaches its end; then the next run begins,
+with another integrator. The target is random as well: one rank, all ranks or the launcher (SIGKILL), or the
+launcher gets a signal and gives its ranks a second to stop (SIGTERM, SIGINT). After every kill all processes
+must end within 20 s, and every state in states.xdmf must be complete; at the end states, history, probes and
+reactions must be those of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from lyra_petsc.api.mpirun import environment, find_launcher  # noqa: E402
 from lyra_petsc.output.read_run import StoredRun, read_table  # noqa: E402
 
 PATIENCE = 20.0
-"""Seconds within which the other ranks must be gone."""
+"""Seconds within which the other ranks must end."""
 
 SAME = 1e-9
 """Largest difference [m] between positions of two runs on the same ranks with a direct solver."""
@@ -57,7 +57,7 @@ output: {every: 0.02, checkpoint: {seconds: 0.05}, fields: [velocity], reactions
 probes: {middle: {nodes: [24]}}
 """
 
-WAYS = {
+INTEGRATORS = {
     "beuler": [],
     "bdf2": ["--set", "time.integrator=bdf2"],
     "alpha2, adaptive": ["--set", "time={end: 0.4, step: auto, tolerance: 0.02, integrator: alpha2}"],
@@ -68,8 +68,8 @@ DIRECT = ["-ksp_type", "preonly", "-pc_type", "lu"]
 TARGETS = ("one rank", "all ranks", "launcher", "launcher, SIGTERM", "launcher, SIGINT")
 
 
-class Wrong(Exception):
-    """A run has left something else than it must."""
+class WrongResult(Exception):
+    """A run has left wrong or incomplete files, or processes."""
 
 
 def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[bytes]:
@@ -115,12 +115,12 @@ def wait_random_time(
 
 
 def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: random.Random) -> bool:
-    """Kill; whether anything was still running."""
+    """Kill the target; returns whether the run was still going on."""
     victims = ranks_in(folder)
     if process.poll() is not None:
         return False
     if not target.startswith("launcher") and not victims:
-        target = "launcher"  # which has not started them yet
+        target = "launcher"  # it has not started its ranks yet
     number = {"launcher, SIGTERM": signal.SIGTERM, "launcher, SIGINT": signal.SIGINT}.get(
         target, signal.SIGKILL
     )
@@ -140,28 +140,28 @@ def wait_until_gone(process: subprocess.Popen[bytes], folder: Path) -> None:
     deadline = time.monotonic() + PATIENCE
     while process.poll() is None or ranks_in(folder):
         if time.monotonic() > deadline:
-            left = ranks_in(folder)
-            for victim in [*left, *([process.pid] if process.poll() is None else [])]:
+            remaining = ranks_in(folder)
+            for victim in [*remaining, *([process.pid] if process.poll() is None else [])]:
                 os.kill(victim, signal.SIGKILL)
-            raise Wrong(f"after {PATIENCE:g} s there are still ranks: {left}")
+            raise WrongResult(f"after {PATIENCE:g} s there are still ranks: {remaining}")
         time.sleep(0.02)
 
 
 def check_announced(out: Path) -> int:
-    """Read every state that ``states.xdmf`` announces as other programs would; their number."""
+    """Read every state listed in ``states.xdmf`` as other programs would; returns their number."""
     if not (out / "states.xdmf").exists():
         return 0
     try:
         times = announced(out)
     except AssertionError:
         traceback.print_exc()
-        raise Wrong("what states.xdmf announces is not whole") from None
+        raise WrongResult("states listed in states.xdmf are not complete") from None
     check_vtkhdf(out, times)
     return len(times)
 
 
 def check_vtkhdf(out: Path, times: list[float]) -> None:
-    """Check that VTK finds the same states, but perhaps the last ones, which come later."""
+    """Check that VTK finds the same states; the last ones may be missing, as they are written later."""
     path = out / "states.vtkhdf"
     found: list[float] = []
     if path.exists():
@@ -169,13 +169,13 @@ def check_vtkhdf(out: Path, times: list[float]) -> None:
             found = file["VTKHDF/Steps/Values"][()].tolist()
             for name in ("Points", "PointData/velocity", "PointData/rest"):
                 if not np.isfinite(file[f"VTKHDF/{name}"][()]).all():
-                    raise Wrong(f"{path.name}: {name} is not finite")
+                    raise WrongResult(f"{path.name}: {name} is not finite")
     if found != times[: len(found)] or len(times) - len(found) > 1 + 0.1 * len(times):
-        raise Wrong(f"{path.name} has the times {found}, not {times}")
+        raise WrongResult(f"{path.name} has the times {found}, not {times}")
 
 
 def table(path: Path) -> np.ndarray:
-    """The rows of a CSV file, without wall times."""
+    """The rows of a CSV file, without columns that vary between runs."""
     skipped = {"wall_seconds", "residual", "linear_iterations"}
     return np.column_stack([column for name, column in read_table(path).items() if name not in skipped])
 
@@ -187,22 +187,22 @@ def last_state(out: Path) -> tuple[float, np.ndarray]:
 
 def compare(out: Path, whole: Path) -> None:
     """Compare the resumed run with the uninterrupted one."""
-    left, right = last_state(out), last_state(whole)
-    if left[0] != right[0] or np.abs(left[1] - right[1]).max() > SAME:
-        raise Wrong(f"ends at t = {left[0]}, {np.abs(left[1] - right[1]).max():.3g} m off")
+    (time, x), (expected_time, expected_x) = last_state(out), last_state(whole)
+    if time != expected_time or np.abs(x - expected_x).max() > SAME:
+        raise WrongResult(f"ends at t = {time}, {np.abs(x - expected_x).max():.3g} m off")
     for name in ("history.csv", "probes.csv", "reactions.csv"):
         mine, other = table(out / name), table(whole / name)
         if mine.shape != other.shape or not np.array_equal(mine[:, 0], np.arange(len(mine))):
-            raise Wrong(f"{name}: steps {mine[:, 0].astype(int).tolist()}")
+            raise WrongResult(f"{name}: steps {mine[:, 0].astype(int).tolist()}")
         if not np.allclose(mine, other, rtol=1e-6, atol=1e-9):
-            raise Wrong(
+            raise WrongResult(
                 f"{name} differs in row {np.flatnonzero(~np.isclose(mine, other, 1e-6, 1e-9).all(1))[0]}"
             )
     if check_announced(out) != check_announced(whole):
-        raise Wrong("another number of states")
+        raise WrongResult("another number of states")
     clutter = [entry.name for entry in out.iterdir() if entry.suffix in (".part", ".lock")]
     if clutter:
-        raise Wrong(f"clutter: {clutter}")
+        raise WrongResult(f"clutter: {clutter}")
 
 
 def continue_options(out: Path) -> list[str]:
@@ -216,7 +216,7 @@ def run_to_end(arguments: list[str], folder: Path, ranks: int) -> float:
     began = time.monotonic()
     process = launch(arguments, folder, ranks)
     if process.wait(600) != 0:
-        raise Wrong((folder / "output.txt").read_text(errors="replace")[-2000:])
+        raise WrongResult((folder / "output.txt").read_text(errors="replace")[-2000:])
     return time.monotonic() - began
 
 
@@ -227,9 +227,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--folder", type=Path, help="where to work and to leave everything; else a temporary one"
-    )
+    parser.add_argument("--folder", type=Path, help="working folder, which is kept (default a temporary one)")
     asked = parser.parse_args()
     draw = random.Random(asked.seed)
     folder = (asked.folder or Path(tempfile.mkdtemp(prefix="kill_test-"))).resolve()
@@ -242,12 +240,13 @@ def main() -> int:
     finished, states = 0, 0
     try:
         while kills.total() < asked.kills:
-            way = list(WAYS)[finished % len(WAYS)]
-            words = [str(scene), *WAYS[way]]
-            if way not in whole:
+            integrator = list(INTEGRATORS)[finished % len(INTEGRATORS)]
+            words = [str(scene), *INTEGRATORS[integrator]]
+            if integrator not in whole:
                 straight = folder / f"whole-{len(whole)}"
-                whole[way] = straight, run_to_end([*words, "--out", straight.name], folder, asked.ranks)
-            straight, length = whole[way]
+                seconds = run_to_end([*words, "--out", straight.name], folder, asked.ranks)
+                whole[integrator] = straight, seconds
+            straight, length = whole[integrator]
             out = folder / f"killed-{finished}"
             while kills.total() < asked.kills:
                 target = draw.choice(TARGETS if asked.ranks > 1 else TARGETS[:1])
@@ -257,12 +256,12 @@ def main() -> int:
                 wait_until_gone(process, folder)
                 if not struck:
                     if process.returncode != 0:
-                        raise Wrong((folder / "output.txt").read_text(errors="replace")[-2000:])
+                        raise WrongResult((folder / "output.txt").read_text(errors="replace")[-2000:])
                     break
                 kills[target] += 1
                 states += check_announced(out)
                 print(
-                    f"{kills.total():4d}  {way:<18} {target:<18} rows {rows(out / 'history.csv'):4d}",
+                    f"{kills.total():4d}  {integrator:<18} {target:<18} rows {rows(out / 'history.csv'):4d}",
                     flush=True,
                 )
             else:
@@ -270,7 +269,7 @@ def main() -> int:
             compare(out, straight)
             finished += 1
             shutil.rmtree(out)
-    except Wrong as error:
+    except WrongResult as error:
         print(f"FAILED after {kills.total()} kills in {folder}: {error}")
         return 1
     listed = ", ".join(f"{name} {count}" for name, count in sorted(kills.items()))

@@ -18,8 +18,8 @@ esac
 for argument in "$@"; do
     [[ $argument != --live ]] || extras+=(view)
 done
-# a rank that waits gives its core away only where there are more ranks than cores: beside other programs, which
-# take what is given, a run would hardly get on (read by Open MPI; nproc takes OpenMP's variables for cores)
+# waiting ranks yield their core only if there are more ranks than cores: otherwise other busy programs would take
+# nearly all of the time (the variable is read by Open MPI; nproc would take OpenMP's variables for cores)
 crowded=0
 ((ranks <= $(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc))) || crowded=1
 export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-$crowded}

@@ -1,9 +1,10 @@
-"""Single-point changes of the program that tests must notice: python scripts/mutate.py [--list] [WORD...]
+"""Mutation tests, single changes of the program that tests must notice: python scripts/mutate.py [--list]
+[WORD...]
 
-Each change is made in a temporary copy of the tree, and its tests must fail there, each of them; unchanged
-they must pass. WORDs choose the changes whose file or text contains one of them. A test that begins with
-``2@`` runs on two ranks, by the launcher in $MPIRUN (``mpirun``). Not part of CI: all of it takes a quarter
-of an hour. Exit code 1 if a change goes unnoticed, 2 if its old text is not found once.
+Each change is made in a temporary copy of the tree, where each of its tests must fail; without the change
+they must pass. WORDs select the changes whose file, text or tests contain one of them. A test that begins
+with ``2@`` runs on two ranks, by the launcher in $MPIRUN (``mpirun``). Not part of CI, as all changes take a
+quarter of an hour. Exit code 1 if a change goes unnoticed, 2 if its old text does not occur exactly once.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parent.parent
 
-LEFT_OUT = shutil.ignore_patterns(
+NOT_COPIED = shutil.ignore_patterns(
     ".git", ".venv*", "runs", "*.gif", ".pytest_cache", ".mypy_cache", ".ruff_cache"
 )
 
-LONGEST = 600.0
-"""Seconds after which a test that a change lets hang has noticed it."""
+TIMEOUT = 600.0
+"""Seconds after which a test counts as failed, as the change may make it hang."""
 
 FAILED, PASSED = 1, 0
 """Exit codes of pytest."""
 
 
 class Change(NamedTuple):
-    """One change of ``mutations.yaml``, and the tests each of which must fail by it."""
+    """One change of ``mutations.yaml``, and the tests that must fail with it."""
 
     file: str
     old: str
@@ -49,7 +50,7 @@ CHANGES = [
 
 
 def main() -> int:
-    """Exit code."""
+    """Run the chosen changes; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("words", nargs="*", metavar="WORD")
     parser.add_argument("--list", action="store_true", help="name the changes, and make none")
@@ -63,7 +64,7 @@ def main() -> int:
         return 2 if lost else 0
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
-        shutil.copytree(ROOT, tree, ignore=LEFT_OUT, symlinks=True)
+        shutil.copytree(ROOT, tree, ignore=NOT_COPIED, symlinks=True)
         tests = {test for change in chosen for test in change.tests}
         alone = sorted(test for test in tests if "@" not in test)
         if not all(
@@ -85,7 +86,7 @@ def _line(change: Change) -> str:
 
 
 def _noticed(tree: Path, change: Change) -> bool:
-    """Whether all tests of a change fail by it in a copy of the tree, which is then as before."""
+    """Whether all tests of a change fail with it in a copy of the tree, which is then restored."""
     file = tree / change.file
     text, times = file.read_text("utf-8"), file.stat()
     file.write_text(text.replace(change.old, change.new), "utf-8")
@@ -93,7 +94,7 @@ def _noticed(tree: Path, change: Change) -> bool:
         passed = [test for test in change.tests if _run(tree, test) != FAILED]
     finally:
         file.write_text(text, "utf-8")
-        os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))  # compiled kernels are of this time
+        os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))  # cached kernels depend on the time
     print(
         f"{'UNNOTICED' if passed else 'noticed'}  {change.file}: {_line(change)}  {passed or ''}", flush=True
     )
@@ -101,7 +102,7 @@ def _noticed(tree: Path, change: Change) -> bool:
 
 
 def _run(tree: Path, *tests: str) -> int:
-    """Exit code of pytest; all tests are for one number of ranks."""
+    """Run tests, all on the same number of ranks; returns pytest's exit code."""
     ranks = tests[0].rpartition("@")[0]
     names = [test.rpartition("@")[2] for test in tests]
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *names]
@@ -111,10 +112,10 @@ def _run(tree: Path, *tests: str) -> int:
     path = [str(tree), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
     try:
-        done = subprocess.run(command, cwd=tree, capture_output=True, timeout=LONGEST, env=environment)
+        done = subprocess.run(command, cwd=tree, capture_output=True, timeout=TIMEOUT, env=environment)
     except subprocess.TimeoutExpired:
         return FAILED if len(tests) == 1 else -1
-    # also a Python without pytest ends with 1
+    # Python without pytest ends with exit code 1 as well
     return done.returncode if done.returncode != FAILED or b" failed" in done.stdout else -1
 
 

@@ -1,10 +1,10 @@
-"""Counts Newton iterations of published shells in fifteen load steps.
+"""Counts Newton iterations of published shell problems in fifteen load steps.
 
     python scripts/newton_of_shells.py [NAME[:CELLS,CELLS…]] …
 
-NAME is annulus, hemisphere, open-cylinder, half-cylinder, diaphragms or channel; without names all of them.
-The table has the cells along a side (of the channel: across a flange), Newton and linear iterations, CPU time
-[s] and the longest way of a vertex [m]. All but the annulus are meshes of pattern `alternating`.
+NAME is annulus, hemisphere, open-cylinder, half-cylinder, diaphragms or channel (default all). The table has
+the cells along a side (of the channel: across a flange), Newton and linear iterations, CPU time [s] and the
+largest displacement of a vertex [m]. All meshes but that of the annulus have the pattern `alternating`.
 
 Sources of the shells: Sze, Liu & Lo, Finite Elements in Analysis and Design 40 (2004) 1551-1569; of the
 channel Chroscielewski, Makowski & Stumpf, Int. J. Numer. Meth. Engng 35 (1992) 63-94, with a load beyond its
@@ -37,7 +37,7 @@ LOAD_STEPS = 15
 
 
 def _part_of_cylinder(bench: Bench, cells: tuple[int, int], radius: float, length: float) -> dict[str, Any]:
-    """The mesh of a quarter of its circumference, from the crown (x = 0) on."""
+    """Mesh of a quarter of the circumference, from the crown (x = 0) on."""
     flat, faces = rectangle(*cells, 1.0, 1.0, alternating=True)
     vertices = np.column_stack(cylinder(radius, 0.5 * math.pi, length)(flat[:, 0], flat[:, 1]))
     return bench.mesh(vertices, faces)
@@ -49,7 +49,7 @@ def annulus(bench: Bench, n: int) -> dict[str, Any]:
 
 
 def hemisphere(bench: Bench, n: int) -> dict[str, Any]:
-    """With a hole of 18 degrees, pulled and pushed with 400 N at its edge; a quarter."""
+    """Hemisphere with a hole of 18 degrees, pulled and pushed with 400 N at its edge; a quarter of it."""
     flat, faces = rectangle(n, n, 1.0, 1.0, alternating=True)
     along, up = 0.5 * math.pi * flat[:, 0], math.radians(72.0) * flat[:, 1]
     vertices = 10.0 * np.column_stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.sin(up)])
@@ -62,12 +62,12 @@ def hemisphere(bench: Bench, n: int) -> dict[str, Any]:
 
 
 def open_cylinder(bench: Bench, n: int) -> dict[str, Any]:
-    """Pulled apart in the middle with 40 kN; an eighth."""
+    """Open cylinder pulled apart in the middle with 40 kN; an eighth of it."""
     return open_cylinder_scene(bench, n, "alternating")[0]
 
 
 def half_cylinder(bench: Bench, n: int) -> dict[str, Any]:
-    """Clamped at one end, pinched at the other with 2 kN; a half."""
+    """Half cylinder clamped at one end, pinched at the other with 2 kN; a half of it."""
     radius, length = 1.016, 3.048
     mesh = _part_of_cylinder(bench, (n, round(n * length / (0.5 * math.pi * radius))), radius, length)
     return scene(
@@ -79,7 +79,7 @@ def half_cylinder(bench: Bench, n: int) -> dict[str, Any]:
 
 
 def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
-    """Cylinder between rigid diaphragms, pinched in the middle with 12 kN; an eighth."""
+    """Cylinder between rigid diaphragms, pinched in the middle with 12 kN; an eighth of it."""
     mesh = _part_of_cylinder(bench, (n, n), 100.0, 100.0)
     return scene(
         mesh,
@@ -90,7 +90,7 @@ def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
 
 
 def channel(bench: Bench, n: int) -> dict[str, Any]:
-    """Thin cantilever that 150 N at a corner of its free end twist until it snaps."""
+    """Thin cantilever, twisted by 150 N at a corner of its free end until it snaps through."""
     length, flange, web = 36.0, 2.0, 6.0
     flat, faces = rectangle(
         round(0.5 * n * length / flange), 5 * n, length, 2.0 * flange + web, alternating=True
@@ -119,13 +119,14 @@ SHELLS: dict[str, tuple[Callable[[Bench, int], dict[str, Any]], tuple[int, ...]]
 
 def main(arguments: list[str]) -> None:
     bench, step = Bench(MPI.COMM_WORLD, direct=False), 1.0 / LOAD_STEPS
-    print("| shell | cells | Newton | linear | CPU [s] | way [m] |\n| --- | --- | --- | --- | --- | --- |")
+    heads = ["shell", "cells", "Newton", "linear", "CPU [s]", "displacement [m]"]
+    print("| " + " | ".join(heads) + " |\n" + "| --- " * len(heads) + "|")
     for argument in arguments or SHELLS:
         name, _, sizes = argument.partition(":")
         if name not in SHELLS:
             sys.exit(f"no such shell '{name}'; there are {', '.join(SHELLS)}")
-        make, usual = SHELLS[name]
-        for n in map(int, sizes.split(",")) if sizes else usual:
+        make, default_sizes = SHELLS[name]
+        for n in map(int, sizes.split(",")) if sizes else default_sizes:
             content = make(bench, n) | {
                 "gravity": [0, 0, 0],
                 "time": STATIC | {"step": step},
@@ -136,12 +137,12 @@ def main(arguments: list[str]) -> None:
             with bench.simulation(content) as trial:
                 first = trial.x
                 while not trial.simulation.finished:
-                    taken = trial.step()
-                    newton += taken.newton_iterations
-                    linear += taken.linear_iterations
-                way = float(np.linalg.norm(trial.x - first, axis=1).max())
-            spent = time.process_time() - begin
-            print(f"| {name} | {n} | {newton} | {linear} | {spent:.1f} | {way:.3f} |", flush=True)
+                    report = trial.step()
+                    newton += report.newton_iterations
+                    linear += report.linear_iterations
+                largest = float(np.linalg.norm(trial.x - first, axis=1).max())
+            seconds = time.process_time() - begin
+            print(f"| {name} | {n} | {newton} | {linear} | {seconds:.1f} | {largest:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@
 Runs configs/paper.yaml to t = 0.48 s with each setting and compares its kinetic energy with the ensemble of
 tests/reference/paper.json: root mean square over the twelve reference times, relative to its largest mean.
 
-The scene is chaotic; the last row says how far single correct calculations are apart, and errors below that
-are not resolved. CPU time is user + system of the steps alone, the median of the repeats. Try ``-mat_type
-sbaij -pc_type cholesky`` beside the default: at 256 vertices factors win while Δt is large.
+The scene is chaotic; the last row is the standard deviation between correct calculations, and errors below it
+are not resolved. CPU time is user + system of the steps alone, the median of the repeats. Compare the default
+with ``-mat_type sbaij -pc_type cholesky``: at 256 vertices factorisation is faster for large Δt.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def rms(differences: Any) -> float:
 
 
 def run(setting: str) -> dict[str, Any]:
-    """One calculation; its error is NaN where it ended early."""
+    """Run one calculation; its error is NaN if it ended early."""
     integrator, _, step = setting.partition(":")
     scene = load_scene(
         ROOT / "configs" / "paper.yaml", (f"time.integrator={integrator}", f"time.step={float(step):.12f}")

@@ -3,8 +3,8 @@
     .venv/bin/python scripts/reef_knot.py
 
 The first strip is a bight; the second comes up through it, goes over one of its legs, under both, over the
-other, and down through it again. Each follows a smooth curve, across which it lies so that it is bent rather
-than stretched and twisted as little as possible.
+other, and down through it again. Each follows a smooth curve; its width is directed so that the strip is bent
+rather than stretched, and twisted as little as possible.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.meshes import resample_polyline
 
 FILE = Path(__file__).resolve().parent.parent / "meshes" / "reef-knot.obj"
-UNIT = 0.05  # m, of the points below
-EDGE, CELLS = 0.01, 3  # m, and cells across a strip
+UNIT = 0.05  # m, unit of the points below
+EDGE, CELLS = 0.01, 3  # edge length [m], and number of cells across a strip
 
 BIGHT = [[-5, 1, 0], [-3, 1, 0], [-1, 1, 0], [1, 1, 0], [2.2, 0.7, 0], [2.6, 0, 0]]
 AROUND = [[5, 0.6, 0], [3.5, 0.6, -0.4], [2.4, 0.5, -0.9], [1.2, 0.5, 0], [0.2, 0.9, 0.9], [-0.7, 1.6, 0.7]]
@@ -26,13 +26,13 @@ AROUND += [[-1.2, 1.6, -0.5], [-1.4, 0.8, -0.9], [-1.4, 0, -0.9]]
 
 
 def mirrored(half: list[list[float]]) -> Array:
-    """The whole way of a strip: its first half, and this turned over to the other side of the xz plane."""
+    """The whole curve of a strip: its first half, and the mirror image of this about the xz plane."""
     points = np.array(half, dtype=np.float64)
     return np.concatenate([points, points[-2::-1] * [1, -1, 1]])
 
 
 def smooth(points: Array) -> tuple[Array, float]:
-    """A curve near a polygon's corners, at about the distance of an edge, and that distance [m]."""
+    """A smooth curve near a polygon's corners, sampled at about the edge length, and its spacing [m]."""
     fine = resample_polyline(points * UNIT, 400)
     for _ in range(250):
         fine[1:-1] += 0.25 * (fine[2:] - 2.0 * fine[1:-1] + fine[:-2])
@@ -41,37 +41,35 @@ def smooth(points: Array) -> tuple[Array, float]:
     return resample_polyline(fine, n + 1), length / n
 
 
-def across(curve: Array) -> Array:
-    """Unit vectors (n, 3) across a strip along a curve: at right angles to it and to its curvature, where it
-    has any, and turning little.
-    """
+def width_directions(curve: Array) -> Array:
+    """Unit vectors (n, 3) across a strip: normal to the curve, nearly to its curvature, with little twist."""
     along = np.gradient(curve, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     bend = np.gradient(along, axis=0)
     binormal = np.cross(along, bend)
-    # the direction whose square is most like the binormals' nearby: these may change their sign
-    wanted = binormal[:, :, None] * binormal[:, None, :] / (np.sum(bend**2, axis=1) + 1e-9)[:, None, None]
-    wanted += 0.02 * np.eye(3)
+    # dyadic products are averaged, as the binormals may change their sign
+    tensor = binormal[:, :, None] * binormal[:, None, :] / (np.sum(bend**2, axis=1) + 1e-9)[:, None, None]
+    tensor += 0.02 * np.eye(3)
     for _ in range(60):
-        wanted[1:-1] += 0.25 * (wanted[2:] - 2.0 * wanted[1:-1] + wanted[:-2])
-        wanted[0], wanted[-1] = wanted[1], wanted[-2]
+        tensor[1:-1] += 0.25 * (tensor[2:] - 2.0 * tensor[1:-1] + tensor[:-2])
+        tensor[0], tensor[-1] = tensor[1], tensor[-2]
     plane = np.eye(3) - along[:, :, None] * along[:, None, :]
-    found = np.linalg.eigh(plane @ wanted @ plane)[1][:, :, 2]
+    found = np.linalg.eigh(plane @ tensor @ plane)[1][:, :, 2]
     for i in range(1, len(found)):
         found[i] *= np.sign(found[i] @ found[i - 1])
     return found
 
 
-def strip(points: Array, name: str, first: int, beside: float) -> list[str]:
-    """Lines of an .obj file: vertices from number ``first`` on, material coordinates from y = ``beside`` [m],
-    and quads; those at both ends are groups.
+def strip(points: Array, name: str, first: int, offset: float) -> list[str]:
+    """Lines of an .obj file: vertices with numbers from ``first`` on, material coordinates about y =
+    ``offset`` [m], and quads; those at each end are a group.
     """
     curve, edge = smooth(points)
-    sideways, n = across(curve), len(curve)
+    across, n = width_directions(curve), len(curve)
     lines, rows = [], np.arange(CELLS + 1) - 0.5 * CELLS
     for i in range(n):
-        lines += ["v {:.6f} {:.6f} {:.6f}".format(*(curve[i] + EDGE * row * sideways[i])) for row in rows]
-        lines += [f"vt {edge * i:.6f} {beside + EDGE * row:.6f}" for row in rows]
+        lines += ["v {:.6f} {:.6f} {:.6f}".format(*(curve[i] + EDGE * row * across[i])) for row in rows]
+        lines += [f"vt {edge * i:.6f} {offset + EDGE * row:.6f}" for row in rows]
     for group, begin, end in ((name, 1, n - 2), (f"{name}-start", 0, 1), (f"{name}-end", n - 2, n - 1)):
         lines.append(f"g {group}")
         for i in range(begin, end):

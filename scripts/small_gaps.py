@@ -1,11 +1,10 @@
-"""Counts Newton iterations where sheets fall on what is round or has edges, with small gaps.
+"""Counts Newton iterations of sheets that fall onto round or edged obstacles with small gaps.
 
     python scripts/small_gaps.py [NAME] …
 
-NAME is one of the scenes, without names all of them: 24 × 24 cells of gray interlock, 1 m wide. The table has
-steps, how many were repeated, Newton iterations of accepted steps (median, most) and of all attempts, linear
-iterations, and CPU time [s]: with the linear model that has the barrier's law
-(`stepping/contact_model.py`), and without it.
+NAME is one of the scenes (default all): 24 × 24 cells of gray interlock, 1 m wide. The table has steps,
+repeated steps, Newton iterations of accepted steps (median, maximum) and of all attempts, linear iterations,
+and CPU time [s], each with and without the contact model of the line search (`stepping/contact_model.py`).
 """
 
 from __future__ import annotations
@@ -58,28 +57,28 @@ def scene(name: str) -> Scene:
 
 
 def count(name: str) -> list[Any]:
-    """The numbers of a row."""
+    """Run a scene; returns the numbers of its row."""
     simulation = SteppedScene(MPI.COMM_WORLD, scene(name))
     begin, newton, linear, repeated, attempts = time.process_time(), [], 0, 0, 0
     attempt = simulation.stepper.attempt
 
     def counted(t0: float, t1: float) -> Any:
         nonlocal attempts
-        tried = attempt(t0, t1)
-        attempts += tried.newton_iterations
-        newton[-1:] = [tried.newton_iterations]
-        return tried
+        result = attempt(t0, t1)
+        attempts += result.newton_iterations
+        newton[-1:] = [result.newton_iterations]
+        return result
 
     simulation.stepper.attempt = counted  # type: ignore[method-assign]
     while not simulation.finished:
         newton.append(0)
-        taken = simulation.step()
-        linear += taken.linear_iterations
-        repeated += taken.rejected
-    spent = time.process_time() - begin
+        report = simulation.step()
+        linear += report.linear_iterations
+        repeated += report.rejected
+    seconds = time.process_time() - begin
     for option in simulation.stepper.our_options:
         PETSc.Options().delValue(option)
-    return [len(newton), repeated, statistics.median(newton), max(newton), attempts, linear, f"{spent:.1f}"]
+    return [len(newton), repeated, statistics.median(newton), max(newton), attempts, linear, f"{seconds:.1f}"]
 
 
 def main(names: list[str]) -> None:
@@ -90,8 +89,8 @@ def main(names: list[str]) -> None:
         if name not in SCENES:
             sys.exit(f"no such scene '{name}'; there are {', '.join(SCENES)}")
         for model in ("yes", "no"):
-            changed = improve if model == "yes" else lambda *_: False
-            ContactModel.improve = changed  # type: ignore[method-assign,assignment]
+            chosen = improve if model == "yes" else lambda *_: False
+            ContactModel.improve = chosen  # type: ignore[method-assign,assignment]
             print("|", " | ".join(map(str, [name, model, *count(name)])), "|", flush=True)
 
 

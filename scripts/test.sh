@@ -3,10 +3,9 @@
 #
 #   bash scripts/test.sh [--quick] [pytest arguments]
 #
-# First all tests in two processes a core (at most four), as many of them wait for programs that they started,
-# then those marked `parallel` under mpirun on two and on three ranks. With --quick only those marked `quick`, on one and two ranks: some
-# of each kind, within a minute. The tests of a file that is named run in one process, and so does everything
-# with -s or -n 0.
+# First all tests, in two processes a core (at most four), as many tests wait for other programs; then those marked
+# `parallel`, under mpirun on two and on three ranks. With --quick only tests marked `quick` run, on one and two
+# ranks: some of each kind, within a minute. With -s, -n 0 or the name of a file all tests run in one process.
 # The last line is pytest's closing line of the first part, the exit code that of the first failure.
 set -euo pipefail
 
@@ -41,8 +40,8 @@ trap 'rm -rf -- "$logs"' EXIT
 trap 'exit 130' INT
 export LYRA_TEST_LOGS=$logs PYTEST_XDIST_AUTO_NUM_WORKERS=$workers
 
-# Rank 0 speaks, the others write to a file that is shown when something fails. Each has a cache of
-# its own, as --last-failed must not select different tests on different ranks.
+# Rank 0 prints, the others write to a file that is shown if a test fails. Each rank has its own cache, as
+# --last-failed must not select different tests on different ranks.
 one_rank='rank=${OMPI_COMM_WORLD_RANK:-${PMIX_RANK:-${PMI_RANK:-${SLURM_PROCID:-0}}}}
 set -- "$@" -o cache_dir="$LYRA_TEST_LOGS/cache-$rank"
 if [ "$rank" = 0 ]; then "$@"; else "$@" >"$LYRA_TEST_LOGS/rank-$rank" 2>&1; fi
@@ -50,7 +49,7 @@ code=$?
 if [ $code = 5 ]; then exit 0; fi # none of the selected tests need be a parallel one
 exit $code'
 
-limit=() # ranks that wait for each other for ever must not hold up everything
+limit=() # ends ranks that deadlock
 ! command -v timeout >/dev/null || limit=(timeout --foreground --kill-after=10 "${LYRA_TEST_TIMEOUT:-1500}")
 
 # the terminal is behind a pipe here, and mpirun pretends to be one
@@ -86,7 +85,7 @@ run_part() {
     parts=("$ranks" "${parts[@]}")
     selection=$(printf ' and %s' "${wanted[@]}" "${marks[@]}")
     say "tests on $ranks rank(s)"
-    # an interrupt must leave tee there for what pytest says of it
+    # tee must survive an interrupt, to show pytest's output about it
     "${command[@]}" "${files[@]}" "${arguments[@]}" -m "${selection# and }" 2>&1 |
         tee -i "$logs/part-$ranks" || result=${PIPESTATUS[0]}
     if ((result != 0 && ranks > 1)); then
@@ -103,7 +102,7 @@ run_part() {
 
 for ranks in "${counts[@]}"; do run_part "$ranks"; done
 
-# pytest's "=== 12 passed in 3.45s ===", or else the last that it said
+# pytest's "=== 12 passed in 3.45s ===", else its last line
 for ranks in "${parts[@]}"; do
     say "tests on $ranks rank(s) closed with"
     sed 's/\x1b\[[0-9;]*m//g' "$logs/part-$ranks" | tr -d '\r' >"$logs/plain"

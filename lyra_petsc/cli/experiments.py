@@ -1,4 +1,4 @@
-"""``verify`` and ``stress``, and what ``study`` shares with them: signals, the command that repeats them."""
+"""The verbs ``verify``, ``stress`` and ``fabric``, and functions shared with ``study`` and ``fit``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rich.text import Text
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.progress import duration
-from lyra_petsc.cli.run import tell_unused
+from lyra_petsc.cli.run import warn_unused
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import OUTCOME_FILE, Case, Launcher, Outcome, count_passed, save_record
@@ -26,19 +26,19 @@ from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
 
 FAILED = 1
-"""Exit code when a verdict failed."""
+"""Exit code if a verdict failed."""
 
 FOLDER = Path("stress")
-"""Where results of ``stress`` go unless ``--out`` says otherwise."""
+"""Folder of the results of ``stress`` without ``--out``."""
 
-WIDTH = 150
-"""Columns of the terminal at least, so that numbers are never cut."""
+MIN_WIDTH = 150
+"""Smallest number of columns of the output, so that numbers are never cut."""
 
 
-def watched(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]:
+def stop_check(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]:
     """A function to call before every step; it raises `Interrupted` on all ranks after a signal.
 
-    ``kept`` gives the words after the signal's name: what has been done, and how to go on.
+    ``kept`` returns the end of the message: which results are kept, and how to resume.
     """
     stop = StopRequest(comm)
 
@@ -49,38 +49,38 @@ def watched(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]
     return watch
 
 
-def petsc_words() -> list[str]:
-    """PETSc's options of the command line."""
+def petsc_arguments() -> list[str]:
+    """PETSc options of the command line."""
     return split(sys.argv[1:])[1]
 
 
 def command(comm: MPI.Comm, verb: str, words: Sequence[str]) -> list[str]:
     """The command line that repeats a verb."""
     launcher = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
-    return [*launcher, "python", "-m", "lyra_petsc", verb, *words, *petsc_words()]
+    return [*launcher, "python", "-m", "lyra_petsc", verb, *words, *petsc_arguments()]
 
 
-def words_of(options: Mapping[str, Any]) -> list[str]:
-    """Options as typed: repeated for each of several values, left out where they have no value."""
-    words = []
-    for name, given in options.items():
-        for value in given if isinstance(given, tuple | list) else [given]:
+def to_arguments(options: Mapping[str, Any]) -> list[str]:
+    """Options as arguments: repeated for each of several values, omitted without a value."""
+    arguments = []
+    for name, values in options.items():
+        for value in values if isinstance(values, tuple | list) else [values]:
             if value not in (None, "", False):
-                words += [name] if value is True else [name, str(value)]
-    return words
+                arguments += [name] if value is True else [name, str(value)]
+    return arguments
 
 
 def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | None:
-    """What starts an mpirun for each case with ``--ranks``; collective.
+    """Launcher that starts an mpirun for each case; None without ``--ranks``; collective.
 
     Raises
     ------
     InputError
-        Where that cannot be.
+        If no launcher can be used.
     """
     if ranks is None:
         return None
-    return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_words())
+    return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_arguments())
 
 
 class Terminal(CaseObserver[Any, Any]):
@@ -91,38 +91,38 @@ class Terminal(CaseObserver[Any, Any]):
     comm : MPI.Comm
     view : View
     count, known : int
-        Cases to come, and cases that there are.
+        Numbers of cases to run, and of all existing cases.
     """
 
     def __init__(self, comm: MPI.Comm, view: View[Any], count: int, known: int) -> None:
-        self._speaks, self._view, self._count, self._done = comm.rank == 0, view, count, 0
-        self._console = Console(width=max(WIDTH, Console().width), highlight=False, soft_wrap=True)
+        self._shown, self._view, self._count, self._done = comm.rank == 0, view, count, 0
+        self._console = Console(width=max(MIN_WIDTH, Console().width), highlight=False, soft_wrap=True)
         self.print(f"{count}{f' of {known}' if known != count else ''} cases")
         if heading := view.heading():
             self.print(heading, "bold")
 
     def print(self, text: str = "", style: str = "") -> None:
-        """A line."""
-        if self._speaks:
+        """Print a line."""
+        if self._shown:
             self._console.print(Text(text, style=style))
 
     def begin(self, case: Case) -> None:
-        """A case begins: a line on a terminal, until the case has ended."""
+        """Show the name of a case that begins, on a terminal."""
         self._done += 1
-        if self._speaks and sys.stderr.isatty():
+        if self._shown and sys.stderr.isatty():
             print(f"{self._done} of {self._count}: {case.name} …", file=sys.stderr, end="\r", flush=True)
 
     def end(self, outcome: Outcome[Any]) -> None:
-        """A case has ended."""
-        if self._speaks and sys.stderr.isatty():
+        """Print the result of a case that has ended."""
+        if self._shown and sys.stderr.isatty():
             print("\x1b[2K", file=sys.stderr, end="\r", flush=True)
         for line in self._view.terminal_lines(outcome):
             self.print(*line)
 
     def close(self, results: Results[Any], note: str) -> None:
-        """The end: a table, what passed, where results are, what is missing, options that nothing used."""
+        """Print the summary table, the verdict, the folder of the results, a note and unused options."""
         outcomes, table = results.outcomes, self._view.summary_table(results.outcomes)
-        if self._view.heading():  # the lines of the cases are a table, too
+        if self._view.heading():  # an empty line between the table of the cases and the summary
             self.print()
         for line in align_columns(table, len(table[0]) - 1):
             self.print(line)
@@ -132,21 +132,21 @@ class Terminal(CaseObserver[Any, Any]):
             self.print(f"results: {results.folder}")
         if note:
             self.print(f"note: {note}")
-        if self._speaks:
-            tell_unused([])
+        if self._shown:
+            warn_unused([])
 
 
 def verify(
     comm: MPI.Comm, names: Sequence[str], *, quick: bool, listed: bool, out: Path | None, force: bool
 ) -> int:
-    """Run cases of ``verify`` (all of them without names) or list them; the exit code; collective.
+    """Run cases of ``verify`` (all of them without names) or list them; returns the exit code; collective.
 
     Raises
     ------
     InputError
-        An unknown case, or a folder that cannot be used; nothing has run then.
+        For an unknown case, or a folder that cannot be used; nothing has run then.
     Interrupted
-        A signal; what had been done is in the folder.
+        After a signal; results of finished cases are in the folder.
     """
     from lyra_petsc.experiments.verification import verification_case
     from lyra_petsc.experiments.verification.cases import CASES
@@ -155,9 +155,9 @@ def verify(
     if listed:
         return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
     cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
-    again = command(comm, "verify", [*names, *words_of({"--quick": quick})])
+    again = command(comm, "verify", [*names, *to_arguments({"--quick": quick})])
     results = Results(comm, out, Verification(), ranks=comm.size, command=again, force=force)
-    run = partial(verification_case.run_case, comm, quick=quick, watch=watched(comm))
+    run = partial(verification_case.run_case, comm, quick=quick, watch=stop_check(comm))
     return _run(comm, results, cases, run, len(CASES.modules))
 
 
@@ -176,14 +176,14 @@ def stress(
     job: Path | None,
     trust_mesh: bool,
 ) -> int:
-    """Run the cases of ``stress`` or list them; the exit code; collective.
+    """Run the cases of ``stress`` or list them; returns the exit code; collective.
 
     Raises
     ------
     InputError
-        A bad scene, an unknown case, or a folder that cannot be used; nothing has run then.
+        For a bad scene, an unknown case, or a folder that cannot be used; nothing has run then.
     Interrupted
-        A signal; what had been done is in the folder.
+        After a signal; results of finished cases are in the folder.
     """
     from lyra_petsc.experiments.stress import stress_runner
     from lyra_petsc.experiments.stress.cases import FAMILIES, selected
@@ -208,13 +208,13 @@ def stress(
         ended = results is not None and results.outcomes
         return f"; the cases that had ended are in {folder}" if ended else "; no case had ended"
 
-    watch = watched(comm, kept)
+    watch = stop_check(comm, kept)
     if launcher is None:
-        # a base scene that does not run is refused before anything is written
+        # a base scene that fails is refused before anything is written
         clock = stress_runner.BaseClock(comm, setting, watch)
         setting = replace(setting, size=clock.size)
-    asked = [*([] if scene is None else [str(scene)]), *words_of({"--set": settings})]
-    asked += words_of({"--trust-mesh": trust_mesh, "--quick": quick, "--full": full})
+    asked = [*([] if scene is None else [str(scene)]), *to_arguments({"--set": settings})]
+    asked += to_arguments({"--trust-mesh": trust_mesh, "--quick": quick, "--full": full})
 
     def run(case: StressCase) -> stress_runner.StressOutcome:
         if launcher is not None:
@@ -225,7 +225,7 @@ def stress(
         outcome = run(cases[0])
         on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.saved()))
         return 0 if outcome.passed else FAILED
-    words = [*asked, *words_of({"--only": ",".join(names), "--ranks": ranks})]
+    words = [*asked, *to_arguments({"--only": ",".join(names), "--ranks": ranks})]
     again, view = command(comm, "stress", words), Stress(setting, len(cases))
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, known)
@@ -244,14 +244,14 @@ def fabric(
     only: str | None,
     job: Path | None,
 ) -> int:
-    """Run textile tests; the exit code; collective.
+    """Run textile tests; returns the exit code; collective.
 
     Raises
     ------
     InputError
-        An unknown test or cloth, a bad scene, or a folder that cannot be used; nothing has run then.
+        For an unknown test or cloth, a bad scene, or a folder that cannot be used; nothing has run then.
     Interrupted
-        A signal; what had been done is in the folder.
+        After a signal; results of finished tests are in the folder.
     """
     from lyra_petsc.experiments.fabric import fabric_report, textile_tests
     from lyra_petsc.experiments.fabric.specimens import fabric_of
@@ -265,8 +265,8 @@ def fabric(
         if case.test not in ("tensile", "shear"):
             tested.needs_bending(case.test)
     launcher = case_launcher(comm, "fabric", ranks)
-    asked = [named, *words_of({"--set": settings})]
-    watch = watched(comm)
+    asked = [named, *to_arguments({"--set": settings})]
+    watch = stop_check(comm)
 
     def run(case: fabric_report.FabricCase) -> fabric_report.FabricOutcome:
         if launcher is not None:
@@ -279,7 +279,7 @@ def fabric(
         return 0 if outcome.passed else FAILED
     first = Path("fabric") / f"{Path(named).stem}-{test}"
     folder = out or on_root(comm, lambda: first if force else free_name(first))
-    again = command(comm, "fabric", [test, *asked, *words_of({"--ranks": ranks})])
+    again = command(comm, "fabric", [test, *asked, *to_arguments({"--ranks": ranks})])
     view = fabric_report.Fabric(named)
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, len(cases))
@@ -288,7 +288,7 @@ def fabric(
 def _run(
     comm: MPI.Comm, results: Results[Any], cases: Sequence[Any], run: Callable[[Any], Any], known: int
 ) -> int:
-    """Run cases and print their outcomes; returns the exit code. ``known`` counts all that there are."""
+    """Run cases and print their outcomes; returns the exit code. ``known`` is the number of all cases."""
     terminal = Terminal(comm, results.view, len(cases), known)
     note = results.run(cases, run, terminal)
     terminal.close(results, note)
@@ -301,10 +301,10 @@ def _list(
     """Print names and titles of cases below headings, on rank 0; returns the exit code."""
     if comm.rank > 0:
         return 0
-    width, told = max(len(case.name) for case in cases), ""
+    width, last = max(len(case.name) for case in cases), ""
     for case in cases:
-        if heading is not None and heading(case) != told:
-            click.echo(told := heading(case))
+        if heading is not None and heading(case) != last:
+            click.echo(last := heading(case))
         click.echo(f"{'  ' * (heading is not None)}{case.name:<{width}}  {case.title}")
     click.echo(count, err=True)
     return 0

@@ -1,4 +1,4 @@
-"""``fit``: numbers of a scene from measurements."""
+"""The verb ``fit``: estimates numbers of a scene from measurements."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import click
 from mpi4py import MPI
 
 from lyra_petsc.api.mpirun import environment, find_launcher
-from lyra_petsc.cli.experiments import command, petsc_words, watched, words_of
+from lyra_petsc.cli.experiments import command, petsc_arguments, stop_check, to_arguments
 from lyra_petsc.cli.progress import ProgressBar, duration
-from lyra_petsc.cli.run import petsc_speaks, tell_unused
+from lyra_petsc.cli.run import petsc_prints, warn_unused
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
 from lyra_petsc.experiments.fit.estimate import Trial
@@ -26,7 +26,7 @@ from lyra_petsc.scene.schema import Scene
 
 
 class FitProgress(ProgressBar, Observer):
-    """Shows the progress of a fit: the present evaluation, and the sum of squares of the one before."""
+    """Shows the progress of a fit: the current evaluation, and the sum of squares of the last one."""
 
     def __init__(self, comm: MPI.Comm, *, plain: bool) -> None:
         super().__init__(comm, plain=plain)
@@ -37,8 +37,8 @@ class FitProgress(ProgressBar, Observer):
 
     def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
         self._cost = f"  sum of squares {2.0 * trial.cost:.5g}"
-        again = " (from before)" if resumed else ""
-        self._print_line(f"evaluation {number}{self._cost}{again}")
+        source = " (from before)" if resumed else ""
+        self._print_line(f"evaluation {number}{self._cost}{source}")
 
 
 def fit(
@@ -52,22 +52,22 @@ def fit(
     resume: bool,
     ranks: int | None,
 ) -> int:
-    """Fit a scene; the exit code; collective.
+    """Fit a scene; returns the exit code; collective.
 
     Raises
     ------
     InputError
-        Bad input; nothing is written.
+        For bad input; nothing is written.
     SolverError
-        A simulation that failed; evaluations before it are kept.
+        If a simulation fails; earlier evaluations are kept.
     Interrupted
-        A signal; ``--resume`` goes on.
+        After a signal; ``--resume`` continues.
     """
     if scene is None:
         raise InputError("needs a scene with a block fit, as in: fit strip.yaml", key="SCENE")
-    words = [str(scene), *words_of({"--set": settings, "--trust-mesh": trust_mesh})]
+    words = [str(scene), *to_arguments({"--set": settings, "--trust-mesh": trust_mesh})]
     if ranks is not None:
-        words += words_of({"--out": out, "--force": force, "--resume": resume})
+        words += to_arguments({"--out": out, "--force": force, "--resume": resume})
         return _launched(comm, ranks, words)
 
     def read() -> Scene:
@@ -83,14 +83,14 @@ def fit(
             return " in the first evaluation, nothing is kept"
         return f"; evaluations are kept in {choice.path}, fit --resume goes on"
 
-    watch = watched(comm, kept)
+    watch = stop_check(comm, kept)
     view = Fit(f"Fit of {loaded.title or scene.stem}")
     with RunDirectory(comm, choice) as directory:
         folder = directory.path
         directory.clean()
 
         def work(case: Case) -> FitOutcome:
-            with FitProgress(comm, plain=petsc_speaks()) as progress:
+            with FitProgress(comm, plain=petsc_prints()) as progress:
                 if directory.note:
                     progress.say(f"note: {directory.note}")
                 return outcome_of(fit_scene(comm, loaded, folder=folder, watch=watch, observer=progress))
@@ -103,15 +103,15 @@ def fit(
         outcome = results.outcomes[0]
         for line in view.terminal(outcome):
             click.echo(line)
-        told = f"{len(outcome.fitted.trials)} evaluations in {duration(outcome.fitted.seconds)}"
-        click.echo(f"{told}; results: {folder}")
+        evaluations = f"{len(outcome.fitted.trials)} evaluations in {duration(outcome.fitted.seconds)}"
+        click.echo(f"{evaluations}; results: {folder}")
         if note:
             click.echo(f"note: {note}")
-        tell_unused([])
+        warn_unused([])
     return 0
 
 
 def _launched(comm: MPI.Comm, ranks: int, words: list[str]) -> int:
-    """Run the same command on so many ranks, with this process's standard streams; returns the exit code."""
+    """Run the same command on ``ranks`` ranks, with this process's streams; returns the exit code."""
     program = [*on_root(comm, lambda: find_launcher(ranks)), sys.executable, "-m", "lyra_petsc", "fit"]
-    return subprocess.call([*program, *words, *petsc_words()], env=environment())
+    return subprocess.call([*program, *words, *petsc_arguments()], env=environment())

@@ -1,4 +1,4 @@
-"""``run``: simulate a scene and leave its results in a folder."""
+"""The verb ``run``: simulates a scene and writes its results into a folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lyra_petsc.show.view.live import LivePage
 
 
-NO_PLACE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
+NO_CACHE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 
 
 def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str], *, trust_mesh: bool = False) -> Scene:
@@ -49,16 +49,16 @@ def run(
     trust_mesh: bool = False,
     served: Served | None = None,
 ) -> None:
-    """Simulate a scene, which a page shows if ``served`` says where; collective.
+    """Simulate a scene, shown on a live page if ``served`` is given; collective.
 
     Raises
     ------
     InputError
-        Bad input; nothing is written.
+        For bad input; nothing is written.
     SolverError, OutputError
-        The run could not go on; all states announced before can be read.
+        If the run cannot continue; all states written before can be read.
     Interrupted
-        A signal; the last step is in the checkpoint.
+        After a signal; the last step is in the checkpoint.
     """
     if served is not None:
         on_root(comm, lambda: served.check("--live"))
@@ -79,23 +79,23 @@ def say(text: str) -> None:
 
 
 class TerminalProgress(ProgressCallbacks):
-    """Shows the progress of a run, its notes, and at the end where the time went.
+    """Shows the progress of a run, its notes, and at the end the wall time of its phases.
 
     Parameters
     ----------
     comm : MPI.Comm
     served : Served, optional
-        Where a page shows it as well.
+        Address of the live page.
     usual : Path, optional
-        The folder that it takes unless that exists.
+        The default folder of the results, which is used unless it exists.
     """
 
     def __init__(self, comm: MPI.Comm, served: Served | None = None, usual: Path | None = None) -> None:
         self._comm, self._usual = comm, usual
         self._progress: Progress | None = None
-        self._told_of_place = False
+        self._noted_cache = False
         if comm.rank == 0:
-            COMPILATION.first = self._tell_of_compilation
+            COMPILATION.first = self._announce_compilation
         self._page: LivePage | None = None
         if served is not None and comm.rank == 0:
             from lyra_petsc.show.view.live import LivePage
@@ -111,12 +111,12 @@ class TerminalProgress(ProgressCallbacks):
         if self._progress is not None:
             self._progress.say(text)
 
-    def _tell_of_compilation(self) -> None:
+    def _announce_compilation(self) -> None:
         """Tell the user that kernels are being compiled, above the bar once there is one."""
         text = "compiling kernels, once, about 15 s"
         if not COMPILATION.kept:
-            self._told_of_place = True
-            text = f"compiling kernels, about 15 s in every run: {NO_PLACE}"
+            self._noted_cache = True
+            text = f"compiling kernels, about 15 s in every run: {NO_CACHE}"
         if self._progress is not None:
             self._progress.say(text)
         else:
@@ -128,7 +128,7 @@ class TerminalProgress(ProgressCallbacks):
             self._comm,
             simulation.control.end,
             start=simulation.time,
-            plain=petsc_speaks(),
+            plain=petsc_prints(),
             clock=lambda: time.monotonic() - COMPILATION.seconds,
             unit="s" if simulation.problem.system.integrator.dynamic else "",
         )
@@ -156,29 +156,29 @@ class TerminalProgress(ProgressCallbacks):
             self._progress.close()
 
     def done(self, simulation: SteppedScene, folder: Path) -> None:
-        """Print where the time went, and which PETSc options nothing used."""
+        """Print the closing table, and a warning of unused PETSc options."""
         simulation.stepper.ts.viewFromOptions("-ts_view")
         outcome = "done"
         if not simulation.at_end:
             now = f"step {simulation.step_number}, t = {simulation.time:g} of {simulation.control.end:g} s"
             outcome = f"stopped at {now}, by -ts_max_steps; --resume goes on"
-        if not COMPILATION.kept and not self._told_of_place:
-            self._say(f"note: the next run compiles kernels anew: {NO_PLACE}")
+        if not COMPILATION.kept and not self._noted_cache:
+            self._say(f"note: the next run compiles kernels anew: {NO_CACHE}")
         closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._page is not None:
             print(f"look again   lyra-petsc view {folder}", flush=True)
         if self._comm.rank == 0:
-            tell_unused(simulation.stepper.our_options)
+            warn_unused(simulation.stepper.our_options)
 
 
-def petsc_speaks() -> bool:
-    """Whether PETSc prints while the run goes on, which would spoil a progress bar."""
+def petsc_prints() -> bool:
+    """Whether PETSc prints during the run, which would disturb a progress bar."""
     names = PETSc.Options().getAll()
     return any(word in name for name in names for word in ("monitor", "converged_reason", "_view", "info"))
 
 
-def tell_unused(ours: list[str]) -> None:
-    """Warn of PETSc options, beside ours, that nothing has used. On one rank."""
-    if left := unused(ours):
-        listed = ", ".join(f"-{name}" for name in left)
+def warn_unused(defaults: list[str]) -> None:
+    """Warn of PETSc options that were not used, except those in ``defaults``; to be called on one rank."""
+    if names := unused(defaults):
+        listed = ", ".join(f"-{name}" for name in names)
         print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The text of a starter scene, with a grid or with a mesh file of the user's."""
+"""Text of a starter scene, with a grid or a given mesh file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lyra_petsc.scene.materials.library import material_names
 from lyra_petsc.scene.schema import FIELDS, MeshSource
 
 CLOTHS = 4
-"""Names of the library that are shown."""
+"""Number of the library's cloths that are named."""
 
 _GRID = """\
 mesh:
@@ -38,16 +38,16 @@ _RESERVED = re.compile("null|true|false|yes|no|on|off", re.IGNORECASE)
 
 
 def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_mesh: bool) -> str:
-    """A commented scene that can be run as it stands.
+    """Text of a commented scene that can be run without changes.
 
     Parameters
     ----------
     scene : Path
-        Where it will be written; the mesh file is named relative to it.
+        Path of the scene; the mesh file is named relative to it.
     commands : pair of str
-        How the program is started on one rank and on two.
+        Commands that start the program on one rank and on two.
     file : Path or None
-        A mesh; without it, a grid.
+        A mesh file; None for a grid.
     trust_mesh : bool
         Give gmsh the script whatever it says.
 
@@ -84,7 +84,7 @@ def _read(file: Path, trust_mesh: bool) -> Mesh:
 
 def _mesh(file: Path, mesh: Mesh, scene: Path) -> str:
     name = os.path.relpath(file.absolute(), scene.absolute().parent)
-    if name.startswith(os.path.join("..", "..")):  # far away: neither is likely to move with the other
+    if name.startswith(os.path.join("..", "..")):  # so far apart that they will hardly be moved together
         name = str(file.absolute())
     lines = ["mesh:", f"  file: {_quoted(name)}"]
     if file.suffix.lower() == ".geo":
@@ -108,7 +108,7 @@ def _mesh(file: Path, mesh: Mesh, scene: Path) -> str:
 
 
 def _span(mesh: Mesh) -> tuple[list[float], list[float]]:
-    """Lower and upper corner [m]."""
+    """Lower and upper corner [m] of the mesh's bounding box."""
     return mesh.positions.min(axis=0).tolist(), mesh.positions.max(axis=0).tolist()
 
 
@@ -117,7 +117,7 @@ def _handle(mesh: Mesh) -> str:
     for name, group in mesh.groups.items():
         if group.dimension < 2 and len(group.vertices) < mesh.n_vertices:
             return "\n".join([f"  - group: {_quoted(name)}", *lines])
-    # nothing to name: the upper end of the sheet, along z or the longest axis of a flat one
+    # no suitable group: a box at the upper end of the sheet, along z or the longest axis of a flat sheet
     low, high = _span(mesh)
     extent = [b - a for a, b in zip(low, high, strict=True)]
     axis = 2 if extent[2] > 0.01 * max(extent) else extent.index(max(extent))
@@ -133,6 +133,6 @@ def _digits(value: float) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Text as YAML takes it for text."""
+    """A text, quoted if YAML would not read it as a text."""
     plain = _PLAIN_NAME.fullmatch(text) and not _RESERVED.fullmatch(text)
     return text if plain else json.dumps(text, ensure_ascii=False)

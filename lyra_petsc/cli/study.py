@@ -1,4 +1,4 @@
-"""``study``: error against run time, for combinations of settings of a scene."""
+"""The verb ``study``: error against run time, for combinations of settings of a scene."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.cli.experiments import case_launcher, command, watched, words_of
+from lyra_petsc.cli.experiments import case_launcher, command, stop_check, to_arguments
 from lyra_petsc.cli.progress import StudyProgress
-from lyra_petsc.cli.run import petsc_speaks, tell_unused
+from lyra_petsc.cli.run import petsc_prints, warn_unused
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.results import Results
@@ -23,7 +23,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import default_scene
 
 
-def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said: Any) -> None:
+def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **given: Any) -> None:
     """Run a study; collective.
 
     Parameters
@@ -31,26 +31,26 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
     comm : MPI.Comm
     out, resume, force
         The options of these names.
-    **said
-        Fields of `Request` as the command line gives them; None or empty where nothing was said.
-        ``trust_mesh`` is always said: it is not taken from a folder, which may be another's.
+    **given
+        Fields of `Request` from the command line; None or empty if not given. ``trust_mesh`` is always
+        given: it is not read from a folder, which may be someone else's.
 
     Raises
     ------
     InputError
-        Bad input; nothing is written.
+        For bad input; nothing is written.
     SolverError
-        No combination ran to its end, or no reference; what there is to tell is written.
+        If all combinations, or the reference, failed; the report is written.
     Interrupted
-        A signal; the folder can be resumed.
+        After a signal; the folder can be resumed.
     """
-    scene = said["scene"] or default_scene()
-    stem = out.name if resume and said["scene"] is None and out is not None else scene.stem
+    scene = given["scene"] or default_scene()
+    stem = out.name if resume and given["scene"] is None and out is not None else scene.stem
     choice = choose(comm, stem, out, force=force, resume=resume, kind=STUDY)
     base = on_root(comm, lambda: read_request(choice.path)) if resume else Request(str(scene))
-    said["scene"] = said["scene"] and str(scene)
-    request = dataclasses.replace(base, **{k: given for k, given in said.items() if given not in (None, ())})
-    obey = watched(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
+    given["scene"] = given["scene"] and str(scene)
+    request = dataclasses.replace(base, **{k: value for k, value in given.items() if value not in (None, ())})
+    check = stop_check(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
     launcher = case_launcher(comm, "study", request.ranks)
     plan = on_root(comm, lambda: make_plan(request))
     chosen = on_root(comm, lambda: choose_references(plan))
@@ -59,17 +59,17 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
         directory.clean()
         on_root(comm, lambda: save_record(folder / REQUEST_FILE, plan.request))
         lock = directory.descriptor if launcher is not None else -1
-        with StudyProgress(comm, obey, len(plan.combinations), plain=petsc_speaks()) as progress:
+        with StudyProgress(comm, check, len(plan.combinations), plain=petsc_prints()) as progress:
             for note in [*plan.notes, *([directory.note] if directory.note else [])]:
                 progress.note(note)
             view = Study(Work(comm, plan, chosen, folder, progress, launcher, lock))
-            again = command(comm, "study", _words(plan))
+            again = command(comm, "study", _arguments(plan))
             results = Results(comm, folder, view, ranks=view.ranks, command=again, force=True)
             results.run(view.cases(), view.work.run)
     _close(comm, view, folder)
 
 
-def _words(plan: Plan) -> list[str]:
+def _arguments(plan: Plan) -> list[str]:
     """The arguments that repeat the study from the beginning."""
     request, varied = plan.request, []
     for axis in plan.axes:
@@ -78,7 +78,7 @@ def _words(plan: Plan) -> list[str]:
     options = {"--set": request.settings, "--vary": varied}
     for name in ("reference", "quantities", "repeats", "ranks"):
         options[f"--{name}"] = getattr(request, name)
-    return [request.scene, *words_of(options | {"--trust-mesh": request.trust_mesh})]
+    return [request.scene, *to_arguments(options | {"--trust-mesh": request.trust_mesh})]
 
 
 def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
@@ -91,7 +91,7 @@ def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
                 print(one.words)
         print(f"{done} of {len(rows)} combinations done, {len(rows) - done} failed")
         print(f"report       {folder / 'report.html'}", flush=True)
-        tell_unused([])
+        warn_unused([])
     if not done:
         words = f"all {len(rows)} combinations failed; the first: {rows[0].result.problem}"
         raise SolverError(words, collective=True)

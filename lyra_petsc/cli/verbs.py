@@ -25,7 +25,7 @@ from lyra_petsc.cli.options import (
     with_help,
 )
 from lyra_petsc.cli.render import export, render, report
-from lyra_petsc.cli.view import Served, view, where_served
+from lyra_petsc.cli.view import Served, server_options, view
 from lyra_petsc.errors import InputError, nearest
 
 
@@ -77,7 +77,7 @@ def verbs(ctx: click.Context) -> None:
 @click.option("--resume", is_flag=True, help="Go on from the newest checkpoint.")
 @trust_mesh
 @click.option("--live", is_flag=True, help="Show it in the browser while it goes on.")
-@where_served
+@server_options
 def run(
     comm: Any, /, live: bool, host: str | None, port: int | None, no_browser: bool, **options: Any
 ) -> None:
@@ -159,10 +159,10 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
 
     require("study")
     if job is not None:
-        from lyra_petsc.cli.experiments import watched
+        from lyra_petsc.cli.experiments import stop_check
         from lyra_petsc.experiments.study.jobs import run_job
 
-        run_job(comm, job, watched(comm))
+        run_job(comm, job, stop_check(comm))
     else:
         from lyra_petsc.cli.study import study as study_scene
 

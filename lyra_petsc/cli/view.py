@@ -1,4 +1,4 @@
-"""``view``: a local page that plays a run."""
+"""The verb ``view``: serves a local web page that plays a run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import raise_together
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
-"""What the page needs of the extra ``view``."""
+"""Packages of the extra ``view`` that the page needs."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def where_served(function: Function) -> Function:
-    """Add the options that say where the page is served."""
+def server_options(function: Function) -> Function:
+    """Add the options of the page's server."""
     for option in (
         click.option("--no-browser", is_flag=True, help="Do not open the page in a browser."),
         click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Its port (a free one)."),
@@ -36,7 +36,7 @@ def where_served(function: Function) -> Function:
 
 @dataclass(frozen=True)
 class Served:
-    """Where the page is served, and whether a browser opens it."""
+    """Address and port of the page, and whether to open it in a browser."""
 
     host: str
     port: int
@@ -49,12 +49,12 @@ class Served:
 
     @classmethod
     def of_live(cls, live: bool, host: str | None, port: int | None, no_browser: bool) -> Served | None:
-        """From the options of ``run``: None without ``--live``.
+        """From the options of ``run``; None without ``--live``.
 
         Raises
         ------
         InputError
-            For options that have no meaning without ``--live``.
+            For server options without ``--live``.
         """
         if live:
             return cls.of(host, port, no_browser)
@@ -65,12 +65,12 @@ class Served:
         return None
 
     def check(self, what: str) -> None:
-        """Check that the page can be served, before anything else is done; for one rank.
+        """Check that the page can be served; to be called on one rank before anything else.
 
         Raises
         ------
         InputError
-            For packages that are missing, or an address that cannot be used.
+            For missing packages, or an address that cannot be used.
         """
         require(what, PACKAGES, "view")
         from lyra_petsc.show.view.server import check_address
@@ -78,7 +78,7 @@ class Served:
         check_address(self.host, self.port)
 
     def announce(self, url: str, say: Callable[[str], Any]) -> None:
-        """Print the address of the page and who can reach it, and open it."""
+        """Print the address of the page, warn if others can reach it, and open it."""
         from lyra_petsc.show.view.server import is_loopback, open_browser
 
         say(f"view: {url}")
@@ -95,7 +95,7 @@ class Served:
 @click.option(
     "--set", "settings", multiple=True, metavar="render.KEY=VALUE", help="Change the camera; may be repeated."
 )
-@where_served
+@server_options
 def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser: bool, **look: Any) -> None:
     """Play RUN, a folder of results, in the browser; follow it if it goes on."""
     problem: LyraError | None = None
@@ -105,13 +105,13 @@ def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser
         except LyraError as error:
             problem = error
     request = comm.Ibarrier()
-    while not request.Test():  # a barrier that keeps no processor busy
+    while not request.Test():  # unlike MPI's barrier this keeps no processor busy
         time.sleep(0.2)
     raise_together(comm, problem)
 
 
 def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:
-    """Serve until a signal."""
+    """Serve the page until a signal."""
     served.check("view")
     from lyra_petsc.show.view.server import find_run, serve
 
@@ -120,5 +120,5 @@ def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:
         click.echo("Ctrl-C ends")
 
     number = asyncio.run(serve(find_run(folder), served.host, served.port, ready, **look))
-    if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
+    if number not in (0, signal.SIGINT):  # Ctrl-C is the normal end
         raise Interrupted("", number, "ended by")

@@ -1,4 +1,5 @@
-"""``scripts/bench``: how fast and how large, as ``bench.json`` and ``bench.md``; see docs/performance.md."""
+"""``scripts/bench``: measures time and memory, writes ``bench.json`` and ``bench.md``; see
+docs/performance.md."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ def flat(lists: Sequence[list[int]]) -> list[int]:
 
 
 def numbers(text: str) -> list[int]:
-    """Whole numbers from 1 on between commas."""
+    """Positive integers separated by commas."""
     try:
         found = [int(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -114,13 +115,13 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
 
 
 class Bench:
-    """Results as they come in; both files are complete after each measurement.
+    """Performs the measurements; both files are rewritten after each of them.
 
     Parameters
     ----------
     asked : argparse.Namespace
     petsc : sequence of str
-        PETSc's options, given to every measurement of ours.
+        PETSc options for every measurement of this program.
     words : sequence of str
         The command line.
     """
@@ -138,7 +139,7 @@ class Bench:
         }
 
     def _attempt(self, what: str, work: Callable[..., Any], *given: Any, **more: Any) -> Any:
-        """Measure; None, and one line for the user, where it fails."""
+        """Perform a measurement; prints a line and returns None if it fails."""
         print(f"bench: {what}", file=sys.stderr, flush=True)
         try:
             return work(*given, **more)
@@ -170,10 +171,11 @@ class Bench:
         replace_text(self._folder / "bench.json", text + "\n")
         replace_text(self._folder / "bench.md", document(self.results))
 
-    def go(self) -> None:
+    def run(self) -> None:
+        """Perform all measurements."""
         asked = self._asked
         few = Limits(1, 1.0, 600.0)
-        for plain, method in itertools.product(self._plain, METHODS):  # no row pays for compiling
+        for plain, method in itertools.product(self._plain, METHODS):  # so that no row includes compilation
             self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few, plain)
         for vertices in asked.vertices:
             for method, ranks, plain in itertools.product(METHODS, asked.ranks, self._plain):
@@ -184,10 +186,10 @@ class Bench:
         self._growth()
         if asked.presets is not None:
             self._presets()
-        self._beside()
+        self._compare()
         if not asked.only_rows:
             self._scaling()
-            self._rest()
+            self._single_numbers()
         self.save()
 
     def _add(self, where: str, found: Any) -> None:
@@ -201,11 +203,11 @@ class Bench:
 
     @property
     def _plain(self) -> Sequence[str]:
-        """Folders for the kernels: the usual one, and that of plain numba where it is asked for."""
+        """Cache folders of kernels: the default one (""), and with ``--plain`` that of plain numba."""
         return ["", str((self._folder / "plain").resolve())] if self._asked.plain else [""]
 
-    def _beside(self) -> None:
-        """Bending models, this program and another checkout's, contact: what was asked for of them."""
+    def _compare(self) -> None:
+        """Measure what was requested of: bending models, another checkout, contact."""
         asked, petsc, folder, limits = self._asked, self._petsc, self._folder, self._asked.limits
         methods, each = METHODS, itertools.product
         for kind, method, ranks, n in each(asked.bending or (), methods, asked.ranks, asked.vertices):
@@ -221,17 +223,17 @@ class Bench:
             self._measure("contact", f"{n} vertices in contact, {ranks} rank(s)", measures.contact, *given)
 
     def _scaling(self) -> None:
-        """Other meshes, weak scaling, sheets at once."""
+        """Measure other meshes, weak scaling, and independent sheets."""
         asked, petsc, limits = self._asked, self._petsc, self._asked.limits
-        first, most = asked.ranks[0], max(asked.vertices)
+        first, largest = asked.ranks[0], max(asked.vertices)
         for n in asked.vertices:
             what = f"{n} vertices, other meshes, {first} rank(s)"
             self._measure("meshes", what, measures.meshes, n, first, petsc, self._folder, limits)
         for ranks in asked.ranks if asked.weak else []:
             self._add("weak", self._row(ranks * asked.weak, METHODS[0], ranks))
         for ranks in (ranks for ranks in asked.ranks if ranks > 1):
-            what = f"{ranks} sheets of {most // ranks} vertices at once"
-            self._measure("apart", what, measures.apart, most, ranks, petsc, limits)
+            what = f"{ranks} sheets of {largest // ranks} vertices at once"
+            self._measure("apart", what, measures.apart, largest, ranks, petsc, limits)
 
     def _growth(self) -> None:
         known = measures.first_method(self.results["rows"])
@@ -257,7 +259,7 @@ class Bench:
                 found = {"vertices": square_number(vertices), "problem": failed}
             self._add("presets", found | {"preset": name, "problem_class": title})
 
-    def _rest(self) -> None:
+    def _single_numbers(self) -> None:
         asked, folder, petsc, limits = self._asked, self._folder, self._petsc, self._asked.limits
         ranks, vertices = asked.ranks[-1], asked.output_vertices
         single = {
@@ -274,7 +276,7 @@ class Bench:
 
 
 def main() -> int:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that child processes are ended
     words, petsc = split(sys.argv[1:])
     try:
         asked = read_arguments(words)
@@ -284,7 +286,7 @@ def main() -> int:
         except OSError as error:
             raise InputError(f"cannot be made: {error.strerror}", file=asked.out, key="--out") from None
         bench = Bench(asked, petsc, sys.argv[1:])
-        bench.go()
+        bench.run()
     except (InputError, OutputError) as error:
         print(f"bench: {error}", file=sys.stderr)
         return error.exit_code

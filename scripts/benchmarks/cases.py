@@ -1,4 +1,4 @@
-"""What is measured: a square of gray interlock hung by two corners, and a sheet of 100 triangles."""
+"""Scenes of the benchmark: a square of gray interlock hung by two corners, a small sheet, and contact."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ METHODS = ("semi-implicit", "beuler")
 
 
 def cells_of(vertices: int) -> int:
-    """Cells along an edge of the square that comes closest to a number of vertices."""
+    """Cells along an edge of the square whose number of vertices is closest to ``vertices``."""
     return max(1, round(math.sqrt(vertices)) - 1)
 
 
 def square_number(vertices: int) -> int:
-    """Vertices of the square that comes closest to a number of them."""
+    """Number of vertices of the square that is closest to ``vertices``."""
     return (cells_of(vertices) + 1) ** 2
 
 
@@ -41,13 +41,13 @@ def hanging_square(
     Parameters
     ----------
     vertices : int
-        About as many, see `square_number`.
+        Approximate number, see `square_number`.
     method : str
         ``semi-implicit``: one linear solve a step; ``beuler``: Newton's method to the scene's tolerances.
     step : float
         Δt [s].
     stiffness : float
-        Factor on the membrane's.
+        Factor on the membrane stiffness.
     """
     cells = cells_of(vertices)
     return {
@@ -62,10 +62,10 @@ def hanging_square(
 GRADED_MESH = "gmsh 1:20"
 
 PLAIN_MESHES = ("diagonal", "alternating", "criss-cross", "gmsh")
-"""Kinds of triangles that the square is cut into, the first that of most measurements."""
+"""Kinds of meshes of the square; the first is used in most measurements."""
 
 MESHES = (*PLAIN_MESHES, GRADED_MESH, "diagonal, midedge", "gmsh, midedge")
-"""These and others, with the bending model where it is not that of hinges."""
+"""All kinds of meshes, with the bending model if it is not that of hinges."""
 
 BENDING_MESHES = ("diagonal", "alternating", "gmsh")
 BENDING_MODELS = ("hinge", "midedge")
@@ -75,7 +75,7 @@ GRADED = 20.0
 
 
 def on_mesh(kind: str, vertices: int, folder: Path) -> dict[str, Any]:
-    """`hanging_square` on another kind of mesh, which gmsh makes from a file in ``folder``."""
+    """`hanging_square` on another kind of mesh; files for gmsh are written into ``folder``."""
     kind, _, model = kind.partition(", ")
     scene = hanging_square(vertices)
     if kind in ("diagonal", "alternating"):
@@ -94,15 +94,15 @@ def on_mesh(kind: str, vertices: int, folder: Path) -> dict[str, Any]:
 
 
 def square_script(vertices: int, ratio: float) -> str:
-    """For gmsh: the square with about so many vertices, edges below so many times shorter than above."""
-    # of equilateral triangles of edge h there is a vertex for each √3/2 h²; h grows with the height
+    """Gmsh script of the square with about ``vertices`` vertices; edges grow ``ratio`` times to the top."""
+    # equilateral triangles of edge h have one vertex per √3/2 h²; h grows with the height
     lower = math.sqrt(2.0 / (math.sqrt(3.0) * ratio * vertices))
     sizes = (lower, lower, ratio * lower, ratio * lower)
     return rectangle_script(1.0, 1.0, sizes) + 'Physical Point("held") = {3, 4};\n'
 
 
 def small_sheet() -> dict[str, Any]:
-    """100 triangles, so that hardly anything but the overhead of a step is left."""
+    """A sheet of 100 triangles, for the overhead of a step."""
     scene = hanging_square(36)
     scene["mesh"] = {"grid": {"width": 0.5, "height": 1.0, "nx": 5, "ny": 10}}
     scene["handles"] = [{"nodes": [60, 65]}]
@@ -110,22 +110,23 @@ def small_sheet() -> dict[str, Any]:
 
 
 SHEETS = 5
-"""Of the stack."""
+"""Number of sheets in the stack."""
 
 
 def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
-    """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then the same
-    with contact and nothing near (by ``semi-implicit`` steps, too), and one that falls over a ball; sheets
-    that swing, and as many in a stack on a plane, vertices on vertices and not, of the cloth as it is and a
-    thousand times stiffer.
+    """Scenes by name, each with about ``vertices`` vertices in total.
+
+    A sheet held at an edge that swings, without contact and with contact but nothing near (also with
+    ``semi-implicit`` steps); a sheet that falls over a ball; several sheets that swing, and as many in a
+    stack on a plane, with aligned and with shifted vertices; the latter also a thousand times stiffer.
     """
 
-    def sheets(number: int, apart: float, aside: float = 0.0) -> list[dict[str, Any]]:
+    def sheets(number: int, distance: float, shift: float = 0.0) -> list[dict[str, Any]]:
         cells = cells_of(vertices // number)
         grid = {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells, "pattern": "alternating"}
-        first, farther = np.array([-0.5, -0.5, 0.95 * apart]), np.array([aside, 0.6 * aside, apart])
+        first, offset = np.array([-0.5, -0.5, 0.95 * distance]), np.array([shift, 0.6 * shift, distance])
         return [
-            {"grid": grid, "transform": {"translate": (first + layer * farther).tolist()}}
+            {"grid": grid, "transform": {"translate": (first + layer * offset).tolist()}}
             for layer in range(number)
         ]
 
@@ -135,7 +136,7 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     ball = {"obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.31], "radius": 0.3}}}}
     floor = {"obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}}
     gap = 0.2 / cells_of(vertices // SHEETS)
-    one, several, beside = sheets(1, 0.0), sheets(SHEETS, gap), {"mesh": sheets(SHEETS, gap, 1.55 * gap)}
+    one, several, shifted = sheets(1, 0.0), sheets(SHEETS, gap), {"mesh": sheets(SHEETS, gap, 1.55 * gap)}
     far = {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}}
     alone, near = {"mesh": one}, {"mesh": one, "contact": {"friction": 0.4}}
     once = held | {"time": common["time"] | {"integrator": "semi-implicit"}}
@@ -152,5 +153,5 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
         scenes[f"{SHEETS} swing{words}"] = stiffer | held
         touching = {"contact": {"gap": gap, "friction": 0.4}}
         scenes[f"{SHEETS} in a stack{words}"] = stiffer | free | floor | touching
-        scenes[f"{SHEETS} in a stack, not in line{words}"] = stiffer | free | floor | touching | beside
+        scenes[f"{SHEETS} in a stack, not in line{words}"] = stiffer | free | floor | touching | shifted
     return scenes

@@ -1,4 +1,4 @@
-"""The single measurements of the bench, each returning plain data for its JSON file."""
+"""The measurements of the benchmark, each returning plain data for its JSON file."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from lyra_petsc.experiments.study.study_report import processor
 from lyra_petsc.linear.presets import PRESETS
 
 WARM_UP = 3
-"""Steps of a row before the first one that is measured."""
+"""Steps of a row before the first measured one."""
 
 REPEATS = 3
 PAIRS = 7
-"""Runs of this program and of another checkout's, by turns."""
+"""Pairs of runs, of this program and of another checkout's by turns."""
 
 STATES = 10
-"""States that are written to measure output."""
+"""Number of states written to measure output."""
 
 PROBLEM_CLASSES: dict[str, dict[str, float]] = {
     "soft, 5 ms": {},
@@ -51,7 +51,7 @@ Result = dict[str, Any]
 
 
 def machine() -> Result:
-    """What the numbers were measured on."""
+    """Processor, cores and load of the machine."""
     return {"processor": processor(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
 
 
@@ -64,9 +64,9 @@ def row(
     plain: str = "",
     **changes: float,
 ) -> Result:
-    """Set-up, steps and memory of the hanging square; ``changes`` as `hanging_square` takes them.
+    """Measure set-up, steps and memory of the hanging square; ``changes`` are options of `hanging_square`.
 
-    With a folder ``plain``, kernels are plain numba, see ``worker.py``.
+    With a folder ``plain``, kernels are in plain numba, see ``worker.py``.
     """
     scene = hanging_square(vertices, method, **changes)
     found = _steps("steps", scene, ranks, petsc, limits, **({"plain": plain} if plain else {}))
@@ -74,7 +74,7 @@ def row(
 
 
 def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
-    """Steps of sheets of a rank's share of the vertices, one on each rank at the same time."""
+    """Measure steps of independent sheets, one a rank at the same time, each of vertices / ranks vertices."""
     found = _steps("apart", hanging_square(vertices // ranks), ranks, petsc, limits)
     return found | {"whole_vertices": square_number(vertices)}
 
@@ -87,7 +87,7 @@ def _steps(
 
 
 def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
-    """Steps of the square on every kind of mesh, by turns."""
+    """Measure steps of the square on every kind of mesh, by turns."""
     few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": len(MESHES) * limits.seconds}
     with _scratch(folder) as scratch:
         scenes = {kind: on_mesh(kind, vertices, scratch) for kind in MESHES}
@@ -97,7 +97,7 @@ def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits
 def bending(
     kind: str, vertices: int, method: str, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits
 ) -> Result:
-    """Steps of the square on a kind of mesh with either bending model, by turns; memory of each alone."""
+    """Measure steps of the square with each bending model, by turns, and the memory of each separately."""
     few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": 2.0 * limits.seconds}
     with _scratch(folder) as scratch:
         scenes = {model: on_mesh(f"{kind}, {model}", vertices, scratch) for model in BENDING_MODELS}
@@ -121,8 +121,9 @@ def against(
     limits: Limits,
     other: Path,
 ) -> Result:
-    """Steps of the square on a kind of mesh with this program and that of another checkout, in pairs of runs
-    that take turns in being first.
+    """Measure steps of the square with this program and with another checkout, in pairs of runs.
+
+    The order within the pairs alternates.
     """
     few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": limits.seconds}
     runs: dict[str, list[Result]] = {"here": [], "other": []}
@@ -141,8 +142,10 @@ def against(
 def contact(
     vertices: int, ranks: int, petsc: Sequence[str], limits: Limits, settle: float, only: Sequence[str]
 ) -> Result:
-    """Steps of sheets in contact by turns with sheets that swing, after those of ``settle`` seconds; of all
-    scenes, or of those that have one of some words in their names.
+    """Measure steps of sheets in contact and of swinging sheets, by turns, after ``settle`` simulated
+    seconds.
+
+    With words ``only``, those scenes whose names contain one of them.
     """
     few = {"warm_up": max(WARM_UP, round(settle / STEP)), "steps": limits.steps, "seconds": math.inf}
     scenes = in_contact(vertices)
@@ -157,14 +160,14 @@ def first_method(rows: Sequence[Result]) -> list[Result]:
 
 
 def peer_row(name: str, command: str, vertices: int, folder: Path, limits: Limits) -> Result:
-    """Time per step of another program on the same scene; its files stay in ``folder``."""
+    """Measure the time per step of another program on the same scene; its files stay in ``folder``."""
     size = square_number(vertices)
     found = measure_peer(command, folder / "peers" / str(size), size, limits)
     return {"vertices": size, "who": name, "ranks": 1, "command": command, **found}
 
 
 def preset_names(names: Sequence[str]) -> list[str]:
-    """The named presets, or all.
+    """The names, or those of all presets if there are none.
 
     Raises
     ------
@@ -177,7 +180,7 @@ def preset_names(names: Sequence[str]) -> list[str]:
 
 
 def preset_options(name: str) -> list[str]:
-    """The options of a preset as words of a command line."""
+    """The options of a preset as command line arguments."""
     words = []
     for option, value in PRESETS[name].items():
         text = str(value).lower() if isinstance(value, bool) else value
@@ -186,7 +189,7 @@ def preset_options(name: str) -> list[str]:
 
 
 def overhead(petsc: Sequence[str], limits: Limits) -> Result:
-    """Steps a second of 100 triangles."""
+    """Measure steps per second of 100 triangles."""
     return measure(
         "overhead", 1, petsc, limits.process, scene=small_sheet(), warm_up=100, steps=200, blocks=5
     )
@@ -194,7 +197,7 @@ def overhead(petsc: Sequence[str], limits: Limits) -> Result:
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """A folder beside the results, on the same file system, removed afterwards."""
+    """A temporary folder on the file system of the results."""
     scratch = (folder / "scratch").resolve()
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
@@ -205,7 +208,7 @@ def _scratch(folder: Path) -> Iterator[Path]:
 
 
 def output(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
-    """Speed of writing states (positions and velocities), beside that of plain files."""
+    """Measure the speed of writing states (positions and velocities), and of plain files."""
     scene = hanging_square(vertices) | {"output": {"every": STEP, "fields": ["velocity"]}}
     with _scratch(folder) as scratch:
         return measure(
@@ -218,7 +221,7 @@ def _program(ranks: int, *words: str) -> list[str]:
 
 
 def default_scene(ranks: int, petsc: Sequence[str], folder: Path, limits: Limits, *, short: bool) -> Result:
-    """Time of the default scene, and the share of it that goes into output."""
+    """Measure the time of the default scene, and the fraction of it spent on output."""
     shorter = ["--set", "time.end=0.05"] if short else []
     with _scratch(folder) as scratch:
         seconds, _ = run([*_program(ranks, "--out", str(scratch / "run")), *shorter, *petsc], limits.process)
@@ -234,7 +237,7 @@ def default_scene(ranks: int, petsc: Sequence[str], folder: Path, limits: Limits
 
 
 def start_up(petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
-    """Time of a process that runs one step of the default scene and ends, with numba's cache filled."""
+    """Measure the time of a process that runs one step of the default scene, with numba's cache filled."""
     with _scratch(folder) as scratch:
         words = _program(1, "--out", str(scratch / "run"), "--force")
         times = [run([*words, "-ts_max_steps", "1", *petsc], limits.process).wall for _ in range(REPEATS + 1)]

@@ -44,7 +44,7 @@ def parse(text: str) -> tuple[str, str]:
 
 
 def write_files(folder: Path, vertices: int) -> None:
-    """The mesh and the material of the hanging square."""
+    """Write the mesh and the material of the hanging square."""
     folder.mkdir(parents=True, exist_ok=True)
     mesh = build_mesh(Scene.model_validate(hanging_square(vertices)).mesh)
     with (folder / OBJ_FILE).open("w", encoding="ascii") as file:
@@ -62,7 +62,7 @@ def write_files(folder: Path, vertices: int) -> None:
 
 
 def write_scene(folder: Path, vertices: int, steps: int) -> Path:
-    """The scene of so many steps."""
+    """Write the scene with a number of steps; returns its path."""
     scene = {
         "frame_time": STEP,
         "frame_steps": 1,
@@ -77,9 +77,9 @@ def write_scene(folder: Path, vertices: int, steps: int) -> Path:
 
 
 def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> dict[str, Any]:
-    """Wall and CPU seconds per step of a command: a run of `WARM_UP` steps taken from one of more.
+    """Wall and CPU seconds per step of a command: the difference of a long run and one of `WARM_UP` steps.
 
-    So start-up, reading and the first steps, which ours are not charged with either, drop out.
+    So start-up, input and the first steps are excluded, as for this program.
 
     Raises
     ------
@@ -89,14 +89,14 @@ def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> d
     write_files(folder, vertices)
 
     def run_for(steps: int) -> Spent:
-        told = {"obj": folder / OBJ_FILE, "json": write_scene(folder, vertices, steps), "steps": steps}
+        values = {"obj": folder / OBJ_FILE, "json": write_scene(folder, vertices, steps), "steps": steps}
         line = command
-        for name, value in told.items():
+        for name, value in values.items():
             line = line.replace(f"{{{name}}}", shlex.quote(str(value)))
         return run(line, limits.process, folder)
 
     began = time.perf_counter()
-    run_for(WARM_UP)  # its caches
+    run_for(WARM_UP)  # fills its caches
     short = [run_for(WARM_UP)]
     steps = int(np.clip(limits.seconds * WARM_UP / max(short[0].wall, 1e-9), 2, limits.steps))
     long = [run_for(WARM_UP + steps)]

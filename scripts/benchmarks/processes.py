@@ -1,4 +1,4 @@
-"""Processes that are measured: started, limited in time, listened to, and ended with all their children."""
+"""Starts measured processes with a time limit, reads their errors, and ends them with all their children."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from typing import Any, NamedTuple
 from lyra_petsc.api.mpirun import environment, find_launcher
 
 GRACE = 10.0
-"""Seconds [s] that a process gets to leave before it is killed."""
+"""Seconds after the request to end before a process is killed."""
 
 HERE = Path(__file__).parents[2]
 WORKER = Path("scripts", "benchmarks", "worker.py")
 
 
 class Failed(Exception):
-    """A measurement that came to nothing; one line says why."""
+    """A measurement failed; the message is one line."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How long things may take.
+    """Limits of a measurement.
 
     Attributes
     ----------
     steps : int
-        Measured steps of a row, at most.
+        Maximum number of measured steps of a row.
     seconds : float
         Time [s] after which a row measures no further steps.
     process : float
-        Time [s] after which a process is given up.
+        Time limit [s] of a process.
     """
 
     steps: int
@@ -49,7 +49,7 @@ class Limits:
 
 
 class Spent(NamedTuple):
-    """Wall time [s] of a process, and CPU time [s] of it and of those that it has started."""
+    """Wall time [s] of a process, and CPU time [s] of it and its children."""
 
     wall: float
     cpu: float
@@ -58,28 +58,27 @@ class Spent(NamedTuple):
 def run(
     command: Sequence[str] | str, limit: float, cwd: Path | None = None, *, program: Path = HERE
 ) -> Spent:
-    """Run a command, a list of words or one line for the shell, that imports the program of a checkout; what
-    it took.
+    """Run a command, a list of words or a line for the shell, with the package of the checkout ``program``.
 
     Raises
     ------
     Failed
-        If it cannot be started, takes longer than ``limit`` [s] or ends with another exit code than 0.
+        If it cannot be started, takes longer than ``limit`` [s] or has a nonzero exit code.
     """
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as heard:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         began, cpu = time.perf_counter(), _cpu_of_children()
-        inherited = environment()
+        variables = environment()
         if program != HERE:
-            inherited["PYTHONPATH"] = os.pathsep.join([str(program), inherited.get("PYTHONPATH", "")])
+            variables["PYTHONPATH"] = os.pathsep.join([str(program), variables.get("PYTHONPATH", "")])
         try:
             process = subprocess.Popen(
                 command,
                 shell=isinstance(command, str),
                 cwd=cwd,
-                env=inherited,
+                env=variables,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=heard,
+                stderr=errors,
                 start_new_session=True,
             )
         except OSError as error:
@@ -91,9 +90,9 @@ def run(
         finally:
             _end(process)
         spent = Spent(time.perf_counter() - began, _cpu_of_children() - cpu)
-        heard.seek(0)
+        errors.seek(0)
         if code != 0:
-            raise Failed(_last_words(heard.read(), code))
+            raise Failed(_error_message(errors.read(), code))
     return spent
 
 
@@ -103,7 +102,7 @@ def _cpu_of_children() -> float:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process that still runs, and what it has started."""
+    """End a process that is still running, and its children."""
     if process.poll() is not None:
         return
     process.terminate()
@@ -114,31 +113,31 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _last_words(heard: str, code: int) -> str:
-    """What a process said in the end: our line where there is one, else its last."""
-    lines = [line.strip() for line in heard.splitlines() if line.strip(" -\t*")]
+def _error_message(stderr: str, code: int) -> str:
+    """Message of a failed process: this program's line if there is one, else the last line."""
+    lines = [line.strip() for line in stderr.splitlines() if line.strip(" -\t*")]
     ours = [line.removeprefix("lyra-petsc: ") for line in lines if line.startswith("lyra-petsc: ")]
     errors = [line for line in lines if line.partition(":")[0].endswith(("Error", "Exception"))]
     if ours:
         return ours[0]
-    said = (errors or lines)[-1:]
+    last = (errors or lines)[-1:]
     reason = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-    return f"{reason}: {said[0][:200]}" if said else reason
+    return f"{reason}: {last[0][:200]}" if last else reason
 
 
 def measure(
     kind: str, ranks: int, petsc: Sequence[str], limit: float, *, program: Path = HERE, **job: Any
 ) -> dict[str, Any]:
-    """One measurement of a checkout's ``worker.py`` on so many ranks; its result.
+    """Perform one measurement by a checkout's ``worker.py`` on ``ranks`` ranks; returns its result.
 
     Raises
     ------
     Failed
     """
     with tempfile.TemporaryDirectory(prefix="lyra-bench-") as folder:
-        told, result = Path(folder, "job.json"), Path(folder, "result.json")
-        told.write_text(json.dumps({"kind": kind, **job}), encoding="utf-8")
-        words = [sys.executable, str(program / WORKER), str(told), str(result), *petsc]
+        job_file, result = Path(folder, "job.json"), Path(folder, "result.json")
+        job_file.write_text(json.dumps({"kind": kind, **job}), encoding="utf-8")
+        words = [sys.executable, str(program / WORKER), str(job_file), str(result), *petsc]
         run([*find_launcher(ranks), *words], limit, program=program)
         found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
     return found

@@ -1,4 +1,4 @@
-"""What was measured as Markdown, and the numbers derived from it."""
+"""Markdown tables of the measurements, and derived numbers."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from lyra_petsc.show.report.plots import fitted_slope
 
 Result = dict[str, Any]
 
-COUNTS_FROM = 4500
-"""Vertices from which a size counts for the exponent of growth."""
+GROWTH_FROM = 4500
+"""Number of vertices from which sizes are used for the exponent of growth."""
 
 PARTS = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
 
 Row = dict[str, str]
-"""Cells of a row of a table by their columns."""
+"""Cells of a table row by column."""
 
 
 def number(value: float, digits: int = 3) -> str:
-    """To so many significant digits, without an exponent where one can read it."""
+    """A number with significant digits, without an exponent if it is readable."""
     if not math.isfinite(value):
         return "–"
     if value == 0.0 or 1e-4 <= abs(value) < 1e7:
@@ -39,7 +39,7 @@ def spread(values: Sequence[float], factor: float = 1.0) -> str:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Lines of a Markdown table with the columns of the first row; cells that others lack are dashes."""
+    """Lines of a Markdown table with the columns of the first row; missing cells are dashes."""
     names = list(rows[0])
     lines = [names, ["---"] * len(names), *([row.get(name, "–") for name in names] for row in rows)]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
@@ -51,19 +51,19 @@ def median_of(row: Result, name: str) -> float:
 
 
 def step_seconds(row: Result) -> list[float]:
-    """Seconds of each measured step, ours or a peer's."""
+    """Seconds of each measured step, of this program or a peer."""
     return row["step_seconds"] if "step_seconds" in row else [step["seconds"] for step in row["steps"]]
 
 
 def main_table(rows: Sequence[Result]) -> list[str]:
-    """Rows of ours and of peers, by size; ratios to the first method on one rank at that size."""
+    """Table of this program and peers, by size, with ratios to the first method on one rank of that size."""
     first = {}
     for row in rows:
         if row["who"] == METHODS[0]:
             first.setdefault(row["vertices"], row)
     ordered = sorted(rows, key=lambda row: row["vertices"])
     cells = [_main_row(row, first.get(row["vertices"])) for row in ordered]
-    # with all columns, where the first row is a peer's
+    # the first row may be a peer's, which has fewer columns
     columns: Row = dict.fromkeys(max(cells, key=len), "–")
     return table([columns | each for each in cells])
 
@@ -99,15 +99,13 @@ def _main_row(row: Result, first: Result | None) -> Row:
     }
 
 
-def of_vertex(found: Result) -> float:
-    """CPU seconds of a step over vertices."""
+def cpu_per_vertex(found: Result) -> float:
+    """CPU seconds of a step over the number of vertices."""
     return median_of(found, "cpu") / found["vertices"]
 
 
 def contact_table(results: Sequence[Result]) -> list[str]:
-    """Steps in contact beside those of the sheets that swing, named before them; how both grow with the
-    vertices, and what further ranks bring.
-    """
+    """Table of steps in contact, relative to those of swinging sheets listed before; growth and speed-up."""
     rows = []
     for result in results:
         base: Result = {}
@@ -137,7 +135,7 @@ def contact_table(results: Sequence[Result]) -> list[str]:
 
 
 def _growth_of_contact(results: Sequence[Result]) -> list[str]:
-    """Exponents of the cost of a step on one rank, and the wall time of one rank over that of several."""
+    """Exponents of the CPU time of a step on one rank, and speed-ups on several ranks."""
     lines: list[str] = []
     for name in dict.fromkeys(name for result in results for name in result["meshes"]):
         of = {
@@ -159,19 +157,19 @@ def _growth_of_contact(results: Sequence[Result]) -> list[str]:
 
 
 def meshes_table(results: Sequence[Result]) -> list[str]:
-    """Kinds of meshes beside the first, by time a vertex, and the slowest of all."""
+    """Table of time per vertex on kinds of meshes, relative to the first, and the slowest one."""
     rows, slowest, first = [], (0.0, ""), next(iter(results[0]["meshes"]))
     for result in results:
-        base = of_vertex(result["meshes"][first])
+        base = cpu_per_vertex(result["meshes"][first])
         for kind, found in result["meshes"].items():
-            ratio = of_vertex(found) / base
+            ratio = cpu_per_vertex(found) / base
             slowest = max(slowest, (ratio, f"{kind}, {found['vertices']} vertices"))
             rows.append(
                 {
                     "vertices": str(found["vertices"]),
                     "mesh": kind,
                     "CPU ms a step": spread([step["cpu"] for step in found["steps"]], 1e3),
-                    "µs a vertex": number(1e6 * of_vertex(found)),
+                    "µs a vertex": number(1e6 * cpu_per_vertex(found)),
                     f"times {first}": number(ratio),
                     "CG iterations": number(median_of(found, "cg")),
                     "preset": found["preset"],
@@ -183,7 +181,7 @@ def meshes_table(results: Sequence[Result]) -> list[str]:
 
 
 def bending_table(results: Sequence[Result]) -> list[str]:
-    """Directors on edges over hinges, in time and memory; CG iterations of a step, and their growth."""
+    """Table of the midedge model relative to hinges, in time and memory; CG iterations and their growth."""
     rows: list[Row] = []
     least: dict[tuple[str, str, int], float] = {}
     for result in results:
@@ -215,7 +213,7 @@ def bending_table(results: Sequence[Result]) -> list[str]:
 
 
 def against_table(results: Sequence[Result]) -> list[str]:
-    """This program over that of another checkout, pair by pair; the median of all rows and the largest."""
+    """Table of this program relative to another checkout, pair by pair; median of all rows and largest."""
     rows, medians = [], []
     for result in results:
         pairs = list(zip(result["here"], result["other"], strict=True))
@@ -250,8 +248,8 @@ def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
 
 
 def growth(rows: Sequence[Result]) -> Result:
-    """Exponents of growth of rows that differ in size alone, from `COUNTS_FROM` vertices on."""
-    counted = sorted((r for r in rows if r["vertices"] >= COUNTS_FROM), key=lambda r: r["vertices"])
+    """Exponents of growth of rows that only differ in size, from `GROWTH_FROM` vertices on."""
+    counted = sorted((r for r in rows if r["vertices"] >= GROWTH_FROM), key=lambda r: r["vertices"])
     costs: dict[str, Callable[[Result], float]] = {
         "step": lambda row: median_of(row, "seconds"),
         "assembly": lambda row: median_of(row, "assembly"),
@@ -264,9 +262,9 @@ def growth(rows: Sequence[Result]) -> Result:
     }
 
 
-def growth_words(found: Result) -> list[str]:
+def growth_lines(found: Result) -> list[str]:
     if not math.isfinite(found["step"]):
-        return [f"Growth needs two sizes of {COUNTS_FROM} vertices or more: --vertices or --growth."]
+        return [f"Growth needs two sizes of {GROWTH_FROM} vertices or more: --vertices or --growth."]
     sizes = ", ".join(map(str, found["vertices"]))
     return [
         f"Exponent of growth over {sizes} vertices, first method, one rank: time per step "
@@ -276,7 +274,7 @@ def growth_words(found: Result) -> list[str]:
 
 
 def weak_table(rows: Sequence[Result]) -> list[str]:
-    """Weak scaling: vertices per rank stay the same."""
+    """Table of weak scaling, with a constant number of vertices per rank."""
     base = median_of(rows[0], "seconds")
     return table(
         [
@@ -295,7 +293,7 @@ def weak_table(rows: Sequence[Result]) -> list[str]:
 
 
 def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
-    """What ranks bring, beside what they could bring if they had nothing to tell each other."""
+    """Table of the speed-up on several ranks, and of that of independent sheets, its bound."""
 
     def cells(found: Result) -> Row:
         same = [
@@ -321,7 +319,7 @@ def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
 
 
 def presets_table(rows: Sequence[Result]) -> list[str]:
-    """CG iterations of one solve, and time, of each preset, cloth and Δt against size."""
+    """Table of CG iterations of one solve, and time, of each preset, cloth and Δt by size."""
     sizes = sorted({row["vertices"] for row in rows})
     lines: dict[tuple[str, str], Row] = {}
     for row in rows:
@@ -356,7 +354,7 @@ def document(results: Result) -> str:
         ("bending", "## Directors on edges beside hinges", bending_table),
         ("against", "## Beside another checkout", against_table),
         ("contact", "## Contact", contact_table),
-        ("growth", "", growth_words),
+        ("growth", "", growth_lines),
         ("weak", "## Weak scaling", weak_table),
         ("apart", "## What ranks bring", lambda apart: apart_table(results["rows"], apart)),
         ("presets", "## CG iterations a solve, and time per step", presets_table),

@@ -1,10 +1,10 @@
-"""One measurement, in a process (or an mpirun) of its own, so that nothing of another one is in its memory.
+"""Performs one measurement in its own process or mpirun, so that memory is not affected by others.
 
     mpirun -n P python worker.py JOB.json RESULT.json [-petsc options]
 
-``JOB.json`` holds ``kind`` (a name in `KINDS`), ``scene`` and what else the kind takes; all times are in
-seconds of wall time, between barriers. With ``plain``, a folder for numba's cache, kernels call the functions
-of ``tests/kernels/plain_vectors.py`` instead of those written in LLVM's language.
+``JOB.json`` holds ``kind`` (a name in `KINDS`), ``scene`` and further parameters of the kind; times are in
+seconds of wall time, between barriers, unless stated otherwise. With ``plain``, a folder for numba's cache,
+kernels call the functions of ``tests/kernels/plain_vectors.py`` instead of those in LLVM's language.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import petsc4py
 petsc4py.init([sys.argv[0], *sys.argv[3:]])
 
 if plain := json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")).get("plain"):
-    # before anything imports what they replace; kernels in the usual cache contain the others
+    # before the module that they replace is imported; another cache, as cached kernels contain the others
     os.environ["NUMBA_CACHE_DIR"] = plain
     sys.path.append(str(Path(__file__).parents[2] / "tests" / "kernels"))
     sys.modules["lyra_petsc.kernels.vectors"] = importlib.import_module("plain_vectors")
@@ -42,8 +42,8 @@ from lyra_petsc.output.summary import versions  # noqa: E402
 from lyra_petsc.scene.schema import Scene  # noqa: E402
 from lyra_petsc.stepping.simulation import SteppedScene  # noqa: E402
 
-FEWEST = 2
-"""Steps that are measured however long they take."""
+MIN_STEPS = 2
+"""Smallest number of measured steps, however long they take."""
 
 PARTS = {
     "residual": phases.RESIDUAL,
@@ -53,7 +53,7 @@ PARTS = {
     "preconditioner": "PCSetUp",
     "solve": "KSPSolve",
 }
-"""Parts of a step and their events in PETSc's log; none lies in another."""
+"""Parts of a step and their events in PETSc's log; they do not overlap."""
 
 Comm = MPI.Intracomm
 Result = dict[str, Any]
@@ -65,15 +65,15 @@ def now(comm: Comm) -> float:
 
 
 def resident() -> tuple[int, int]:
-    """Bytes of memory of this process now, and at most so far (Linux)."""
+    """Current and peak resident memory of this process [bytes] (Linux)."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     now_and_peak = [re.search(rf"^{name}:\s+(\d+) kB", status, re.M) for name in ("VmRSS", "VmHWM")]
     current, peak = (1024 * int(found[1]) if found else 0 for found in now_and_peak)
     return current, peak
 
 
-def forget_peak() -> None:
-    """Let the peak begin anew: importing takes more than it keeps."""
+def reset_peak() -> None:
+    """Reset the peak of the memory, as imports take more than they keep."""
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:
@@ -81,7 +81,7 @@ def forget_peak() -> None:
 
 
 def events(comm: Comm) -> dict[str, tuple[float, int]]:
-    """Seconds (mean of the ranks) and calls of each of `PARTS` so far."""
+    """Seconds (mean over ranks) and number of calls of each of `PARTS` so far."""
     stage = phases.STAGES["solve"].id
     found = {}
     for part, name in PARTS.items():
@@ -91,7 +91,7 @@ def events(comm: Comm) -> dict[str, tuple[float, int]]:
 
 
 def matrix_product(comm: Comm, matrix: PETSc.Mat) -> list[float]:
-    """Times of single products of a matrix with a vector, at least 20 and a fifth of a second."""
+    """Times of single products of a matrix with a vector: at least 20, and 0.2 s in total."""
     x, y = matrix.createVecs()
     x.setRandom()
     for _ in range(3):
@@ -107,12 +107,12 @@ def matrix_product(comm: Comm, matrix: PETSc.Mat) -> list[float]:
 
 
 def steps(comm: Comm, job: Result) -> Result:
-    """Set-up, steps and their parts, memory.
+    """Measure set-up, steps with their parts, and memory.
 
-    ``warm_up`` steps are taken first; then up to ``steps`` are measured, fewer when ``seconds`` are over.
+    After ``warm_up`` steps up to ``steps`` are measured, fewer if they take more than ``seconds``.
     """
     PETSc.Log.begin()
-    forget_peak()
+    reset_peak()
     before, _ = resident()
     began = now(comm)
     simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
@@ -137,18 +137,18 @@ def steps(comm: Comm, job: Result) -> Result:
         spent = {part: after[part][0] - past[part][0] for part in PARTS}
         calls = {part: after[part][1] - past[part][1] for part in PARTS}
         row |= spent | {"rest": max(0.0, seconds - sum(spent.values()))}
-        # of one Newton iteration; what is frozen in a step serves all of its iterations
+        # assembly time of a Newton iteration; quantities frozen in a step serve all of its iterations
         row["assembly"] = spent["residual"] / max(1, calls["residual"])
         row["assembly"] += (spent["jacobian"] + spent["frozen"]) / max(1, calls["jacobian"])
         row["solves"] = calls["solve"]
         rows.append(row)
         past = after
-        if comm.bcast(time.perf_counter() - first > job["seconds"] and len(rows) >= FEWEST):
+        if comm.bcast(time.perf_counter() - first > job["seconds"] and len(rows) >= MIN_STEPS):
             break
     _, peak = resident()
     outline, stepper = simulation.problem.outline, simulation.stepper
     operator, pattern = stepper.linear.operator, simulation.problem.pattern
-    # PETSc's own product, with the storage that has as many entries as ours
+    # PETSc's own product, with the storage of as many entries
     assembled = AssembledMatrix(simulation.problem.points, pattern, "sbaij")
     assembled.set(operator.rows)
     return {
@@ -170,9 +170,9 @@ def steps(comm: Comm, job: Result) -> Result:
 
 
 def meshes(comm: Comm, job: Result) -> Result:
-    """CPU time, summed over ranks, of steps of several sheets by turns: what else the machine does hits all.
+    """Measure CPU time, summed over ranks, of steps of several scenes by turns, so that disturbances hit all.
 
-    ``scenes`` are theirs by name; ``warm_up``, ``steps`` and ``seconds`` as of `steps`.
+    ``scenes`` by name; ``warm_up``, ``steps`` and ``seconds`` as for `steps`.
     """
     simulations, found = {}, {}
     for name, scene in job["scenes"].items():
@@ -200,14 +200,14 @@ def meshes(comm: Comm, job: Result) -> Result:
             if number >= job["warm_up"]:
                 iterations = {"cg": report.linear_iterations, "newton": report.newton_iterations}
                 found[name]["steps"].append({"cpu": cpu, "seconds": wall, **iterations})
-        enough = number >= job["warm_up"] - 1 + FEWEST
+        enough = number >= job["warm_up"] - 1 + MIN_STEPS
         if comm.bcast(time.perf_counter() - first > job["seconds"] and enough):
             break
     return {"meshes": found}
 
 
 def apart(comm: Comm, job: Result) -> Result:
-    """Each rank has a sheet of its own, at the same time: the steps of all, in seconds."""
+    """Measure steps of independent sheets, one a rank, at the same time."""
     own = steps(MPI.COMM_SELF, job)
     gathered = comm.gather([row["seconds"] for row in own["steps"]])
     seconds = [each for of_rank in gathered or [] for each in of_rank]
@@ -215,7 +215,7 @@ def apart(comm: Comm, job: Result) -> Result:
 
 
 def overhead(comm: Comm, job: Result) -> Result:
-    """Steps a second in ``blocks`` blocks of ``steps``, nothing logged."""
+    """Measure steps per second in ``blocks`` blocks of ``steps`` steps, without logging."""
     simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
     for _ in range(job["warm_up"]):
         simulation.step()
@@ -234,7 +234,7 @@ def overhead(comm: Comm, job: Result) -> Result:
 
 
 def output(comm: Comm, job: Result) -> Result:
-    """States with their checkpoints, by turns with plain files of the same sizes; all on the disk (fsync)."""
+    """Write states with checkpoints, by turns with plain files of the same sizes; all with fsync."""
     folder = Path(job["folder"])
     simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
     recorder = Recorder(simulation)
@@ -275,7 +275,7 @@ KINDS = {"steps": steps, "meshes": meshes, "apart": apart, "overhead": overhead,
 
 
 def main() -> None:
-    """Run the job on all ranks; rank 0 writes the result, or the line that says why there is none."""
+    """Run the job on all ranks; rank 0 writes the result, or prints the error."""
     comm = MPI.COMM_WORLD
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     try:
@@ -291,7 +291,7 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except Exception:  # the other ranks wait
+    except Exception:  # other ranks may be waiting
         import traceback
 
         traceback.print_exc()

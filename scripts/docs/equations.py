@@ -1,4 +1,4 @@
-"""Hook of the site: equations as MathML, which browsers show without a script or the network."""
+"""MkDocs hook that turns equations into MathML, which browsers show without scripts or network access."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\
 
 def on_page_content(content: str, **_: Any) -> str:
     """Called by MkDocs with the HTML of each page."""
-    return _EQUATION.sub(_in_mathml, content)
+    return _EQUATION.sub(_to_mathml, content)
 
 
-def _in_mathml(equation: re.Match[str]) -> str:
+def _to_mathml(equation: re.Match[str]) -> str:
     display = "block" if equation[2] == "[" else "inline"
     return str(convert(html.unescape(equation[3]).strip(), display=display))

@@ -1,7 +1,7 @@
 """Writes docs/reference/fabrics.md: the library's cloths in the tests of ``fabric``.
 
-``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: an hour of one core). FOLDER keeps what came
-of each test, which is not run again; the page has what is there.
+``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: an hour of one core). FOLDER keeps the outcomes;
+tests with an outcome there are not repeated, and the page shows all outcomes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CLOTHS = [*measured_names(), "aluminium", "paper"]
 
 SHAPES = ("cantilever", "loop")
 CURVES = ("tensile", "shear", "bending", *SHAPES)
-"""Tests with curves, and those whose curves are shapes."""
+"""Tests whose curves are shapes, and all tests with curves."""
 
 COLUMNS = {
     "EMT [%]": ("tensile", "EMT"),
@@ -39,17 +39,17 @@ COLUMNS = {
     "drape [%]": ("cusick", "drape coefficient"),
     "folds": ("cusick", "folds"),
 }
-"""Heads, and which test and quantity each is of."""
+"""Test and quantity of each column."""
 
 
 def records(folder: Path, cloth: str, test: str) -> list[Record]:
-    """What came of a test of a cloth, of warp and weft where they have one each."""
+    """Records of a test of a cloth; two if warp and weft are tested separately."""
     found = [read_record(folder / cloth / case.name / OUTCOME_FILE, Record) for case in cases_of(test)]
     return [record for record in found if record is not None]
 
 
 def measure(folder: Path, cloth: str, case: FabricCase) -> None:
-    """Run a test that has not been run."""
+    """Run a test unless it has an outcome."""
     file = folder / cloth / case.name / OUTCOME_FILE
     if read_record(file, Record) is None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def measure(folder: Path, cloth: str, case: FabricCase) -> None:
 
 
 def cell(found: list[Record], quantity: str) -> str:
-    """A number, or those of warp and weft; – without."""
+    """Text of a quantity, or of those of warp and weft; – for a missing one."""
     words = []
     for record in found:
         number = next((n for n in record.numbers if n.quantity == quantity), None)
@@ -73,7 +73,7 @@ def cell(found: list[Record], quantity: str) -> str:
 
 
 def sheet(folder: Path, cloth: str) -> bool:
-    """Curves and shadow of a cloth beside each other; whether there are any."""
+    """Draw curves and shadow of a cloth side by side; returns whether there are any."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -130,7 +130,7 @@ def page(folder: Path) -> None:
 
 
 def main() -> None:
-    """Run what is missing of the tests, and write the page after each of them."""
+    """Run the missing tests, and write the page after each kind of test."""
     folder = Path(sys.argv[1])
     for test in sys.argv[2:] or dict.fromkeys(test for test, _ in COLUMNS.values()):
         for cloth in CLOTHS:

@@ -76,7 +76,7 @@ OPTIONS = {
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; without "
     "any of these `average`; with `contact` bisection of space.",
 }
-"""What the program does with options that it reads, sets defaults for, or refuses."""
+"""Descriptions of the options that the program reads, sets or refuses."""
 
 _READ = re.compile(
     r"(?:is_set|petsc_number|hasName|getString|getReal|getInt|getBool)\(\s*\"(\w+)\"|\"(ts_(?:theta_\w+|dt|time_step))\""
@@ -92,7 +92,7 @@ _PLAIN = {
     "Path": "path",
     "tuple": "list",
 }
-"""Python's words for values in those of a scene's author."""
+"""Python values as they are written in a scene."""
 
 _DEFAULTS = {
     ("Time", "end"): "required; static: 1",
@@ -107,7 +107,7 @@ _DEFAULTS = {
 
 
 def options_read() -> set[str]:
-    """Names of the PETSc options that the program itself asks for."""
+    """Names of the PETSc options that the program itself reads."""
     found = set()
     for path in (ROOT / "lyra_petsc").rglob("*.py"):
         for match in _READ.finditer(path.read_text(encoding="utf-8")):
@@ -119,7 +119,7 @@ def options_read() -> set[str]:
 
 
 def scene_page() -> str:
-    """Every key of a scene."""
+    """The page of all keys of a scene."""
     parts = [
         "# Keys of a scene",
         MADE,
@@ -144,7 +144,7 @@ def _listed(words: Iterable[str]) -> str:
 
 
 def _blocks() -> Iterator[tuple[type[Block], list[str]]]:
-    """The blocks of a scene in the order of their first use, and the keys under which they stand."""
+    """The blocks of a scene in the order of their first use, with the keys that hold them."""
     places: dict[type[Block], list[str]] = {Scene: []}
     waiting = [Scene]
     while waiting:
@@ -179,7 +179,7 @@ def _block_section(block: type[Block], where: list[str]) -> str:
 
 
 def _further(block: type[Block]) -> str:
-    """What a docstring says between its first paragraph and its list."""
+    """The second paragraph of a block's docstring, if it is not the list of attributes."""
     paragraphs = (block.__doc__ or "").split("\n\n")[1:]
     more = [" ".join(p.split()) for p in paragraphs if "Attributes\n" not in p and p.strip()]
     return " " + more[0] if more else ""
@@ -220,7 +220,7 @@ def _default(field: Any) -> str:
 
 
 def petsc_page() -> str:
-    """PETSc options that the program has to do with, and the linear solvers it starts with."""
+    """The page of PETSc options that the program reads, sets or refuses, and of its linear solvers."""
     rows = ["| option | |", "| --- | --- |", *(f"| `-{name}` | {text} |" for name, text in OPTIONS.items())]
     presets = ["| name | options |", "| --- | --- |"]
     presets += [f"| `{name}` | `{_words(options)}` |" for name, options in PRESETS.items()]
@@ -250,7 +250,7 @@ def _words(options: dict[str, Value]) -> str:
 
 
 def commands_page() -> str:
-    """The help text of every verb."""
+    """The page of the help texts of all verbs."""
     parts = [
         "# Commands",
         MADE,
