@@ -32,5 +32,6 @@ def test_a_sheet_on_a_slope_by_multipliers(trials: ModuleType, part: float) -> N
     if part > 1.0:
         assert found["creep"] < 1e-6
     else:
-        exact = trials.G * (1.0 - part) * math.sin(math.radians(30.0)) * (1.0 - trials.LATE) * trials.SLID
+        seconds = (1.0 - trials.MEASURE_FROM) * trials.SLID
+        exact = trials.G * (1.0 - part) * math.sin(math.radians(30.0)) * seconds
         assert found["change"] == pytest.approx(exact, rel=1e-4)
