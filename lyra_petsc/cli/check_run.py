@@ -13,7 +13,7 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.start_crossings import Overlaps, find_overlaps
+from lyra_petsc.mesh.overlaps import Overlaps, find_overlaps
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root

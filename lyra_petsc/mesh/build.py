@@ -1,7 +1,7 @@
-"""From the mesh sources of a scene, files and grids, to one checked mesh; serial, for rank 0.
+"""Build one checked mesh from the mesh sources of a scene (files and grids), on rank 0.
 
-What cannot be simulated is refused, with the numbers of vertices and triangles; neighbouring triangles are
-turned so that they run along their common edge in opposite directions.
+Meshes that cannot be simulated are refused; the messages give the numbers of vertices and triangles.
+Triangles are oriented consistently: neighbours traverse their common edge in opposite directions.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
 
-# a triangle is degenerate if twice its area is below this share of its longest side squared: slivers of
-# aspect 1e9 pass, and three points on a line do not, whatever their round-off
+# A triangle is degenerate if twice its area is below this fraction of its longest side squared. Slivers of
+# aspect ratio 1e9 pass; three points on a line do not, despite their round-off.
 _FLATNESS = 1e-10
 
 
 def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None) -> None:
-    """Refuse a mesh that is not a surface, whatever its scale and position.
+    """Refuse a mesh that is not a surface.
 
     Raises
     ------
     InputError
-        No triangles, non-finite coordinates, a triangle that uses a vertex twice, duplicate triangles,
-        vertices in no triangle. Triangles and vertices are counted from 0 in file order, after splitting
-        quads.
+        No triangles, non-finite coordinates, a triangle that uses a vertex twice, duplicate triangles, or
+        vertices in no triangle. Triangles and vertices are counted from 0 in file order, quads as two
+        triangles.
     """
 
     def refuse(message: str) -> None:
@@ -66,12 +66,12 @@ def check_shape(corners: Array, shape: str, *, file: object | None, key: str | N
     corners : (F, 3, d) float64
         Corners of the triangles [m], d = 2 or 3.
     shape : str
-        Which shape this is (``rest`` or ``start``), for the message.
+        ``rest`` or ``start``, for the message.
 
     Raises
     ------
     InputError
-        Triangles whose area is zero, up to round-off, or too large for a number.
+        Triangles whose area is zero up to round-off, or overflows.
     """
     with np.errstate(all="ignore"):
         a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -80,20 +80,20 @@ def check_shape(corners: Array, shape: str, *, file: object | None, key: str | N
             double_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         else:
             double_area = np.linalg.norm(np.cross(a, b), axis=1)
-        # coordinates carry a round-off of their own size: what is left of a line far from the origin
+        # far from the origin the round-off of the coordinates gives collinear points some area
         noise = 16 * np.finfo(np.float64).eps * np.abs(corners).max(axis=(1, 2)) * longest
         flat = double_area <= np.maximum(_FLATNESS * longest**2, noise)
-    for wrong, words in (
+    for wrong, text in (
         (~np.isfinite(double_area), f"triangles too large to compute in the {shape} shape"),
         (flat, f"degenerate triangles (no area in the {shape} shape)"),
     ):
         if wrong.any():
             numbers = first_few(np.flatnonzero(wrong).tolist())
-            raise InputError(f"{words}: {numbers} (counted from 0)", file=file, key=key)
+            raise InputError(f"{text}: {numbers} (counted from 0)", file=file, key=key)
 
 
 def _duplicates(triangles: Ints) -> Ints:
-    """Triangles with the three vertices of an earlier one, ascending."""
+    """Triangles with the same three vertices as an earlier triangle, ascending."""
     corners = np.sort(triangles, axis=1)
     order = np.lexsort(corners.T[::-1])
     same = (corners[order][1:] == corners[order][:-1]).all(axis=1)
@@ -101,9 +101,9 @@ def _duplicates(triangles: Ints) -> Ints:
 
 
 def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None:
-    """Turn triangles over until the orientation is consistent in each connected piece, with a note.
+    """Orient the triangles of each connected component consistently by reversing some, with a note.
 
-    In each piece the larger part keeps its orientation, in a tie that of the first triangle.
+    In each component the majority keeps its orientation; in a tie the first triangle does.
 
     Parameters
     ----------
@@ -119,12 +119,12 @@ def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None
     begin = table.first[table.sizes == 2]
     first, second = table.sides[begin], table.sides[begin + 1]
     corner = sheet.triangles.reshape(-1)
-    # both sides start at the same vertex: the two triangles disagree
+    # sides that start at the same vertex belong to triangles of opposite orientation
     disagree = corner[first] == corner[second]
     if not disagree.any():
         return
     pairs = np.stack([first // 3, second // 3], axis=1)
-    turned = _walk(len(sheet.triangles), pairs, disagree)
+    turned = _triangles_to_reverse(len(sheet.triangles), pairs, disagree)
     contradiction = pairs[(turned[pairs[:, 0]] != turned[pairs[:, 1]]) != disagree]
     if contradiction.size:
         shown = first_few(f"{one}-{other}" for one, other in contradiction.tolist())
@@ -144,42 +144,45 @@ def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None
     )
 
 
-def _walk(n_triangles: int, pairs: Ints, disagree: Mask) -> Mask:
-    """Triangles to turn over, by a breadth-first walk over each connected piece."""
-    links: list[list[tuple[int, bool]]] = [[] for _ in range(n_triangles)]
+def _triangles_to_reverse(n_triangles: int, pairs: Ints, disagree: Mask) -> Mask:
+    """Whether to reverse each triangle (F,), by breadth-first search in each connected component.
+
+    ``pairs`` (n, 2) are neighbours, ``disagree`` (n,) whether their orientations are opposite.
+    """
+    neighbours: list[list[tuple[int, bool]]] = [[] for _ in range(n_triangles)]
     for (one, other), differs in zip(pairs.tolist(), disagree.tolist(), strict=True):
-        links[one].append((other, differs))
-        links[other].append((one, differs))
+        neighbours[one].append((other, differs))
+        neighbours[other].append((one, differs))
     turned: list[bool | None] = [None] * n_triangles
     for seed in range(n_triangles):
         if turned[seed] is not None:
             continue
         turned[seed] = False
-        piece, queue = [seed], deque([seed])
+        component, queue = [seed], deque([seed])
         while queue:
-            here = queue.popleft()
-            for there, differs in links[here]:
-                if turned[there] is None:
-                    turned[there] = bool(turned[here]) != differs
-                    piece.append(there)
-                    queue.append(there)
-        if 2 * sum(bool(turned[member]) for member in piece) > len(piece):
-            for member in piece:
-                turned[member] = not turned[member]
+            triangle = queue.popleft()
+            for other, differs in neighbours[triangle]:
+                if turned[other] is None:
+                    turned[other] = bool(turned[triangle]) != differs
+                    component.append(other)
+                    queue.append(other)
+        if 2 * sum(bool(turned[t]) for t in component) > len(component):
+            for t in component:
+                turned[t] = not turned[t]
     return np.array(turned, dtype=np.bool_)
 
 
 def grid_sheet(grid: Grid) -> Sheet:
     """Triangles of an nx × ny grid of cells, from the origin to (width, height, 0).
 
-    Vertex ``j (nx + 1) + i`` lies at column i, row j. ``diagonal`` joins (i, j) to (i+1, j+1);
-    ``alternating`` flips that where i + j is odd; ``criss-cross`` adds the centre of cell (i, j) as
-    vertex ``(nx + 1)(ny + 1) + j nx + i``. All triangles run anticlockwise seen from +z, those of a
-    cell follow each other. Groups: surface ``sheet``, curves ``left``, ``right``, ``bottom``, ``top``,
-    points ``corners``.
+    Vertex ``j (nx + 1) + i`` is at column i, row j. The pattern ``diagonal`` joins (i, j) to (i+1, j+1);
+    ``alternating`` takes the other diagonal where i + j is odd; ``criss-cross`` adds the centre of cell
+    (i, j) as vertex ``(nx + 1)(ny + 1) + j nx + i``. All triangles are anticlockwise seen from +z; those of
+    a cell are consecutive. Groups: surface ``sheet``, curves ``left``, ``right``, ``bottom``, ``top``, points
+    ``corners``.
     """
     nx, ny = grid.nx, grid.ny
-    points = _lattice(nx, ny, grid.width, grid.height)
+    points = _lattice_points(nx, ny, grid.width, grid.height)
     low_left = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)[None, :]).reshape(-1)
     cell = np.stack([low_left, low_left + 1, low_left + nx + 2, low_left + nx + 1], axis=1)
     if grid.pattern == "criss-cross":
@@ -200,13 +203,13 @@ def grid_sheet(grid: Grid) -> Sheet:
     return Sheet(points, triangles, groups=_grid_groups(nx, ny, len(triangles)))
 
 
-def grid_vertices(grid: Grid) -> int:
+def count_grid_vertices(grid: Grid) -> int:
     """Number of vertices of a grid."""
     nx, ny = grid.nx, grid.ny
     return (nx + 1) * (ny + 1) + (nx * ny if grid.pattern == "criss-cross" else 0)
 
 
-def _lattice(nx: int, ny: int, width: float, height: float) -> Array:
+def _lattice_points(nx: int, ny: int, width: float, height: float) -> Array:
     points = np.zeros(((nx + 1) * (ny + 1), 3))
     points[:, 0] = np.tile(np.linspace(0.0, width, nx + 1), ny + 1)
     points[:, 1] = np.repeat(np.linspace(0.0, height, ny + 1), nx + 1)
@@ -224,13 +227,13 @@ def _grid_groups(nx: int, ny: int, n_triangles: int) -> list[NamedSet]:
 
 
 Members = dict[tuple[str, int], list[Ints]]
-"""Of groups of the whole mesh, by name and dimension: from each source."""
+"""Members of the groups of the whole mesh by name and dimension, one array for each source."""
 
 
-def _take_groups(
+def _add_groups(
     members: Members, groups: list[NamedSet], source: str | None, n_triangles: int, first: tuple[int, int]
 ) -> None:
-    """Add the groups of a source of ``n_triangles``; ``first`` numbers its vertex 0 and its triangle 0."""
+    """Add the groups of a source to ``members``; ``first``: numbers of its first vertex and triangle."""
     found = [(each.name, each.dimension, each.members + first[each.dimension == 2]) for each in groups]
     if source is not None:
         found += [(f"{source}.{name}", dimension, each) for name, dimension, each in found]
@@ -240,10 +243,10 @@ def _take_groups(
 
 
 def _named_groups(members: Members, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
-    """Groups by unique name, and a note for each that had to change; ``triangles`` (F, 3) of the mesh."""
+    """Groups by unique name, and a note for each group that was renamed; ``triangles`` (F, 3)."""
     groups: dict[str, Group] = {}
     notes: list[str] = []
-    # surfaces first: they keep the name, as materials can be told by surface groups only
+    # surfaces come first and keep the name, as materials are assigned by surface groups only
     for name, dimension in sorted(members, key=lambda entry: -entry[1]):
         unique, kind = name, DIMENSION_NAMES[dimension]
         while unique in groups:
@@ -268,33 +271,33 @@ def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
 
 
 def build_scene_mesh(scene: Scene, report: Callable[[str], None] | None = None) -> Mesh:
-    """`build_mesh` of a scene's sources, with its obstacles; scripts are trusted if the scene's are."""
+    """The mesh of a scene's sheets (`build_mesh`), with the surfaces of its obstacles."""
     mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, report=report)
     for name, obstacle in (scene.obstacles or {}).items():
         if obstacle.mesh is not None:
             source = MeshSource(file=obstacle.mesh.file, transform=obstacle.mesh.transform)
-            mesh.obstacles[name], notes = _surface(source, scene.trusts_meshes, report)
+            mesh.obstacles[name], notes = _read_surface(source, scene.trusts_meshes, report)
             mesh.notes += [f"obstacle {name}: {note}" for note in notes]
     return mesh
 
 
-def _surface(
+def _read_surface(
     source: MeshSource, trust_scripts: bool, report: Callable[[str], None] | None
 ) -> tuple[TriangleSurface, list[str]]:
-    """The surface of an obstacle at t = 0 without unused points, and what the reader of its file noted."""
+    """The surface of an obstacle at t = 0, without unused points, and the notes of its file's reader."""
     try:
         sheet = _read(source, trust_scripts, report)
         used, numbers = np.unique(sheet.triangles, return_inverse=True)
         whole = Sheet(sheet.points[used], numbers.reshape(-1, 3).astype(np.int64))
         check_topology(whole, file=source.file)
-        _, points = _placed(whole.points, source.transform)
+        _, points = _transformed(whole.points, source.transform)
         check_shape(points[whole.triangles], "start", file=source.file)
     except MemoryError:
         raise InputError("the mesh does not fit into memory", file=source.file) from None
     return TriangleSurface(points, whole.triangles), sheet.notes
 
 
-def _placed(points: Array, transform: Transform) -> tuple[Array, ...]:
+def _transformed(points: Array, transform: Transform) -> tuple[Array, ...]:
     """Points (n, 3) [m] after the scaling, and after the whole transform."""
     scaled = points * np.asarray(transform.scale)
     turned = scaled if transform.rotate is None else scaled @ _rotation_matrix(transform.rotate).T
@@ -310,13 +313,12 @@ def build_mesh(
 ) -> Mesh:
     """Read, transform, check and join the mesh sources of a scene.
 
-    Vertices are numbered consecutively over the sources, in file order within each. Groups: a named
-    source is a surface group of its name; its own groups are found by their names, where those of equal
-    name in several sources are one group, and as ``source.group``. Where one name stands for groups of
-    different dimension, the surface (else the curve) keeps it and the others become ``name.curve`` and
-    ``name.point``, with a note.
+    Vertices are numbered consecutively over the sources, in file order within each source. A named source
+    is a surface group of its name; its own groups can also be called ``source.group``. Groups of equal name
+    in several sources are one group. Where groups of different dimension have one name, the surface (else
+    the curve) keeps it and the others become ``name.curve`` and ``name.point``, with a note.
 
-    Rest shape: with ``vt`` those, in metres, whatever the transform; without, the mesh after scaling.
+    The rest shape is given by the ``vt`` [m], without the transform; without ``vt`` it is the scaled mesh.
 
     Parameters
     ----------
@@ -324,14 +326,14 @@ def build_mesh(
     file : optional
         The scene file, for messages about keys.
     trust_scripts : bool
-        Give gmsh its scripts as they are, whatever they say.
+        Give scripts to gmsh unchecked.
     report : callable, optional
-        Called with a line now and then while gmsh is at work.
+        Called with a line of progress at intervals while gmsh works.
 
     Raises
     ------
     InputError
-        Whatever cannot be read or simulated; names the mesh file, or the scene's key.
+        A mesh cannot be read or simulated; the message names the mesh file, or the key of the scene.
     """
     members: Members = {}
     pieces: list[Mesh] = []
@@ -342,16 +344,16 @@ def build_mesh(
     for number, source in enumerate(sources):
         key = "mesh" if len(sources) == 1 else f"mesh[{number}]"
         if source.grid is not None:
-            check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
+            check_capacity(n_vertices + count_grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
             sheet = _read(source, trust_scripts, report)
-            piece = _prepare(sheet, source, key, file)
+            piece = _check_and_transform(sheet, source, key, file)
         except MemoryError:
             raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
         label = source.name or (source.file.name if source.file is not None else "grid")
         notes += [f"{label}: {note}" for note in sheet.notes]
         first = n_vertices, n_triangles
-        _take_groups(members, sheet.groups, source.name, piece.n_triangles, first)
+        _add_groups(members, sheet.groups, source.name, piece.n_triangles, first)
         pieces.append(piece)
         listed.append(Source(label, piece.n_vertices, piece.n_triangles))
         tags.append(np.zeros(piece.n_vertices, np.int64) if sheet.tags is None else sheet.tags)
@@ -385,12 +387,12 @@ def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None]
     return read_obj(source.file)
 
 
-def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) -> Mesh:
-    # a grid has no file of its own: its mistakes are the scene's
+def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: object | None) -> Mesh:
+    # a grid has no file: messages name the scene and its key
     where = {"file": source.file} if source.file is not None else {"file": file, "key": f"{key}.grid"}
     check_topology(sheet, **where)
     orient(sheet, **where)
-    rest, positions = _placed(sheet.points, source.transform)
+    rest, positions = _transformed(sheet.points, source.transform)
     uv = sheet.uv
     if uv is not None:
         check_shape(uv, "rest", **where)
@@ -427,7 +429,7 @@ def _rotation_matrix(rotation: Rotation) -> Array:
     direction /= np.linalg.norm(direction)
     quarter, rest = divmod(rotation.degrees, 90.0)
     if rest == 0.0:
-        # cos 90° is 6e-17 in floating point: a sheet turned upright would no longer be flat
+        # cos 90° is 6e-17 in floating point: a sheet rotated by 90° would no longer be flat
         cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter % 4)]
     else:
         cosine, sine = math.cos(math.radians(rotation.degrees)), math.sin(math.radians(rotation.degrees))

@@ -1,4 +1,4 @@
-"""Limit on the size of a mesh, checked by an estimate before anything of that size is allocated."""
+"""Limit on the size of a mesh, checked against an estimate of the memory before it is allocated."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.values import LARGEST_INDEX
 
 BYTES_PER_VERTEX = 2000
-"""Memory [B] a vertex takes on the rank that sets a scene up (measured: 2400 for a whole run on one rank)."""
+"""Memory [B] for a vertex on rank 0 during set-up (measured: 2400 for a whole run on one rank)."""
 
 _CGROUP = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 def available_memory() -> int:
-    """Memory [B] this process may use: the machine's, or what its container or ``ulimit -v`` allows."""
+    """Memory [B] that this process may use: the machine's, its container's or that of ``ulimit -v``."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for file in _CGROUP:
         try:
@@ -30,12 +30,12 @@ def available_memory() -> int:
 
 
 def check_capacity(n_vertices: int, *, file: object | None, key: str | None) -> None:
-    """Refuse a mesh that this machine cannot hold.
+    """Refuse a mesh that does not fit into memory.
 
     Raises
     ------
     InputError
-        With the number of vertices and the memory they would take.
+        The message gives the number of vertices and the memory needed.
     """
     memory = available_memory()
     needed = n_vertices * BYTES_PER_VERTEX

@@ -7,25 +7,25 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
 
-# below this length of x projected into a triangle's plane, y is the better guide
+# if the projection of x into the plane of a triangle is shorter, y is projected instead
 _NEARLY_NORMAL = 0.1
 
 
 def triangle_sides(corners: Array) -> tuple[Array, Array]:
-    """The two sides (n, d) each that leave the first corner; ``corners`` is (n, 3, d)."""
+    """Vectors (n, d) from the first corner to the second and to the third; ``corners`` is (n, 3, d)."""
     return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
 
 def rest_matrices(mesh: Mesh, warp_degrees: Array | float = 0.0) -> tuple[Array, Array]:
     """Inverse rest matrices in material axes, and rest areas.
 
-    With ``Dm = [u1 - u0, u2 - u0]`` (columns, in material axes) and ``Ds`` the same of current
-    positions, the deformation gradient is ``F = Ds Dm⁻¹``. The first material axis is the warp:
-    the first axis of ``triangle_uv`` rotated by ``warp_degrees`` anticlockwise in that plane.
+    With ``Dm = [u1 - u0, u2 - u0]`` (columns, in material axes) and ``Ds`` of current positions likewise,
+    the deformation gradient is ``F = Ds Dm⁻¹``. The first material axis is the warp: the first axis of
+    ``triangle_uv`` rotated by ``warp_degrees`` anticlockwise in the material plane.
 
-    ``det Dm`` is positive for every triangle: where the corners run clockwise in the material plane
-    (a mirrored pattern piece) the second material axis is reversed, after the rotation. That changes
-    the sign of the shear E_uv only, hence no energy of an orthotropic material.
+    ``det Dm`` is positive for every triangle: where the corners are clockwise in the material plane (a
+    mirrored pattern piece) the second material axis is reversed after the rotation. This only changes the
+    sign of the shear E_uv, on which the energy of an orthotropic material does not depend.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def rest_matrices(mesh: Mesh, warp_degrees: Array | float = 0.0) -> tuple[Array,
     m10 = cosine * a[:, 1] - sine * a[:, 0]
     m01 = cosine * b[:, 0] + sine * b[:, 1]
     m11 = cosine * b[:, 1] - sine * b[:, 0]
-    # from the unrotated sides, so that areas do not depend on the warp's round-off
+    # computed from the unrotated sides: areas do not depend on the round-off of the rotation
     determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     mirror = np.where(determinant < 0.0, -1.0, 1.0)
     m10, m11, determinant = mirror * m10, mirror * m11, np.abs(determinant)
@@ -60,12 +60,12 @@ def rest_matrices(mesh: Mesh, warp_degrees: Array | float = 0.0) -> tuple[Array,
 
 
 def mean_edge_length(mesh: Mesh) -> float:
-    """Mean rest length [m] of the triangles' sides (interior edges count twice)."""
+    """Mean rest length [m] of the sides of all triangles (an interior edge counts twice)."""
     return float(edge_lengths(mesh).mean())
 
 
 def edge_lengths(mesh: Mesh) -> Array:
-    """Rest lengths (F, 3) [m] of the triangles' sides (interior edges are there twice)."""
+    """Rest lengths (F, 3) [m] of the sides of each triangle."""
     uv = mesh.triangle_uv
     return np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
 
@@ -76,11 +76,11 @@ def bounding_diagonal(points: Array) -> float:
 
 
 def plane_coordinates(rest: Array, triangles: Ints) -> Array:
-    """Coordinates of each triangle's corners in its own plane.
+    """Coordinates of the corners of each triangle in the plane of the triangle.
 
-    The first axis is x projected into the plane, or y where the plane is nearly normal to x (x makes
-    less than about 6° with the normal); the second is the normal times the first. Coordinates are
-    measured from the origin, so those of a flat sheet are continuous. A sheet flat in xy gets its x, y.
+    The first axis is x projected into the plane, or y where x makes less than about 6° with the normal; the
+    second is the cross product of the normal and the first. The origin is that of space, so that the
+    coordinates on a flat sheet are continuous. A sheet in a plane z = const keeps its x, y.
 
     Parameters
     ----------
@@ -112,6 +112,6 @@ def _projected(direction: Array, normal: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    # scaled first: the cross product of two tiny sides would underflow when squared
+    # scaling first avoids underflow: the vectors may be cross products of tiny sides
     vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

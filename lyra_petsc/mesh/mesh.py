@@ -1,4 +1,4 @@
-"""The triangle mesh of a scene as it exists on rank 0 during set-up: one source of it, and the whole."""
+"""Data types of meshes on rank 0 during set-up: a source as read (`Sheet`), and the whole mesh (`Mesh`)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from lyra_petsc.arrays import Array, Ints, Mask
 
 @dataclass
 class Group:
-    """A named set from the mesh (gmsh physical group, OBJ group, or a sheet's name).
+    """A named group of the mesh: a physical group of gmsh, a group of an .obj file, or a sheet.
 
     Attributes
     ----------
     dimension : int
         0 points, 1 curves, 2 surfaces.
     vertices : (n,) int64
-        Its vertices, ascending, each once.
+        Vertices, ascending, each once.
     triangles : (m,) int64
-        Its triangles (dimension 2), else empty.
+        Triangles of a surface group, else empty.
     edges : (k, 2) int64
-        Its edges as vertex pairs (dimension 1), else empty.
+        Edges of a curve group as pairs of vertices, else empty.
     """
 
     dimension: int
@@ -32,7 +32,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Source:
-    """One source of a mesh: its name or file, and its numbers of vertices and triangles."""
+    """One source of a mesh: its name or file name, and its numbers of vertices and triangles."""
 
     label: str
     n_vertices: int
@@ -40,7 +40,7 @@ class Source:
 
 
 class TriangleSurface(NamedTuple):
-    """Points (n, 3) float64 [m], and the numbers (m, 3) int64 of those of each triangle."""
+    """Points (n, 3) float64 [m], and triangles (m, 3) int64 as indices of points."""
 
     points: Array
     triangles: Ints
@@ -53,31 +53,30 @@ class Mesh:
     Attributes
     ----------
     positions : (V, 3) float64
-        Start positions [m], after the source's transform.
+        Start positions [m], after the transform of the source.
     rest : (V, 3) float64
-        Rest surface [m]: the mesh as it stands after scaling; of a sheet with ``vt`` the
-        ``vt`` with z = 0 where each vertex has one, else (seams) the scaled position.
+        Rest positions [m]: the scaled mesh; in a sheet with ``vt`` the ``vt`` with z = 0 if each vertex has
+        one ``vt``, else (at seams) the scaled mesh.
     triangles : (F, 3) int64
         Vertices of each triangle, consistently oriented within a sheet.
     triangle_uv : (F, 3, 2) float64
-        Material coordinates of each triangle's corners [m], in a frame whose first axis is
-        the warp direction: the ``vt``, or for a sheet without, the rest triangle laid out in
-        its own plane (first axis: x, or where the plane is nearly normal to x, y, projected
-        into it; a sheet flat in xy gets its x, y).
+        Material coordinates [m] of the corners of each triangle; the first axis is the warp. They are the
+        ``vt``, or without ``vt`` coordinates in the plane of the rest triangle
+        (`measures.plane_coordinates`).
     flat_rest : (F,) bool
-        True where the rest shape is flat by definition (``vt`` given): rest angles are 0.
+        Whether the rest shape is flat by definition, as with ``vt``: rest angles are 0.
     groups : dict[str, Group]
-        Named groups; names are unique over all sources (see ``build``).
+        Named groups; names are unique over all sources (`build.build_mesh`).
     notes : list[str]
-        What was repaired or dropped, one line each, for the user.
+        Lines for the user on what was repaired or dropped.
     has_uv : bool
-        True if any sheet came with ``vt``.
+        Whether any sheet has ``vt``.
     sources : list of Source
-        In the order of the numbering.
+        In the order of the vertices.
     tags : (V,) int64 or None
-        Node tags of .msh files, 0 elsewhere; None where they only count the vertices.
+        Node tags of .msh files, 0 for other sources; None if all tags are 1, 2, 3, ….
     obstacles : dict of str to TriangleSurface
-        The scene's obstacles that are meshes, at t = 0; no part of the sheets.
+        Obstacles of the scene that are meshes, at t = 0; not part of the sheets.
     """
 
     positions: Array
@@ -103,7 +102,7 @@ class Mesh:
 
 @dataclass
 class NamedSet:
-    """A group as read.
+    """A group as read from a source.
 
     Attributes
     ----------
@@ -121,20 +120,20 @@ class NamedSet:
 
 @dataclass
 class Sheet:
-    """Vertices and triangles of one source, before transform and checks.
+    """Vertices and triangles of one source, before checks and transform.
 
     Attributes
     ----------
     points : (V, 3) float64
-        As in the file.
+        Positions in units of the file.
     triangles : (F, 3) int64
     uv : (F, 3, 2) float64 or None
-        ``vt`` of each triangle's corners [m], where the file has them.
+        ``vt`` [m] of the corners of each triangle, if the file has any.
     groups : list of NamedSet
     notes : list of str
-        What the reader dropped or split.
+        Lines for the user on what the reader dropped or split.
     tags : (V,) int64 or None
-        Numbers that the file itself gives its vertices, where they are not 1, 2, 3, …
+        Node tags of the file, unless they are 1, 2, 3, ….
     """
 
     points: Array

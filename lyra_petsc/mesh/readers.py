@@ -1,4 +1,4 @@
-"""What the readers of mesh files share: words for messages, quads and polygons as triangles."""
+"""Functions that readers of mesh files share: text for messages; quads and polygons split into triangles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SECOND_DIAGONAL = np.array([[0, 1, 3], [1, 2, 3]])
 
 
 def first_few(indices: Iterable[object], limit: int = 5) -> str:
-    """``3, 5, 9, 12, 40 and 7 more``."""
+    """The first ``limit`` of the indices as text: ``3, 5, 9, 12, 40 and 7 more``."""
     everything = list(indices)
     shown = ", ".join(str(index) for index in everything[:limit])
     more = f" and {len(everything) - limit} more" if len(everything) > limit else ""
@@ -21,12 +21,12 @@ def first_few(indices: Iterable[object], limit: int = 5) -> str:
 
 
 def printable(name: str) -> str:
-    """``name`` without what a terminal or HDF5 would choke on (control and null characters)."""
+    """``name`` with control and null characters, which terminals and HDF5 cannot take, replaced."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
 def split_quads(corners: Array) -> Ints:
-    """Split quads on the shorter diagonal of those that lie inside.
+    """Split quads along the shorter of the diagonals that lie inside the quad.
 
     Parameters
     ----------
@@ -43,14 +43,14 @@ def split_quads(corners: Array) -> Ints:
     length_first, length_second = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
     inside_first = _smallest_area(corners[:, _FIRST_DIAGONAL], normal) > 0
     inside_second = _smallest_area(corners[:, _SECOND_DIAGONAL], normal) > 0
-    # equal lengths must not depend on round-off: a tie takes the first diagonal
+    # between diagonals of equal length the first is taken, whatever their round-off
     shorter = length_first <= length_second * (1 + 1e-9)
     take_first = np.where(inside_first == inside_second, shorter, inside_first)
     return np.where(take_first[:, None, None], _FIRST_DIAGONAL, _SECOND_DIAGONAL).astype(np.int64)
 
 
 def split_polygon(corners: Array) -> Ints | None:
-    """Split one polygon as a fan from the corner that gives the largest smallest triangle.
+    """Split one polygon into a fan of triangles, from the corner for which the smallest one is largest.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def split_polygon(corners: Array) -> Ints | None:
 
 
 def _smallest_area(triangles: Array, normal: Array) -> Array:
-    """Smallest area along ``normal`` (n, 3) over the triangles (n, m, 3, 3) of each polygon."""
+    """Smallest signed area (n,) of the triangles (n, m, 3, 3) of each polygon, times 2 |normal| (n, 3)."""
     sides = triangles[:, :, 1:] - triangles[:, :, :1]
     areas = np.einsum("nmi,ni->nm", np.cross(sides[:, :, 0], sides[:, :, 1]), normal)
     return areas.min(axis=1)

@@ -1,4 +1,4 @@
-"""Vertices and triangles picked by group, by number or by box."""
+"""Selection of vertices and triangles by group, number or box."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 
 
 def select_vertices(mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None) -> Ints:
-    """Vertices a selector names, ascending, each once.
+    """Vertices that a selector names, ascending, each once.
 
     Parameters
     ----------
     mesh : Mesh
     selector : VertexChoice
-        With a group, numbers or a box; the box includes its faces, give or take 1e-9 of the mesh's size.
+        A group, numbers or a box; the box includes its faces, with a tolerance of 1e-9 of the mesh's size.
     key : str
-        The scene key of the selector, for messages (``handles[0]``).
+        The key of the selector in the scene, for messages (``handles[0]``).
     file : optional
         The scene file, for messages.
 
@@ -36,14 +36,14 @@ def select_vertices(mesh: Mesh, selector: VertexChoice, *, key: str, file: objec
     Raises
     ------
     InputError
-        Unknown group, vertex out of range, or nothing selected.
+        Unknown group, vertex out of range, or no vertex in the box.
     """
     if selector.group is not None:
         return find_group(mesh, selector.group, key=f"{key}.group", file=file).vertices
     if selector.nodes is not None:
-        return _numbered(mesh, selector.nodes, key=f"{key}.nodes", file=file)
+        return _check_numbers(mesh, selector.nodes, key=f"{key}.nodes", file=file)
     assert selector.box is not None
-    return _boxed(mesh, selector.box, key=f"{key}.box", file=file)
+    return _vertices_in_box(mesh, selector.box, key=f"{key}.box", file=file)
 
 
 def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | None = None) -> Ints:
@@ -52,7 +52,7 @@ def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | 
     Raises
     ------
     InputError
-        Unknown group, or one of points or curves.
+        Unknown group, or a group of points or curves.
     """
     if group is None:
         return np.arange(mesh.n_triangles, dtype=np.int64)
@@ -69,12 +69,12 @@ def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | 
 
 
 def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -> Group:
-    """The group of that name.
+    """The group of this name.
 
     Raises
     ------
     InputError
-        If there is none; the message gives the nearest name and those that exist.
+        No such group; the message gives the most similar name and all names.
     """
     found = mesh.groups.get(name)
     if found is not None:
@@ -82,7 +82,7 @@ def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -
     raise InputError(f"no group '{name}' in the mesh; {nearest(name, mesh.groups)}", key=key, file=file)
 
 
-def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> Ints:
+def _check_numbers(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> Ints:
     wrong = [node for node in nodes if node >= mesh.n_vertices]
     if wrong:
         raise InputError(
@@ -93,10 +93,10 @@ def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None
     return np.unique(np.asarray(nodes, dtype=np.int64))
 
 
-def _boxed(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> Ints:
+def _vertices_in_box(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> Ints:
     corners = np.asarray(box, dtype=np.float64)
-    slack = 1e-9 * bounding_diagonal(mesh.positions)
-    low, high = corners.min(axis=0) - slack, corners.max(axis=0) + slack
+    tolerance = 1e-9 * bounding_diagonal(mesh.positions)
+    low, high = corners.min(axis=0) - tolerance, corners.max(axis=0) + tolerance
     inside = np.flatnonzero(((mesh.positions >= low) & (mesh.positions <= high)).all(axis=1))
     if inside.size == 0:
         first, last = mesh.positions.min(axis=0), mesh.positions.max(axis=0)

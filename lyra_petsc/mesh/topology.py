@@ -1,4 +1,4 @@
-"""Edges of a triangle mesh: hinges (two triangles), boundary edges (one), and what breaks a surface."""
+"""Edges of a triangle mesh: hinges (of two triangles), boundary edges (of one), junctions (of more)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Hinges(NamedTuple):
     Attributes
     ----------
     vertices : (H, 4) int64
-        ``[a, b, c, d]``: edge a-b as the first triangle (a, b, c) runs along it; c is opposite in
-        the first triangle, d in the second, which is (b, a, d) where orientation is consistent.
+        ``[a, b, c, d]``: edge a-b in the direction of the first triangle (a, b, c), and the opposite vertex
+        d of the second triangle, which is (b, a, d) where orientation is consistent.
     triangles : (H, 2) int64
-        First and second triangle; the first has the smaller index.
+        First and second triangle; the first has the lower index.
     """
 
     vertices: Ints
@@ -31,11 +31,11 @@ class BoundaryEdges(NamedTuple):
     Attributes
     ----------
     edges : (B, 2) int64
-        Vertices, in the direction in which the triangle runs.
+        Vertices, in the direction of the triangle.
     triangles : (B,) int64
         The triangle of each edge.
     opposite : (B,) int64
-        The triangle's third vertex.
+        The third vertex of the triangle.
     """
 
     edges: Ints
@@ -44,18 +44,18 @@ class BoundaryEdges(NamedTuple):
 
 
 class EdgeTable(NamedTuple):
-    """All triangle sides, grouped by the undirected edge they lie on.
+    """All sides of triangles, grouped by undirected edge.
 
-    Side ``3 t + k`` runs from corner k to corner k + 1 of triangle t.
+    Side ``3 t + k`` goes from corner k to corner k + 1 of triangle t.
 
     Attributes
     ----------
     sides : (3F,) int64
-        Side numbers, sides of one edge next to each other and ascending.
+        Numbers of the sides; those of one edge are consecutive and ascending.
     first : (E,) int64
-        Where each edge begins in ``sides``.
+        Index in ``sides`` of the first side of each edge.
     sizes : (E,) int64
-        Number of sides (triangles) of each edge.
+        Number of sides (and of triangles) of each edge.
     """
 
     sides: Ints
@@ -84,7 +84,7 @@ def side_vertices(triangles: Ints, sides: Ints) -> Ints:
 
 
 def hinges(triangles: Ints) -> Hinges:
-    """All edges of exactly two of ``triangles`` (F, 3), ordered by the first of them and its corner."""
+    """All edges of exactly two of ``triangles`` (F, 3), ordered by the first triangle and its corner."""
     table = edge_table(triangles)
     begin = table.first[table.sizes == 2]
     first, second = table.sides[begin], table.sides[begin + 1]
@@ -97,7 +97,7 @@ def hinges(triangles: Ints) -> Hinges:
 
 
 def junctions(triangles: Ints) -> list[Ints]:
-    """The triangles of each edge that more than two of ``triangles`` (F, 3) have."""
+    """For each edge of more than two of ``triangles`` (F, 3), these triangles, ascending."""
     table = edge_table(triangles)
     many = np.flatnonzero(table.sizes > 2)
     return [np.sort(table.sides[table.first[e] :][: table.sizes[e]] // 3) for e in many]
@@ -112,6 +112,6 @@ def boundary_edges(triangles: Ints) -> BoundaryEdges:
 
 
 def unique_edges(triangles: Ints) -> Ints:
-    """All edges of ``triangles`` (F, 3) as vertex pairs (E, 2), smaller vertex first, each once."""
+    """All edges of ``triangles`` (F, 3), each once, as pairs of vertices (E, 2), lower vertex first."""
     table = edge_table(triangles)
     return np.sort(side_vertices(triangles, table.sides[table.first])[:, :2], axis=1)

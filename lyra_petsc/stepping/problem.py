@@ -228,7 +228,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
     places = None
     if scene.contact is not None:
         from lyra_petsc.mesh.obstacles import made as made_obstacles
-        from lyra_petsc.mesh.start_crossings import refuse_crossings  # with kernels
+        from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
         places = data.get("start", mesh.positions)
         refuse_crossings(scene, mesh, places, made_obstacles(scene, mesh.obstacles, Motion))

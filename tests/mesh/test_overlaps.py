@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from lyra_petsc.mesh.start_crossings import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
+from lyra_petsc.mesh.overlaps import Overlaps, behind_planes, inside_ball, inside_box, outside_ball
 from lyra_petsc.mesh.topology import unique_edges
 
 pytestmark = pytest.mark.quick
@@ -74,9 +74,9 @@ def test_balls_and_capsules_against_points_within_triangles(axis: list[list[floa
     judged = np.zeros((2, 3, 2))
     for seed in range(2):
         points, triangles = scattered(seed, 1.0)
-        found = in_ball(points, triangles, ends, 0.4)
+        found = inside_ball(points, triangles, ends, 0.4)
         judged[0] += compare(found, points, triangles, lambda x: 0.4 - from_axis(x, ends))
-        found = out_of_ball(points, triangles, ends, 1.8)
+        found = outside_ball(points, triangles, ends, 1.8)
         judged[1] += compare(found, points, triangles, lambda x: from_axis(x, ends) - 1.8)
     assert (judged > 1).all()
 
@@ -92,9 +92,9 @@ def test_boxes_against_points_within_triangles() -> None:
     judged = np.zeros((2, 3, 2))
     for seed in range(4):
         points, triangles = scattered(seed, 1.0)
-        judged[0] += compare(in_box(points, triangles, corners), points, triangles, depth)
+        judged[0] += compare(inside_box(points, triangles, corners), points, triangles, depth)
         points *= 0.25
-        found = beyond_planes(points, triangles, on_planes, normals)
+        found = behind_planes(points, triangles, on_planes, normals)
         judged[1] += compare(found, points, triangles, lambda x: -depth(x))
     assert (judged > 1).all()
 
@@ -104,24 +104,24 @@ def test_boxes_against_points_within_triangles() -> None:
 def test_spheres_that_touch_and_that_do_not(turn: np.ndarray, shift: float) -> None:
     triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]]) @ turn.T + shift
     over = np.array([[0.0, 0, 1]]) @ turn.T + shift
-    assert counts(in_ball(triangle, ONE, over, 1.0)) == (0, 0, 0)
-    assert counts(in_ball(triangle, ONE, over, 1.0 + 1e-9)) == (0, 0, 1)
-    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) - 1e-9)) == (0, 0, 1)
-    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5))) == (0, 0, 1)
-    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) + 1e-9)) == (0, 1, 1)
-    assert counts(in_ball(triangle, ONE, over, np.sqrt(3.0) + 1e-9)) == (1, 3, 1)
-    assert counts(out_of_ball(triangle, ONE, over, np.sqrt(6.0))) == (0, 0, 0)
-    assert counts(out_of_ball(triangle, ONE, over, np.sqrt(6.0) - 1e-9)) == (2, 3, 1)
+    assert counts(inside_ball(triangle, ONE, over, 1.0)) == (0, 0, 0)
+    assert counts(inside_ball(triangle, ONE, over, 1.0 + 1e-9)) == (0, 0, 1)
+    assert counts(inside_ball(triangle, ONE, over, np.sqrt(1.5) - 1e-9)) == (0, 0, 1)
+    assert counts(inside_ball(triangle, ONE, over, np.sqrt(1.5))) == (0, 0, 1)
+    assert counts(inside_ball(triangle, ONE, over, np.sqrt(1.5) + 1e-9)) == (0, 1, 1)
+    assert counts(inside_ball(triangle, ONE, over, np.sqrt(3.0) + 1e-9)) == (1, 3, 1)
+    assert counts(outside_ball(triangle, ONE, over, np.sqrt(6.0))) == (0, 0, 0)
+    assert counts(outside_ball(triangle, ONE, over, np.sqrt(6.0) - 1e-9)) == (2, 3, 1)
 
 
 def test_a_rod_through_the_middle_of_a_triangle() -> None:
     triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]])
     rod = np.array([[0.0, 0, -5], [0, 0, 9]])
-    assert counts(in_ball(triangle, ONE, rod, 1e-3)) == (0, 0, 1)
-    assert counts(in_ball(triangle, ONE, rod + [9, 0, 0], 1e-3)) == (0, 0, 0)
+    assert counts(inside_ball(triangle, ONE, rod, 1e-3)) == (0, 0, 1)
+    assert counts(inside_ball(triangle, ONE, rod + [9, 0, 0], 1e-3)) == (0, 0, 0)
     lying = np.array([[-5.0, 0, 0.5], [5, 0, 0.5]])  # parallel to the triangle and to one side
-    assert counts(in_ball(triangle, ONE, lying, 0.5)) == (0, 0, 0)
-    assert counts(in_ball(triangle, ONE, lying, 0.5 + 1e-9)) == (0, 2, 1)
+    assert counts(inside_ball(triangle, ONE, lying, 0.5)) == (0, 0, 0)
+    assert counts(inside_ball(triangle, ONE, lying, 0.5 + 1e-9)) == (0, 2, 1)
 
 
 @pytest.mark.parametrize("turn", [np.eye(3), turned()])
@@ -129,7 +129,7 @@ def test_sheets_on_and_in_a_box(turn: np.ndarray) -> None:
     box = CUBE @ turn.T + 3.0
 
     def of(*corners: list[float]) -> tuple[int, int, int]:
-        return counts(in_box(np.array(corners, dtype=float) @ turn.T + 3.0, ONE, box))
+        return counts(inside_box(np.array(corners, dtype=float) @ turn.T + 3.0, ONE, box))
 
     assert of([0, 0, 1], [1, 0, 1], [0, 1, 1]) == (0, 0, 0)  # on a side
     assert of([-3, 0.5, 1], [3, 0.5, 1], [0, 9, 4]) == (0, 0, 0)  # an edge on a side
@@ -149,9 +149,9 @@ def test_planes() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, -1e-9], [5, 5, 1]])
     triangles = np.array([[0, 1, 2], [0, 1, 3]])
     floor, up = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
-    found = beyond_planes(points, triangles, floor, up)
+    found = behind_planes(points, triangles, floor, up)
     assert found.vertices.tolist() == [2]
     assert found.edges.tolist() == [[0, 2], [1, 2]]
     assert found.triangles.tolist() == [0]
     points[2, 2] = -1e-17
-    assert counts(beyond_planes(points, triangles, floor, up)) == (0, 0, 0)
+    assert counts(behind_planes(points, triangles, floor, up)) == (0, 0, 0)

@@ -13,7 +13,7 @@ from physics import gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.start_crossings import find_overlaps
+from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier

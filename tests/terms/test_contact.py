@@ -16,7 +16,7 @@ from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.start_crossings import beyond_planes, in_ball, out_of_ball
+from lyra_petsc.mesh.overlaps import behind_planes, inside_ball, outside_ball
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier
@@ -98,11 +98,11 @@ class Watched:
         at = obstacle.positions(self.simulation.time)
         if isinstance(obstacle, Container) and obstacle.kind == "planes":
             normals = obstacle.normals_at(self.simulation.time)
-            return len(beyond_planes(x, self.triangles, at, normals).vertices)
+            return len(behind_planes(x, self.triangles, at, normals).vertices)
         if isinstance(obstacle, Container):
-            return len(out_of_ball(x, self.triangles, at, obstacle.radius).vertices)
+            return len(outside_ball(x, self.triangles, at, obstacle.radius).vertices)
         if obstacle.radius > 0.0:
-            inside = in_ball(x, self.triangles, at, obstacle.radius)
+            inside = inside_ball(x, self.triangles, at, obstacle.radius)
             return len(inside.vertices) + len(inside.edges) + len(inside.triangles)
         return len(mutual_crossings(x, self.triangles, at, obstacle.triangles))
 

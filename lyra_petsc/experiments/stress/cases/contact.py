@@ -30,7 +30,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 )
 from lyra_petsc.experiments.verification.verification_case import FLOOR, grid
 from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.start_crossings import find_overlaps
+from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 
 MOST = 12

@@ -1,14 +1,14 @@
-"""What of a sheet is in an obstacle, and start positions that contact cannot begin with.
+"""Overlaps of sheets with obstacles, and refusal of start positions in which contact cannot begin.
 
-Overlaps are geometry alone, independent of contact: vertices, edges and triangles of a sheet that are in an
-obstacle deeper than rounding counts (`ROUNDING` of the largest coordinate); what touches is not. Of obstacles
-that are triangle meshes, closed or open, only crossing them is overlap: `mutual_crossings`.
+An overlap is a vertex, edge or triangle of a sheet that is in an obstacle deeper than rounding (`ROUNDING`
+times the largest coordinate); to touch an obstacle is no overlap. Triangle meshes as obstacles, closed or
+open, are overlapped by triangles that cross them only (`mutual_crossings`). Contact is not involved.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,20 +23,20 @@ from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 
 ROUNDING = 1e-14
-"""Depth that may be rounding, over the largest coordinate and radius: some fifty units in the last place."""
+"""Depth that may be rounding, over the largest coordinate or radius: about fifty units in the last place."""
 
 
 class Overlaps(NamedTuple):
-    """What is in an obstacle, wholly or in part.
+    """Vertices, edges and triangles of a sheet that are in an obstacle, wholly or in part.
 
     Attributes
     ----------
     vertices : (n,) int64
-        Rows of the sheet's points, ascending.
+        Indices, ascending.
     edges : (m, 2) int64
-        Vertices of the edges, as `topology.unique_edges` has them.
+        Vertices of the edges, as in `topology.unique_edges`.
     triangles : (k,) int64
-        Rows of the sheet's triangles, ascending.
+        Indices, ascending.
     """
 
     vertices: Ints
@@ -44,31 +44,31 @@ class Overlaps(NamedTuple):
     triangles: Ints
 
 
-def beyond_planes(points: Array, triangles: Ints, on_planes: Array, normals: Array) -> Overlaps:
-    """What is behind a plane, or out of a box that contains the sheet.
+def behind_planes(points: Array, triangles: Ints, on_planes: Array, normals: Array) -> Overlaps:
+    """Parts of a sheet behind planes, or outside of a box that shall contain it.
 
     Parameters
     ----------
     points : (V, 3) float64
-        Of the sheet [m].
+        Positions of the sheet [m].
     triangles : (F, 3) int64
     on_planes, normals : (n, 3) float64
-        A point on each plane [m], and a unit vector towards the side that is free.
+        A point on each plane [m], and the unit normal towards the free side.
     """
     depth = _rounding(points, on_planes)
     out = np.zeros(len(points), dtype=bool)
     for point, normal in zip(on_planes, normals, strict=True):
         out |= (points - point) @ normal < -depth
-    return _of_vertices(out, triangles)
+    return _with_vertices(out, triangles)
 
 
-def out_of_ball(points: Array, triangles: Ints, axis: Array, radius: float) -> Overlaps:
-    """What is out of a sphere or a capsule that contains the sheet.
+def outside_ball(points: Array, triangles: Ints, axis: Array, radius: float) -> Overlaps:
+    """Parts of a sheet outside of a sphere or capsule that shall contain it.
 
     Parameters
     ----------
     points : (V, 3) float64
-        Of the sheet [m].
+        Positions of the sheet [m].
     triangles : (F, 3) int64
     axis : (1, 3) or (2, 3) float64
         The centre, or the ends of the axis [m].
@@ -76,121 +76,124 @@ def out_of_ball(points: Array, triangles: Ints, axis: Array, radius: float) -> O
         [m].
     """
     distances = _distances(points, _vertices(points), axis[0], axis[-1])
-    return _of_vertices(distances > radius + _rounding(points, axis, radius), triangles)
+    return _with_vertices(distances > radius + _rounding(points, axis, radius), triangles)
 
 
-def in_ball(points: Array, triangles: Ints, axis: Array, radius: float) -> Overlaps:
-    """What is nearer to a centre or an axis than a radius; parameters as of `out_of_ball`."""
-    reach = radius - _rounding(points, axis, radius)
+def inside_ball(points: Array, triangles: Ints, axis: Array, radius: float) -> Overlaps:
+    """Parts of a sheet inside a sphere or capsule; parameters as of `outside_ball`."""
+    bound = radius - _rounding(points, axis, radius)
     low, high = axis.min(axis=0) - radius, axis.max(axis=0) + radius
 
-    def within(corners: Ints) -> Mask:
-        inside = _boxes_meet(points, corners, low, high)
-        inside[inside] = _distances(points, corners[inside], axis[0], axis[-1]) < reach
+    def overlap(corners: Ints) -> Mask:
+        inside = _boxes_overlap(points, corners, low, high)
+        inside[inside] = _distances(points, corners[inside], axis[0], axis[-1]) < bound
         return inside
 
-    return _of_simplices(within, points, triangles)
+    return _select(overlap, points, triangles)
 
 
-def in_box(points: Array, triangles: Ints, corners: Array) -> Overlaps:
-    """What is in a box of any orientation, by axes that separate (Gottschalk, Lin & Manocha 1996).
+def inside_box(points: Array, triangles: Ints, corners: Array) -> Overlaps:
+    """Parts of a sheet inside a box of any orientation, by the separating axis theorem.
+
+    Source: Gottschalk, Lin & Manocha, OBBTree, SIGGRAPH 1996.
 
     Parameters
     ----------
     points : (V, 3) float64
-        Of the sheet [m].
+        Positions of the sheet [m].
     triangles : (F, 3) int64
     corners : (8, 3) float64
-        Of the box [m]; corner i + 2 j + 4 k is at the upper end of its first, second and third edge where
-        i, j and k are 1.
+        Corners of the box [m]; i, j, k ∈ {0, 1} of corner i + 2 j + 4 k are its coordinates along the edges.
     """
     edges = corners[[1, 2, 4]] - corners[0]
     lengths = np.linalg.norm(edges, axis=1)
     local = (points - corners.mean(axis=0)) @ (edges / lengths[:, None]).T
     half = 0.5 * lengths - _rounding(points, corners)
 
-    def within(rows: Ints) -> Mask:
-        inside = _boxes_meet(local, rows, -half, half)
-        shapes = local[rows[inside]]
+    def overlap(corners: Ints) -> Mask:
+        inside = _boxes_overlap(local, corners, -half, half)
+        shapes = local[corners[inside]]
         sides = np.roll(shapes, -1, axis=1) - shapes
         axes = [np.cross(sides[:, 0], sides[:, 1])]
-        axes += [np.cross(along, sides[:, k]) for along, k in itertools.product(np.eye(3), range(3))]
+        axes += [np.cross(edge, sides[:, k]) for edge, k in itertools.product(np.eye(3), range(3))]
         meets = np.ones(len(shapes), dtype=bool)
         for axis in axes:
-            places = np.einsum("nkx,nx->nk", shapes, axis)
-            reach = np.abs(axis) @ half
-            apart = (places.min(axis=1) >= reach) | (places.max(axis=1) <= -reach)
-            meets &= ~(apart & axis.any(axis=1))  # parallel sides and triangles without area give none
+            projected = np.einsum("nkx,nx->nk", shapes, axis)
+            extent = np.abs(axis) @ half
+            separated = (projected.min(axis=1) >= extent) | (projected.max(axis=1) <= -extent)
+            # an axis is zero for a side parallel to an edge, and for a triangle without area
+            meets &= ~(separated & axis.any(axis=1))
         inside[inside] = meets
         return inside
 
-    return _of_simplices(within, points, triangles)
+    return _select(overlap, points, triangles)
 
 
 def _rounding(points: Array, obstacle: Array, radius: float = 0.0) -> float:
+    """Depth [m] that may be rounding, by the largest coordinate of sheet and obstacle."""
     largest = max(float(np.abs(points).max(initial=0.0)), float(np.abs(obstacle).max()), radius)
     return ROUNDING * largest
 
 
 def _vertices(points: Array) -> Ints:
-    """(V, 3) vertices as triangles of one point each."""
+    """The vertices as triangles (V, 3) whose corners coincide."""
     return np.repeat(np.arange(len(points))[:, None], 3, axis=1)
 
 
-def _boxes_meet(points: Array, corners: Ints, low: Array, high: Array) -> Mask:
-    """(n,) whether the boxes of triangles have points within a box."""
-    of = points[corners]
-    return np.asarray(((of.min(axis=1) < high) & (of.max(axis=1) > low)).all(axis=1))
+def _boxes_overlap(points: Array, corners: Ints, low: Array, high: Array) -> Mask:
+    """Whether the bounding box of each triangle (n,) overlaps the box from ``low`` to ``high``."""
+    x = points[corners]
+    return np.asarray(((x.min(axis=1) < high) & (x.max(axis=1) > low)).all(axis=1))
 
 
-def _of_vertices(out: Mask, triangles: Ints) -> Overlaps:
-    """What has a vertex among those that are out of something convex."""
+def _with_vertices(out: Mask, triangles: Ints) -> Overlaps:
+    """All parts of a sheet with a vertex that is ``out`` (V,) of a convex region."""
     edges = unique_edges(triangles)
     return Overlaps(
         np.flatnonzero(out), edges[out[edges].any(axis=1)], np.flatnonzero(out[triangles].any(axis=1))
     )
 
 
-def _of_simplices(within: Any, points: Array, triangles: Ints) -> Overlaps:
-    """What is in, by a function of triangles; vertices and edges are triangles without area."""
+def _select(overlap: Callable[[Ints], Mask], points: Array, triangles: Ints) -> Overlaps:
+    """Parts of a sheet for which ``overlap`` of triangles (n, 3) is true; vertices and edges have no area."""
     edges = unique_edges(triangles)
     return Overlaps(
-        np.flatnonzero(within(_vertices(points))),
-        edges[within(edges[:, [0, 1, 1]])],
-        np.flatnonzero(within(triangles)),
+        np.flatnonzero(overlap(_vertices(points))),
+        edges[overlap(edges[:, [0, 1, 1]])],
+        np.flatnonzero(overlap(triangles)),
     )
 
 
 @cached()
 def _distances(points: Any, triangles: Any, start: Any, end: Any) -> Any:
-    """(n,) distances of triangles, which may be segments or points, from a segment or point.
+    """Distances (n,) of triangles, which may be degenerate to segments or points, from a segment or point.
 
-    Each is that of two points of both, the nearest up to rounding: never too small by more.
+    Each is computed from two points, one of either, and so is too small by no more than rounding.
     """
     distances = np.empty(len(triangles))
     along = end - start
     for i in range(len(triangles)):
         a, b, c = points[triangles[i, 0]], points[triangles[i, 1]], points[triangles[i, 2]]
-        least = min(
-            _between_segments(a, b, start, end),
-            _between_segments(b, c, start, end),
-            _between_segments(c, a, start, end),
+        d = min(
+            _segment_distance(a, b, start, end),
+            _segment_distance(b, c, start, end),
+            _segment_distance(c, a, start, end),
         )
         normal = _cross(b - a, c - a)
         area = _dot(normal, normal)
         if area > 0.0:
-            least = min(least, _within(a, b, c, normal, start), _within(a, b, c, normal, end))
-            climb = _dot(along, normal)
-            share = _dot(a - start, normal) / climb if climb != 0.0 else -1.0
-            if 0.0 < share < 1.0:
-                least = min(least, _within(a, b, c, normal, start + share * along))
-        distances[i] = least
+            d = min(d, _face_distance(a, b, c, normal, start), _face_distance(a, b, c, normal, end))
+            slope = _dot(along, normal)
+            s = _dot(a - start, normal) / slope if slope != 0.0 else -1.0
+            if 0.0 < s < 1.0:
+                d = min(d, _face_distance(a, b, c, normal, start + s * along))
+        distances[i] = d
     return distances
 
 
 @cached()
-def _within(a: Any, b: Any, c: Any, normal: Any, point: Any) -> float:
-    """Distance of a point from its projection onto a triangle; inf if that is beside the triangle."""
+def _face_distance(a: Any, b: Any, c: Any, normal: Any, point: Any) -> float:
+    """Distance of a point from its projection onto a triangle; inf if the projection is outside of it."""
     x = _dot(_cross(b - point, c - point), normal)
     y = _dot(_cross(c - point, a - point), normal)
     z = _dot(_cross(a - point, b - point), normal)
@@ -202,7 +205,7 @@ def _within(a: Any, b: Any, c: Any, normal: Any, point: Any) -> float:
 
 
 @cached()
-def _between_segments(a: Any, b: Any, c: Any, d: Any) -> float:
+def _segment_distance(a: Any, b: Any, c: Any, d: Any) -> float:
     """Distance of two segments (Ericson, Real-Time Collision Detection, 2005, section 5.1.9)."""
     first, second, offset = b - a, d - c, a - c
     aa, bb, ab = _dot(first, first), _dot(second, second), _dot(first, second)
@@ -225,14 +228,14 @@ def _dot(a: Any, b: Any) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-NAMED = 3
-"""Triangles, or pairs of them, that a message names."""
+MAX_LISTED = 3
+"""Number of triangles, or pairs of triangles, that a message lists."""
 
 
 def refuse_crossings(
     scene: Scene, mesh: Mesh, positions: Array, obstacles: Sequence[Solid | Container]
 ) -> None:
-    """Refuse a start in which triangles cross, or are in an obstacle.
+    """Refuse start positions in which triangles cross, or overlap an obstacle.
 
     Parameters
     ----------
@@ -240,20 +243,19 @@ def refuse_crossings(
         With ``contact``.
     mesh : Mesh
     positions : (V, 3) float64
-        Of its vertices at t = 0 [m].
+        Positions at t = 0 [m].
     obstacles : sequence of Solid or Container
-        As `obstacles.made` makes them.
 
     Raises
     ------
     InputError
-        The first triangles, and where they are.
+        The message gives the first triangles and their positions.
     """
     assert scene.contact is not None
     triangles = mesh.triangles
 
-    def refuse(key: str, count: str, named: Iterable[str], remedy: str) -> None:
-        first = ", ".join(named)
+    def refuse(key: str, count: str, listed: Iterable[str], remedy: str) -> None:
+        first = ", ".join(listed)
         message = f"at the start {count} (counted from 0, the first: {first}); {remedy}"
         raise InputError(message, file=scene.source, key=key)
 
@@ -265,7 +267,7 @@ def refuse_crossings(
         refuse(
             "contact",
             _counted(len(pairs), "pair", "of triangles", "cross"),
-            (f"{a} and {b} {around(a, b)}" for a, b in pairs[:NAMED].tolist()),
+            (f"{a} and {b} {around(a, b)}" for a, b in pairs[:MAX_LISTED].tolist()),
             "move the sheets apart, or give self: false",
         )
     remedy = "move the sheet, or the obstacle"
@@ -274,39 +276,39 @@ def refuse_crossings(
         if shape.mesh is not None and isinstance(obstacle, Solid):
             pairs = mutual_crossings(positions, triangles, obstacle.points, obstacle.triangles)
             if len(pairs):
-                named = (f"{a} and {b} {around(a)}" for a, b in pairs[:NAMED].tolist())
+                listed = (f"{a} and {b} {around(a)}" for a, b in pairs[:MAX_LISTED].tolist())
                 count = _counted(len(pairs), "pair", "of a triangle of the sheet and one of it", "cross")
-                refuse(key, count, named, remedy)
+                refuse(key, count, listed, remedy)
             continue
         inside = find_overlaps(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles
         if len(inside):
             where = "into it" if isinstance(obstacle, Solid) else "beyond it"
-            named = (f"{a} {around(a)}" for a in inside[:NAMED].tolist())
-            refuse(
-                key, f"{_counted(len(inside), 'triangle', 'of the sheet', 'reach')} {where}", named, remedy
-            )
+            listed = (f"{a} {around(a)}" for a in inside[:MAX_LISTED].tolist())
+            count = _counted(len(inside), "triangle", "of the sheet", "reach")
+            refuse(key, f"{count} {where}", listed, remedy)
 
 
 def find_overlaps(
     obstacle: Solid | Container, positions: Array, triangles: Ints, time: float, *, is_box: bool
 ) -> Overlaps:
-    """What of a sheet at positions (V, 3) [m] is at a time [s] where an obstacle does not let it.
+    """Overlaps of a sheet at ``positions`` (V, 3) [m] with an obstacle at a time [s].
 
-    ``is_box`` tells a box from a mesh, of which only the triangles that cross it are found.
+    ``is_box``: a solid without radius is a box; else it is a mesh, for which only triangles that cross it
+    are found.
     """
     sheet, points = (positions, triangles), obstacle.positions(time)
     if isinstance(obstacle, Container):
         if obstacle.kind == "planes":
-            return beyond_planes(*sheet, points, obstacle.normals_at(time))
-        return out_of_ball(*sheet, points, obstacle.radius)
+            return behind_planes(*sheet, points, obstacle.normals_at(time))
+        return outside_ball(*sheet, points, obstacle.radius)
     if obstacle.radius > 0.0:
-        return in_ball(*sheet, points, obstacle.radius)
+        return inside_ball(*sheet, points, obstacle.radius)
     if is_box:
-        return in_box(*sheet, points)
+        return inside_box(*sheet, points)
     crossed = mutual_crossings(*sheet, points, obstacle.triangles)[:, 0]
     return Overlaps(np.empty(0, np.int64), np.empty((0, 2), np.int64), np.unique(crossed))
 
 
 def _counted(count: int, noun: str, of: str, verb: str) -> str:
-    """Subject and verb."""
+    """Subject and verb of a message: ``1 triangle of the sheet reaches``, ``2 triangles … reach``."""
     return f"{count} {noun} {of} {verb}es" if count == 1 else f"{count} {noun}s {of} {verb}"
