@@ -1,4 +1,4 @@
-"""gmsh scripts (.geo), meshed by gmsh in a process of its own; `geo_script` has what they may say."""
+"""Meshing of gmsh scripts (.geo) by gmsh in a child process; `geo_script` checks the scripts before."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.geo_script import check_script
 from lyra_petsc.mesh.mesh import Sheet
-from lyra_petsc.mesh.msh_file import ElementBlock, MshError, assemble, element_type
+from lyra_petsc.mesh.msh_file import ElementBlock, MshError, assemble_sheet, element_type
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
 
-# beyond this ratio of the mean edge to the size asked for, the script sets sizes of its own
+# beyond this ratio of the mean edge to the requested size a note says that the script sets its own sizes
 _SIZE_RATIO = 1.6
 
 SCRIPT_SECONDS = 60
-"""CPU time a script may take until gmsh begins to mesh: one that loops for ever ends here."""
+"""Limit on the CPU time until gmsh begins to mesh, for scripts that loop for ever."""
 
 MESH_SECONDS = 3600
-"""CPU time gmsh may take to mesh."""
+"""Limit on the CPU time of meshing."""
 
-FIRST_WORD = 5.0
-"""Seconds until it is said what gmsh does; then twice as many, and so on, at most `LONGEST_SILENCE`."""
+FIRST_REPORT = 5.0
+"""Seconds until the first report of progress; each interval is twice the last, at most `MAX_INTERVAL`."""
 
-LONGEST_SILENCE = 60.0
+MAX_INTERVAL = 60.0
 
 ALGORITHMS = {"mesh-adapt": 1, "automatic": 2, "delaunay": 5, "frontal-delaunay": 6}
-"""gmsh's algorithms for triangles, by their names and their numbers there (``Mesh.Algorithm``)."""
+"""Names of gmsh's algorithms for triangles, and their numbers in gmsh (``Mesh.Algorithm``)."""
 
-_WAIT = 4.0
-"""Times the CPU time allowed that we wait for gmsh, on a machine with other work to do."""
+_WALL_TIME_RATIO = 4.0
+"""Limit on the wall time, over that on the CPU time: the machine may have other work to do."""
 
 # variables by which an MPI in gmsh's process would take itself for one of our ranks
 _MPI_VARIABLES = ("OMPI_", "PMIX_", "PMI_", "HYDRA_", "MPI_", "SLURM_")
@@ -63,36 +63,34 @@ def mesh_geo(
     ----------
     path : Path
     size : float, optional
-        Element size [m] of the script's own units, in place of every size the script gives. Divisions a
-        script fixes (transfinite curves) stay, with a note. Without it, a mesh that the script makes
-        itself is used as it is.
+        Element size in the units of the script, which replaces all sizes in the script. Fixed divisions
+        (transfinite curves) stay, with a note. Without ``size``, a mesh that the script itself generates is
+        used unchanged.
     algorithm : str, optional
-        One of `ALGORITHMS`, in place of the script's. Without it the mesh is what gmsh alone makes of the
-        script.
+        One of `ALGORITHMS`, which replaces that of the script.
     trusted : bool
-        Give gmsh the script as it is, whatever it says.
+        Give the script to gmsh unchecked.
     report : callable, optional
-        Called with a line now and then while gmsh is at work.
+        Called with a line of progress at intervals while gmsh works.
 
     Raises
     ------
     InputError
-        If gmsh is missing, cannot read the script or cannot mesh it, or there are no triangles; if the
-        script does what a mesh script need not (see `check_script`), or asks for more time or memory
-        than there is.
+        If gmsh is missing, cannot read or mesh the script, or makes no triangles; if the script contains
+        what is not allowed (`check_script`), or needs more time or memory than there is.
     """
     files: list[Path] = []
-    wishes = {"size": size, "algorithm": None if algorithm is None else ALGORITHMS[algorithm]}
+    settings = {"size": size, "algorithm": None if algorithm is None else ALGORITHMS[algorithm]}
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
         if trusted:
-            read_bytes(path)  # for its errors
-            _run_gmsh(path, path.absolute(), None, wishes, Path(folder), meshed, report)
+            read_bytes(path)  # raises if it cannot be read
+            _run_gmsh(path, path.absolute(), None, settings, Path(folder), meshed, report)
         else:
             checked = check_script(path)
             files = checked.files
             copies = Path(folder) / "script"
             copies.mkdir()
-            _run_gmsh(path, checked.write(copies), copies, wishes, Path(folder), meshed, report)
+            _run_gmsh(path, checked.write(copies), copies, settings, Path(folder), meshed, report)
         sheet = _read_mesh(path, meshed)
     if len(files) > 1:
         sheet.notes.append(f"the script includes {', '.join(file.name for file in files[1:])}")
@@ -111,29 +109,38 @@ def _run_gmsh(
     path: Path,
     script: Path,
     readable: Path | None,
-    wishes: dict[str, Any],
+    settings: dict[str, Any],
     folder: Path,
     meshed: BinaryIO,
     report: Callable[[str], None] | None,
 ) -> None:
-    """Mesh the script in another process, which writes ``meshed``; its errors are raised here."""
+    """Mesh the script in a child process, which writes the mesh to ``meshed``.
+
+    ``path`` names the script in messages, ``script`` is the file that gmsh reads, and ``readable`` the folder
+    that gmsh may read, None for all.
+
+    Raises
+    ------
+    InputError
+        As `mesh_geo`.
+    """
     memory = available_memory()
     job = {
         "script": str(script),
         "folder": None if readable is None else str(readable),
-        **wishes,
+        **settings,
         "script_seconds": SCRIPT_SECONDS,
         "mesh_seconds": MESH_SECONDS,
         "memory": memory,
-        "most_triangles": 2 * memory // BYTES_PER_VERTEX,
+        "max_triangles": 2 * memory // BYTES_PER_VERTEX,
     }
     job_file = folder / "job.json"
     job_file.write_text(json.dumps(job))
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_MPI_VARIABLES)}
     environment["PYTHONPATH"] = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     environment["GMSH_HOME"] = str(folder)  # no .gmshrc of the user's
-    with tempfile.TemporaryFile() as told:
-        descriptors = told.fileno(), meshed.fileno()
+    with tempfile.TemporaryFile() as outcome_file:
+        descriptors = outcome_file.fileno(), meshed.fileno()
         process = subprocess.Popen(
             [sys.executable, "-m", "lyra_petsc.mesh.gmsh_process", str(job_file), *map(str, descriptors)],
             cwd=folder,
@@ -142,34 +149,34 @@ def _run_gmsh(
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             pass_fds=descriptors,
-            start_new_session=True,  # Ctrl-C is for the run, which ends us in its own time
+            start_new_session=True,  # Ctrl-C goes to this process only, which ends gmsh
         )
         try:
-            errors = _wait(process, told, lambda line: report and report(f"{path.name}: {line}"))
+            errors = _wait(process, outcome_file, lambda line: report and report(f"{path.name}: {line}"))
         finally:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-        outcome = _outcome(told)
+        outcome = _read_outcome(outcome_file)
     if "refused" in outcome:
         raise InputError(one_line(outcome["refused"]), file=path)
     if outcome.get("stage") != "done" or process.returncode != 0:
-        words = _ending(outcome.get("stage", ""), process.returncode, errors, memory)
-        raise InputError(words, file=path)
+        message = _failure(outcome.get("stage", ""), process.returncode, errors, memory)
+        raise InputError(message, file=path)
 
 
-def _wait(process: subprocess.Popen[bytes], told: BinaryIO, report: Callable[[str], None]) -> bytes:
-    """Wait for gmsh's process, telling the user now and then; returns what it wrote to stderr."""
+def _wait(process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[str], object]) -> bytes:
+    """Wait for gmsh's process, reporting progress; returns what the process wrote to stderr."""
     began = time.monotonic()
-    pause = FIRST_WORD
-    while time.monotonic() - began < _WAIT * (SCRIPT_SECONDS + MESH_SECONDS):
+    interval = FIRST_REPORT
+    while time.monotonic() - began < _WALL_TIME_RATIO * (SCRIPT_SECONDS + MESH_SECONDS):
         try:
-            return process.communicate(timeout=pause)[1]
+            return process.communicate(timeout=interval)[1]
         except subprocess.TimeoutExpired:
-            pause = min(2.0 * pause, LONGEST_SILENCE)
-        outcome = _outcome(told)
-        if outcome.get("stage") != "mesh" and time.monotonic() - began < 2.0 * FIRST_WORD:
-            continue  # most that takes long to read never ends, and is ended soon
+            interval = min(2.0 * interval, MAX_INTERVAL)
+        outcome = _read_outcome(file)
+        if outcome.get("stage") != "mesh" and time.monotonic() - began < 2.0 * FIRST_REPORT:
+            continue  # most scripts that take this long to read never end, and the time limit ends them
         doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading the script"
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
@@ -177,11 +184,11 @@ def _wait(process: subprocess.Popen[bytes], told: BinaryIO, report: Callable[[st
     return b""
 
 
-def _outcome(told: BinaryIO) -> dict[str, Any]:
-    """What gmsh's process has reported, the latest entry of each kind."""
+def _read_outcome(file: BinaryIO) -> dict[str, Any]:
+    """The latest entry of each kind that gmsh's process has written."""
     outcome: dict[str, Any] = {}
-    # not by seeking: the place in the file is that of gmsh's process, too
-    for line in os.pread(told.fileno(), os.fstat(told.fileno()).st_size, 0).splitlines():
+    # pread, as gmsh's process shares the file position
+    for line in os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).splitlines():
         with suppress(ValueError):
             outcome |= json.loads(line)
     return outcome
@@ -201,15 +208,16 @@ def _read_mesh(path: Path, file: BinaryIO) -> Sheet:
             rows = np.column_stack([np.tile(np.arange(count), len(members)), np.repeat(members, count)])
             blocks.append(ElementBlock(kind, corners, np.full(count, entity), rows))
         names = {(dimension, tag): printable(name) for dimension, tag, name in head["names"]}
-        sheet = assemble(tags, points, blocks, names, note_loose=False)  # construction points of the script
+        # nodes in no triangle are construction points of the script
+        sheet = assemble_sheet(tags, points, blocks, names, note_loose=False)
     except MshError as error:
         raise InputError(f"the mesh has {error}", file=path) from None
-    sheet.tags = None  # those of a temporary file
+    sheet.tags = None  # no file of the user's has these tags
     return sheet
 
 
-def _ending(stage: str, code: int, errors: bytes, memory: int) -> str:
-    """Why gmsh did not finish, for the message."""
+def _failure(stage: str, code: int, errors: bytes, memory: int) -> str:
+    """Message on why gmsh did not finish."""
     doing = "meshing" if stage == "mesh" else "reading the script"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
         return (

@@ -1,6 +1,6 @@
-"""The words that a mesh script may use: gmsh's own that describe geometry and mesh size, and no others.
+"""Words that a mesh script may use: those of gmsh that describe geometry and mesh size.
 
-From gmsh 4.8 to 4.15: ``src/parser/Gmsh.l`` and ``Gmsh.y`` (keywords and commands),
+Sources: gmsh 4.8 to 4.15: ``src/parser/Gmsh.l`` and ``Gmsh.y`` (keywords and commands),
 ``src/common/DefaultOptions.h`` (options), ``src/mesh/Field.cpp`` (size fields).
 """
 
@@ -33,7 +33,7 @@ STATEMENTS = _words("""
     MergeWithBoundingBox Left Right AlternateLeft AlternateRight Alternate Volumes SP VP TP SL VL TL
     ST VT TT SQ VQ TQ SS VS TS SH VH TH SI VI TI SY VY TY
 """)
-"""With what a statement may begin, also within braces."""
+"""Words that may begin a statement, also within braces."""
 
 OPERANDS = _words("""
     Abs Fabs Acos ArcCos Asin ArcSin Atan ArcTan Atan2 ArcTan2 Ceil Cos Cosh Exp Floor Fmod Hypot
@@ -52,7 +52,7 @@ OPERANDS = _words("""
     Distance Extend Frustum Gradient IntersectAniso Laplacian LonLat MathEval MathEvalAniso
     MaxEigenHessian Mean MinAniso Octree Param PostView Restrict Threshold
 """)
-"""Functions, constants, and words within a statement."""
+"""Functions, constants, and other words within statements."""
 
 OPTIONS: dict[str, frozenset[str]] = {
     "General": _words("""
@@ -77,10 +77,10 @@ OPTIONS: dict[str, frozenset[str]] = {
     nPointsPerCircle hMin hMax hBulk gradation features NRefine m11 m12 m13 m22 m23 m33 p n
 """),
 }
-"""Options by their group; those of ``Field`` belong to size fields."""
+"""Options by group; ``Field`` means size fields."""
 
 NUMBERED = ("Geometry", "Mesh")
-"""Groups whose options are all numbers, but for commands that a window would run."""
+"""Groups of which all options are allowed, as they are numbers, except commands for gmsh's window."""
 
 COLOUR = re.compile(
     r"(?:Light|Dark|Medium|Dim|Pale|Deep|Dodger|Royal|Navy|Midnight|Sky|Steel|Slate|Forest|Sea|Spring|Lawn|Olive"
@@ -104,7 +104,7 @@ REFUSED: dict[str, str] = {
     **dict.fromkeys(("StringToName", "S2N"), _BUILT),
     **dict.fromkeys(("Exit", "Sleep"), "ends or stops gmsh"),
 }
-"""Why those are refused that scripts of others most often have; what is on no list is refused as well."""
+"""Reasons for the words that scripts most often contain; words on no list are refused without reason."""
 
 RESERVED = (
     _words("""
@@ -116,4 +116,4 @@ RESERVED = (
 """)
     - STATEMENTS
 )
-"""Other words of gmsh: no name of a variable, even if a script gives it a value."""
+"""Other keywords of gmsh, which are refused even if a script assigns a value to them."""

@@ -27,14 +27,14 @@ import numpy as np
 from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
 
 _EQUILATERAL = math.sqrt(3) / 4
-_SHARE_OF_BOX = 0.25
-"""What a surface fills of its bounding box at least, for the estimate of its triangles."""
+_MIN_FILL = 0.25
+"""Fraction of its bounding box that a surface fills at least, for estimates of the number of triangles."""
 
 _SYSTEM = (
     *("/usr", "/lib", "/lib64", "/opt", "/etc/ld.so.cache", "/etc/localtime", "/dev/null", "/dev/urandom"),
     *("/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system"),
 )
-"""What libraries may read when they are in use."""
+"""Files and folders that libraries read."""
 
 
 class Refused(Exception):
@@ -42,23 +42,23 @@ class Refused(Exception):
 
 
 def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
-    """Do a job.
+    """Mesh one script.
 
     Parameters
     ----------
     job : dict
-        ``script``, ``folder`` (what may be read; null: all), ``size`` (or null), ``algorithm`` (or null),
-        ``script_seconds``, ``mesh_seconds`` (CPU time), ``memory`` [B] and ``most_triangles``.
+        ``script``, ``folder`` (may be read; null: all may), ``size`` (or null), ``algorithm`` (or null),
+        ``script_seconds``, ``mesh_seconds`` (limits on CPU time), ``memory`` [B] and ``max_triangles``.
     outcome : int
-        Descriptor of a file that gets a line of JSON for each stage.
+        Descriptor of a file to which a line of JSON is written for each stage.
     mesh : int
-        Descriptor of the file that gets the mesh (`_write_mesh`).
+        Descriptor of the file to which the mesh is written (`_write_mesh`).
     """
 
-    def report(**words: Any) -> None:
-        os.write(outcome, json.dumps(words).encode() + b"\n")
+    def report(**entries: Any) -> None:
+        os.write(outcome, json.dumps(entries).encode() + b"\n")
 
-    _confine(job["memory"])
+    _set_limits(job["memory"])
     report(stage="script")
     _allow_seconds(job["script_seconds"])
     try:
@@ -67,18 +67,18 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
                 *_SYSTEM,
                 sys.prefix,
                 sys.base_prefix,
-                # other environments may hold these; gmsh reads parts of numpy when it hands over meshes
+                # may be in other environments; gmsh imports parts of numpy when it returns meshes
                 os.path.dirname(gmsh.__file__ or ""),
                 os.path.dirname(os.path.dirname(np.__file__)),
                 job["folder"],
             ]
             report(sandbox=enter_sandbox(None if job["folder"] is None else readable))
             _set_size(gmsh, job["size"])
-            with _errors_told(gmsh, job["script"]):
+            with _raise_refused(gmsh, job["script"]):
                 gmsh.merge(job["script"])
             report(stage="mesh")
             _allow_seconds(job["mesh_seconds"])
-            _mesh(gmsh, job, lambda count: report(triangles=round(count)))
+            _generate_mesh(gmsh, job, lambda count: report(triangles=round(count)))
             _write_mesh(gmsh, file)
     except Refused as error:
         report(refused=str(error))
@@ -86,13 +86,14 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
         report(stage="memory")
     else:
         report(stage="done")
-    os._exit(0)  # gmsh has nothing to put away that outlives the process
+    os._exit(0)  # nothing of gmsh outlives the process, so that it need not be finalised
 
 
-def _confine(memory: int) -> None:
+def _set_limits(memory: int) -> None:
+    """Limit the memory [B], write no core files, and end with the parent process."""
     _limit(resource.RLIMIT_AS, memory)
     _limit(resource.RLIMIT_CORE, 0)
-    with contextlib.suppress(OSError, AttributeError):  # Linux: end together with who started us
+    with contextlib.suppress(OSError, AttributeError):  # PR_SET_PDEATHSIG, Linux only
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
@@ -102,15 +103,15 @@ def _allow_seconds(seconds: float) -> None:
     _limit(resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds))
 
 
-def _limit(what: int, value: int) -> None:
-    """Set a soft limit, within the hard one that stands."""
-    hard = resource.getrlimit(what)[1]
-    resource.setrlimit(what, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+def _limit(kind: int, value: int) -> None:
+    """Set the soft limit on a resource, within its hard limit."""
+    hard = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
 
 
 @contextmanager
 def _session() -> Iterator[ModuleType]:
-    """gmsh, quiet, with the user's gmsh configuration ignored."""
+    """gmsh, initialised without the user's configuration, that prints nothing."""
     try:
         import gmsh
     except (ImportError, OSError) as error:
@@ -121,7 +122,7 @@ def _session() -> Iterator[ModuleType]:
     try:
         gmsh.initialize(readConfigFiles=False)
         gmsh.model.add("lyra_petsc")
-    except Exception as error:  # its Python module and its library may be of different versions
+    except Exception as error:  # gmsh's Python module and library may be of different versions
         raise Refused(f"gmsh does not start ({error}); .geo files need a working gmsh") from None
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.option.setNumber("General.Verbosity", 1)  # errors only
@@ -130,33 +131,34 @@ def _session() -> Iterator[ModuleType]:
     yield gmsh
 
 
-def _mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[float], None]) -> None:
-    script, size, most = job["script"], job["size"], job["most_triangles"]
+def _generate_mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[float], None]) -> None:
+    """Mesh the surfaces; ``expect`` is called with an estimate of the number of triangles."""
+    script, size, maximum = job["script"], job["size"], job["max_triangles"]
     _set_size(gmsh, size)  # the script may have set its own
     if job["algorithm"] is not None:
         gmsh.option.setNumber("Mesh.Algorithm", job["algorithm"])
     has_mesh = any(len(tags) for tags in gmsh.model.mesh.getElements(2)[1])
-    with _errors_told(gmsh, script):
+    with _raise_refused(gmsh, script):
         if not has_mesh or size is not None or job["algorithm"] is not None:
             if has_mesh:
                 gmsh.model.mesh.clear()
             if size is not None:
-                _refuse_many(_curve_length(gmsh) / size, "edges", size, most)
-                _refuse_many(_estimate(gmsh, size), "triangles", size, most)
+                _refuse_many(_curve_length(gmsh) / size, "edges", size, maximum)
+                _refuse_many(_estimate_triangles(gmsh, size), "triangles", size, maximum)
             gmsh.model.mesh.generate(1)
-            count = _estimate(gmsh, size)
+            count = _estimate_triangles(gmsh, size)
             if size is None:
-                _refuse_many(count, "triangles", None, most)
-            expect(count / _SHARE_OF_BOX)  # of flat sheets that fill their boxes
+                _refuse_many(count, "triangles", None, maximum)
+            expect(count / _MIN_FILL)  # for flat sheets, which fill their boxes
             gmsh.model.mesh.generate(2)
 
 
 def _write_mesh(gmsh: ModuleType, file: BinaryIO) -> None:
-    """Write nodes, elements up to surfaces and groups, as gmsh orders them in a file, as numpy arrays.
+    """Write nodes, elements and physical groups as numpy arrays, in the order in which gmsh saves them.
 
-    First a JSON text: ``names`` as rows (dimension, tag, name) of physical groups, and ``blocks`` as rows
-    (element type, entity, tags of its groups). Then the tags (n,) and points (n, 3) of the nodes, and the
-    corners (m, corners) of each block's elements.
+    The first array is a JSON text: ``names`` has rows (dimension, tag, name) of physical groups, ``blocks``
+    rows (element type, entity, tags of its groups). Then follow the tags (n,) and points (n, 3) of the nodes,
+    and for each block the corners (m, corners) of its elements.
     """
     model = gmsh.model
     entities = sorted(model.getEntities())
@@ -181,7 +183,7 @@ def _write_mesh(gmsh: ModuleType, file: BinaryIO) -> None:
 
 
 def _group_name(gmsh: ModuleType, dimension: int, tag: int) -> str:
-    """Name of a physical group, whatever its encoding: gmsh's own Python raises for what is not UTF-8."""
+    """Name of a physical group in any encoding; gmsh's Python module raises for names not in UTF-8."""
     name, error = ctypes.c_char_p(), ctypes.c_int()
     gmsh.lib.gmshModelGetPhysicalName(
         ctypes.c_int(dimension), ctypes.c_int(tag), ctypes.byref(name), ctypes.byref(error)
@@ -190,38 +192,39 @@ def _group_name(gmsh: ModuleType, dimension: int, tag: int) -> str:
 
 
 def _set_size(gmsh: ModuleType, size: float | None) -> None:
+    """Replace all element sizes by ``size``; None keeps them."""
     if size is None:
         return
     for option, value in {"MeshSizeFactor": 1.0, "MeshSizeMin": size, "MeshSizeMax": size}.items():
         gmsh.option.setNumber(f"Mesh.{option}", value)
 
 
-def _refuse_many(number: float, what: str, size: float | None, most: int) -> None:
-    if number > most:
-        where = "the sizes in the script" if size is None else f"size {size:g} m"
-        raise Refused(f"{where} would give about {number:.2g} {what}; at most {most:.2g} fit into memory")
+def _refuse_many(number: float, kind: str, size: float | None, maximum: int) -> None:
+    if number > maximum:
+        cause = "the sizes in the script" if size is None else f"size {size:g} m"
+        raise Refused(f"{cause} would give about {number:.2g} {kind}; at most {maximum:.2g} fit into memory")
 
 
 def _curve_length(gmsh: ModuleType) -> float:
-    """Sum [m] of the straight distances that the curves span."""
+    """Lower bound [m] of the length of all curves: the sum of the diagonals of their bounding boxes."""
     boxes = (gmsh.model.getBoundingBox(*entity) for entity in gmsh.model.getEntities(1))
     return sum(math.hypot(*_extent(box)) for box in boxes)
 
 
-def _estimate(gmsh: ModuleType, size: float | None) -> float:
-    """Triangles of all surfaces, from their bounding boxes; without ``size`` from the edges around them."""
+def _estimate_triangles(gmsh: ModuleType, size: float | None) -> float:
+    """Number of triangles by bounding boxes and element size; without ``size`` by that of boundary edges."""
     count = 0.0
     for dimension, tag in gmsh.model.getEntities(2):
         edge = _longest_mean_edge(gmsh, tag) if size is None else size
         if edge is None:
             continue
         x, y, z = _extent(gmsh.model.getBoundingBox(dimension, tag))
-        count += _SHARE_OF_BOX * math.hypot(x * y, y * z, z * x) / (_EQUILATERAL * edge * edge)
+        count += _MIN_FILL * math.hypot(x * y, y * z, z * x) / (_EQUILATERAL * edge * edge)
     return count
 
 
 def _longest_mean_edge(gmsh: ModuleType, surface: int) -> float | None:
-    """Mean length [m] of the edges on the most coarsely divided curve around a surface."""
+    """Mean length [m] of the edges on the coarsest boundary curve of a surface; None without edges."""
     means = []
     for dimension, curve in gmsh.model.getBoundary([(2, surface)], oriented=False):
         edges = sum(len(tags) for tags in gmsh.model.mesh.getElements(dimension, curve)[1])
@@ -232,35 +235,36 @@ def _longest_mean_edge(gmsh: ModuleType, surface: int) -> float | None:
 
 
 def _extent(box: tuple[float, ...]) -> tuple[float, float, float]:
+    """Sides [m] of a bounding box of gmsh; 0 for sides without limit."""
     sides = [high - low for low, high in zip(box[:3], box[3:], strict=True)]
     x, y, z = (side if 0.0 <= side < 1e100 else 0.0 for side in sides)
     return x, y, z
 
 
 @contextmanager
-def _errors_told(gmsh: ModuleType, script: str) -> Iterator[None]:
-    """Turn what gmsh raises, or only logs, into `Refused`."""
+def _raise_refused(gmsh: ModuleType, script: str) -> Iterator[None]:
+    """Raise `Refused` for errors that gmsh raises or only logs."""
     try:
         yield
     except (Refused, MemoryError):
         raise
     except Exception as error:  # gmsh raises nothing more precise
-        raise Refused(f"gmsh: {_complaint(gmsh, script) or ' '.join(str(error).split())}") from None
-    if complaint := _complaint(gmsh, script):
-        raise Refused(f"gmsh: {complaint}")
+        raise Refused(f"gmsh: {_logged_error(gmsh, script) or ' '.join(str(error).split())}") from None
+    if message := _logged_error(gmsh, script):
+        raise Refused(f"gmsh: {message}")
 
 
-def _complaint(gmsh: ModuleType, script: str) -> str:
-    """First error gmsh logged, in one line, without the path of the script itself."""
+def _logged_error(gmsh: ModuleType, script: str) -> str:
+    """The first error in gmsh's log, on one line and without the path of the script; empty if none."""
     try:
         lines = gmsh.logger.get()
     except UnicodeDecodeError:  # an error message that quotes the script
         return "the script has an error, in text that is not UTF-8"
     for line in lines:
         if line.startswith("Error"):
-            words = " ".join(line.split(":", 1)[1].split())
-            folder = os.path.dirname(script)  # of copies: the user knows the files by other names
-            return words.replace(f"'{script}', ", "").replace(f"{folder}/", "").removesuffix(" ()")
+            message = " ".join(line.split(":", 1)[1].split())
+            folder = os.path.dirname(script)  # holds copies, whose paths mean nothing to the user
+            return message.replace(f"'{script}', ", "").replace(f"{folder}/", "").removesuffix(" ()")
     return ""
 
 

@@ -1,10 +1,10 @@
-"""The sandbox of gmsh's process: the kernel's seccomp, by libseccomp, and Landlock, through ctypes.
+"""Sandbox of gmsh's process: seccomp (by libseccomp) and Landlock of the Linux kernel, through ctypes.
 
-Raised once gmsh and its libraries are loaded, and never lowered again: the process can start no program and
-no other process, open no socket, and create, change or remove no file; it goes on writing to what is open.
-With Landlock it can also read only what it needs. The list of statements (`geo_script`) is what is promised;
-this is for what the list may have missed. Where the kernel permits none of it, nothing is raised; without
-libseccomp, which comes with systemd and with Debian's apt, only Landlock.
+The process enters the sandbox once gmsh and its libraries are loaded, and cannot leave it. It can then start
+no program and no process, open no socket, and create, change or remove no file; it can write to files that
+are open. With Landlock it can read only the files it needs. Users rely on the list of allowed statements
+(`geo_script`); the sandbox is a second layer against gaps in this list. Where the kernel permits neither, or
+without libseccomp (part of systemd and of Debian's apt), the respective layer is missing.
 
 Sources: seccomp_init(3), seccomp_rule_add(3), landlock(7).
 """
@@ -24,10 +24,10 @@ from pathlib import Path
 PR_SET_NO_NEW_PRIVS = 38
 CLONE_THREAD = 0x10000
 TIOCSTI, TIOCLINUX = 0x5412, 0x541C
-# and the bit of O_TMPFILE that O_DIRECTORY lacks
+# flags of open for writing; the last is the bit of O_TMPFILE that O_DIRECTORY lacks
 WRITING = (os.O_WRONLY, os.O_RDWR, os.O_CREAT, os.O_TRUNC, 0o20000000)
 
-# of libseccomp: actions, attributes of a filter, comparisons
+# constants of libseccomp: actions, attributes of a filter, comparisons
 _ALLOW, _REFUSE, _UNKNOWN, _KILL = 0x7FFF0000, 0x50000 | errno.EPERM, 0x50000 | errno.ENOSYS, 0x80000000
 _BAD_ARCHITECTURE, _ALL_THREADS = 2, 4
 _DIFFERS, _MASKED = 1, 7
@@ -45,14 +45,14 @@ _REFUSED_CALLS = """
     unshare userfaultfd utime utimensat utimes vfork
 """
 
-# since Linux 5.0 new calls have one number on all machines; an older libseccomp does not know the latest
+# calls that an older libseccomp does not know; since Linux 5.0 new calls have one number on all machines
 _NEW_CALLS = {
     "pidfd_send_signal": 424, "open_tree": 428, "move_mount": 429, "fsopen": 430, "fsconfig": 431,
     "fsmount": 432, "fspick": 433, "pidfd_open": 434, "pidfd_getfd": 438, "mount_setattr": 442,
     "memfd_secret": 447, "fchmodat2": 452, "setxattrat": 463, "removexattrat": 466, "file_setattr": 469,
 }  # fmt: skip
 
-# libraries go on with the older call when they are told that there is no such call
+# answered with "no such call", so that libraries use the older call
 _UNKNOWN_CALLS = {
     "io_uring_setup": 425, "io_uring_enter": 426, "io_uring_register": 427, "clone3": 435, "openat2": 437
 }  # fmt: skip
@@ -60,11 +60,11 @@ _UNKNOWN_CALLS = {
 _LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
 _READ_FILE, _READ_DIR = 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""Rights over files, by the version of Landlock that brought them."""
+"""Access rights to files, by the version of Landlock that introduced them."""
 
 
 class _Comparison(ctypes.Structure):
-    """Of an argument of a call, by its number: with a value, or of its bits in a mask with a value."""
+    """Comparison of an argument with ``first``, or of its bits in the mask ``first`` with ``second``."""
 
     _fields_ = (
         ("argument", ctypes.c_uint),
@@ -89,34 +89,34 @@ def enter_sandbox(readable: Iterable[str | os.PathLike[str]] | None) -> list[str
     Parameters
     ----------
     readable : iterable of path, or None
-        Beneath which files may be read, where Landlock is; None: everywhere.
+        Files and folders that can be read, where the kernel has Landlock; None: all.
 
     Returns
     -------
     list of str
-        What stands: ``seccomp``, ``Landlock``; empty where the kernel permits neither.
+        Layers in force: ``seccomp``, ``Landlock``; empty where the kernel permits neither.
     """
     if sys.platform != "linux":
         return []
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_NO_NEW_PRIVS, *map(ctypes.c_ulong, (1, 0, 0, 0))) != 0:
         return []
-    stands = ["seccomp"] if _seccomp() else []
-    return stands + (["Landlock"] if _landlock(libc, ["/"] if readable is None else readable) else [])
+    layers = ["seccomp"] if _load_seccomp() else []
+    return layers + (["Landlock"] if _load_landlock(libc, ["/"] if readable is None else readable) else [])
 
 
-def describe_sandbox(stands: Sequence[str], *, trusted: bool = False) -> str:
-    """How gmsh is sandboxed, in words for the user."""
+def describe_sandbox(layers: Sequence[str], *, trusted: bool = False) -> str:
+    """Text for the user on how gmsh is sandboxed."""
     first = (
         "scripts are trusted, whatever they say" if trusted else "scripts are read by a list of statements"
     )
-    second = f"{' and '.join(stands)} in gmsh's process" if stands else "none by the kernel here"
+    second = f"{' and '.join(layers)} in gmsh's process" if layers else "none by the kernel here"
     return f"{first}; {second}"
 
 
 @cache
 def supported_layers() -> list[str]:
-    """Which parts of the sandbox this system supports, tried in a process like gmsh's."""
+    """Layers of the sandbox that this system supports, determined in a child process."""
     code = "import json, lyra_petsc.mesh.gmsh_sandbox as s; print(json.dumps(s.enter_sandbox(None)))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
     try:
@@ -136,7 +136,8 @@ def supported_layers() -> list[str]:
 # -- seccomp -----------------------------------------------------------------------------------------
 
 
-def _seccomp() -> bool:
+def _load_seccomp() -> bool:
+    """Load the filter of system calls; whether the whole of it is in force."""
     try:
         library = ctypes.CDLL("libseccomp.so.2")
     except OSError:
@@ -145,11 +146,11 @@ def _seccomp() -> bool:
     rules = ctypes.c_void_p(library.seccomp_init(_ALLOW))
 
     def answer(action: int, name: str, *comparison: int) -> bool:
-        """Whether calls of this name, in which the comparison holds, will be answered so."""
+        """Add a rule for calls of this name for which the comparison holds; whether this worked."""
         number = library.seccomp_syscall_resolve_name(name.encode())
         if number == -1:
             number = (_NEW_CALLS | _UNKNOWN_CALLS).get(name, number)
-        if number < 0:  # not on this machine
+        if number < 0:  # no such call on this machine
             return True
         compared = ctypes.byref(_Comparison(*comparison)) if comparison else None
         rule = rules, ctypes.c_uint32(action), number, len(comparison[:1]), compared
@@ -160,26 +161,27 @@ def _seccomp() -> bool:
         library.seccomp_attr_set(rules, _ALL_THREADS, 1) == 0,
         *(answer(_REFUSE, name) for name in (*_REFUSED_CALLS.split(), *_NEW_CALLS)),
         *(answer(_UNKNOWN, name) for name in _UNKNOWN_CALLS),
-        answer(_REFUSE, "clone", 0, _MASKED, CLONE_THREAD, 0),  # all but threads
-        # the kernel looks at half of this argument
+        answer(_REFUSE, "clone", 0, _MASKED, CLONE_THREAD, 0),  # threads remain allowed
+        # the kernel uses the lower 32 bits of this argument
         *(answer(_REFUSE, "ioctl", 1, _MASKED, 2**32 - 1, request) for request in (TIOCSTI, TIOCLINUX)),
-        *(answer(_REFUSE, name, 0, _DIFFERS, os.getpid()) for name in ("kill", "tgkill")),  # but by abort
-        answer(_REFUSE, "prlimit64", 0, _DIFFERS, 0),  # of other processes
+        *(answer(_REFUSE, name, 0, _DIFFERS, os.getpid()) for name in ("kill", "tgkill")),  # abort needs them
+        answer(_REFUSE, "prlimit64", 0, _DIFFERS, 0),  # 0: this process
         *(
             answer(_REFUSE, name, number, _MASKED, bit, bit)
             for number, name in ((1, "open"), (2, "openat"))
             for bit in WRITING
         ),
     ]
-    stands = all(done) and library.seccomp_load(rules) == 0
+    loaded = all(done) and library.seccomp_load(rules) == 0
     library.seccomp_release(rules)
-    return bool(stands)
+    return bool(loaded)
 
 
 # -- Landlock ----------------------------------------------------------------------------------------
 
 
-def _landlock(libc: ctypes.CDLL, readable: Iterable[str | os.PathLike[str]]) -> bool:
+def _load_landlock(libc: ctypes.CDLL, readable: Iterable[str | os.PathLike[str]]) -> bool:
+    """Restrict reading to ``readable`` and forbid writing; whether it is in force."""
     long, none = ctypes.c_long, ctypes.c_void_p(None)
     version = int(libc.syscall(long(_LANDLOCK_CREATE), none, long(0), long(1)))
     if version < 1:
@@ -194,7 +196,7 @@ def _landlock(libc: ctypes.CDLL, readable: Iterable[str | os.PathLike[str]]) -> 
         for path in readable:
             try:
                 parent = os.open(path, os.O_PATH | os.O_CLOEXEC)
-            except OSError:  # not there
+            except OSError:  # does not exist
                 continue
             try:
                 allowed = _READ_FILE | (_READ_DIR if Path(path).is_dir() else 0)

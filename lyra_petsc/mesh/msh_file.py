@@ -1,7 +1,8 @@
-"""gmsh .msh files, formats 2.2 and 4.1: triangles and physical groups in file order, read without gmsh.
+"""Reader of gmsh's .msh files (formats 2.2 and 4.1): triangles and physical groups in file order.
 
-gmsh in a process of its own takes 1.6 times as long for a million triangles (binary 4.1: 3.1 s, here 1.9 s;
-text 2.2: 10.5 s, here 6.5 s), orders the nodes of format 2.2 anew, and names no section that is damaged.
+It does not use gmsh, which in a child process takes 1.6 times as long for a million triangles (binary 4.1:
+3.1 s instead of 1.9 s; text 2.2: 10.5 s instead of 6.5 s), changes the order of the nodes of format 2.2, and
+does not say which section of a file is damaged.
 """
 
 from __future__ import annotations
@@ -45,38 +46,38 @@ ELEMENT_TYPES: dict[int, tuple[int, int, int]] = {
 
 
 class MshError(ValueError):
-    """A section that does not hold what the format says; the message is for the user."""
+    """A section does not follow the format; the message is for the user."""
 
 
 class NoTrianglesError(MshError):
-    """A sound file without a surface mesh."""
+    """An undamaged file without a surface mesh."""
 
 
 def read_msh(path: Path) -> Sheet:
     """Read a .msh file.
 
-    Vertices come in the order in which the file lists its nodes; those in no triangle are dropped, with
-    a note. Triangles come in file order. Quads are split on the shorter diagonal, elements of higher order
-    reduced to their corners, with a note. A physical group without a name is called by its number.
+    Vertices and triangles are in file order. With a note, nodes in no triangle are dropped, quads are split
+    along the shorter diagonal, and elements of higher order are reduced to their corners. A physical group
+    without a name is called by its number.
 
     Raises
     ------
     InputError
         If the file is of another format, damaged, or holds no triangles.
     """
-    content = _sections(read_bytes(path), path)
+    content = _read_sections(read_bytes(path), path)
     for section in ("Nodes", "Elements"):
         if section not in content.sections:
             raise InputError(f"the mesh has no triangles: section ${section} is missing", file=path)
     section = ""
     try:
         section = "Nodes"
-        tags, points = _nodes(content)
+        tags, points = _read_nodes(content)
         section = "Entities"
-        physical = _entities(content)
+        physical = _read_entities(content)
         section = "Elements"
-        blocks = _elements(content, physical)
-        return assemble(tags, points, blocks, _names(content), note_loose=True)
+        blocks = _read_elements(content, physical)
+        return assemble_sheet(tags, points, blocks, _read_names(content), note_loose=True)
     except NoTrianglesError as error:
         raise InputError(f"the mesh has {error}", file=path) from None
     except MshError as error:
@@ -88,7 +89,7 @@ def read_msh(path: Path) -> Sheet:
 
 @dataclass
 class _File:
-    """The sections of a file and how to read them; ``order`` is empty for ASCII."""
+    """The sections of a file; ``order`` is the byte order (< or >) of a binary file, empty for ASCII."""
 
     version: str
     order: str
@@ -99,7 +100,7 @@ class _File:
         return BinaryValues(body, self.order) if self.order else TextValues(body)
 
 
-def _sections(data: bytes, path: Path) -> _File:
+def _read_sections(data: bytes, path: Path) -> _File:
     found: _File | None = None
     at = 0
     while (head := _SECTION.search(data, at)) is not None:
@@ -112,7 +113,7 @@ def _sections(data: bytes, path: Path) -> _File:
         body = data[head.end() : end]
         at = end + 4 + len(name)
         if name == b"MeshFormat":
-            found = _format(body, path)
+            found = _read_format(body, path)
         elif found is not None:
             found.sections.setdefault(name.decode(), body)
     if found is None:
@@ -121,7 +122,7 @@ def _sections(data: bytes, path: Path) -> _File:
     return found
 
 
-def _format(body: bytes, path: Path) -> _File:
+def _read_format(body: bytes, path: Path) -> _File:
     line, _, rest = body.partition(b"\n")
     words = line.decode("latin-1").split()
     if len(words) < 3 or words[1] not in ("0", "1"):
@@ -145,44 +146,44 @@ def _format(body: bytes, path: Path) -> _File:
     raise InputError("damaged: the byte-order mark of a binary file is not 1", file=path)
 
 
-def _nodes(content: _File) -> tuple[Ints, Array]:
+def _read_nodes(content: _File) -> tuple[Ints, Array]:
     """Tags (n,) and points (n, 3) in file order."""
     if content.version == "4.1":
         values = content.values("Nodes")
         tags, points = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
-        for _ in range(several(values, 4, "size")[0]):
-            dimension, _, parametric = several(values, 3)
-            count = one(values, "size")
+        for _ in range(read_ints(values, 4, "size")[0]):
+            dimension, _, parametric = read_ints(values, 3)
+            count = read_int(values, "size")
             tags.append(values.rows(count, 1, width="size")[0][:, 0])
             extra = dimension if parametric and 0 <= dimension <= 3 else 0
             points.append(values.rows(count, 0, 3 + extra)[1][:, :3])
         return np.concatenate(tags), np.concatenate(points)
-    values, count = _counted(content, "Nodes")
+    values, count = _read_count(content, "Nodes")
     rows, points_2 = values.rows(count, 1, 3)
     return rows[:, 0], points_2
 
 
-def _elements(content: _File, physical: dict[tuple[int, int], list[int]]) -> list[ElementBlock]:
+def _read_elements(content: _File, physical: dict[tuple[int, int], list[int]]) -> list[ElementBlock]:
     if content.version == "4.1":
         return blocks_4(content.values("Elements"), physical)
     if not content.order:
         return blocks_2(TextValues(content.sections["Elements"]))
-    values, count = _counted(content, "Elements")
+    values, count = _read_count(content, "Elements")
     return blocks_2_binary(values, count)
 
 
-def _counted(content: _File, section: str) -> tuple[Values, int]:
+def _read_count(content: _File, section: str) -> tuple[Values, int]:
     """Values of a format 2 section and their count, which precedes them as text in binary files too."""
     if not content.order:
         values = content.values(section)
-        return values, one(values)
+        return values, read_int(values)
     line, _, rest = content.sections[section].partition(b"\n")
     if not line.strip().isdigit() or len(line) > 20:
         raise MshError("does not begin with a count")
     return BinaryValues(rest, content.order), int(line)
 
 
-def _entities(content: _File) -> dict[tuple[int, int], list[int]]:
+def _read_entities(content: _File) -> dict[tuple[int, int], list[int]]:
     """Physical groups of each entity (dimension, tag) of a 4.1 file."""
     physical: dict[tuple[int, int], list[int]] = {}
     if content.version != "4.1":
@@ -193,23 +194,23 @@ def _entities(content: _File) -> dict[tuple[int, int], list[int]]:
         values = content.values(section)
         partitioned = section == "PartitionedEntities"
         if partitioned:
-            several(values, 1, "size")
-            values.rows(one(values, "size"), 2)
-        for dimension, count in enumerate(several(values, 4, "size")):
+            read_ints(values, 1, "size")
+            values.rows(read_int(values, "size"), 2)
+        for dimension, count in enumerate(read_ints(values, 4, "size")):
             for _ in range(count):
-                tag = one(values)
+                tag = read_int(values)
                 if partitioned:
-                    several(values, 2)
-                    several(values, one(values, "size"))
+                    read_ints(values, 2)
+                    read_ints(values, read_int(values, "size"))
                 values.rows(1, 0, 3 if dimension == 0 else 6)
-                groups = several(values, one(values, "size"))
+                groups = read_ints(values, read_int(values, "size"))
                 physical[dimension, tag] = [abs(group) for group in groups]
                 if dimension > 0:
-                    several(values, one(values, "size"))
+                    read_ints(values, read_int(values, "size"))
     return physical
 
 
-def _names(content: _File) -> dict[tuple[int, int], str]:
+def _read_names(content: _File) -> dict[tuple[int, int], str]:
     text = content.sections.get("PhysicalNames", b"").decode("utf-8", errors="replace").replace("\r", "")
     return {(int(dim), abs(int(tag))): printable(name) for dim, tag, name in _NAME.findall(text)}
 
@@ -222,7 +223,7 @@ class TextValues:
 
     def __init__(self, body: bytes) -> None:
         with warnings.catch_warnings():
-            # numpy warns, and stops, at the first thing that is no number
+            # numpy warns and stops at the first text that is no number
             warnings.simplefilter("error")
             try:
                 self._values = np.fromstring(body.decode("latin-1"), dtype=np.float64, sep=" ")
@@ -231,15 +232,15 @@ class TextValues:
         self._at = 0
 
     def rows(self, n: int, integers: int, reals: int = 0, width: Width = "int") -> tuple[Ints, Array]:
-        """``n`` rows of ``integers`` whole numbers followed by ``reals`` numbers.
+        """Read ``n`` rows of ``integers`` integers followed by ``reals`` real numbers.
 
-        Returns (n, integers) int64 and (n, reals) float64. ``width`` is the size of the whole numbers in
-        a binary file: C ``int`` or ``size_t``.
+        Returns (n, integers) int64 and (n, reals) float64. ``width`` is the type of the integers in a binary
+        file: C ``int`` or ``size_t``.
 
         Raises
         ------
         MshError
-            If fewer numbers are left, or something else stands there.
+            If fewer numbers remain, or an integer is none.
         """
         each = integers + reals
         if n < 0 or n * each > len(self._values) - self._at:
@@ -248,13 +249,13 @@ class TextValues:
         self._at += n * each
         return _whole(table[:, :integers]), np.array(table[:, integers:])
 
-    def window(self, n: int) -> Ints:
-        """The next whole numbers, at most ``n``, without reading on."""
+    def peek(self, n: int) -> Ints:
+        """The next integers, at most ``n``, without advancing."""
         return _whole(self._values[self._at : self._at + n])
 
 
 class BinaryValues:
-    """Values of a binary section, read as those of text; ``order`` is ``<`` or ``>``."""
+    """Values of a binary section, with the methods of `TextValues`; ``order`` is ``<`` or ``>``."""
 
     def __init__(self, body: bytes, order: str) -> None:
         self._body = body
@@ -277,18 +278,18 @@ class BinaryValues:
 Values: TypeAlias = TextValues | BinaryValues
 
 
-def one(values: Values, width: Width = "int") -> int:
-    """The next whole number."""
+def read_int(values: Values, width: Width = "int") -> int:
+    """Read the next integer."""
     return int(values.rows(1, 1, width=width)[0][0, 0])
 
 
-def several(values: Values, n: int, width: Width = "int") -> list[int]:
-    """The next ``n`` whole numbers."""
+def read_ints(values: Values, n: int, width: Width = "int") -> list[int]:
+    """Read the next ``n`` integers."""
     return values.rows(n, 1, width=width)[0][:, 0].tolist()
 
 
 def _whole(table: Array) -> Ints:
-    # beyond 2^53 a float no longer holds a whole number exactly; no real tag is that large
+    # floats are exact for integers below 2^53; no tag of a mesh is as large
     if not (
         np.isfinite(table).all() and (np.abs(table) < 2.0**53).all() and (table == np.floor(table)).all()
     ):
@@ -312,7 +313,7 @@ class ElementBlock:
     entity : (n,) int64
         Tag of the geometrical entity.
     groups : (m, 2) int64
-        Elements of the block that are in physical groups, and the tags of these.
+        For each membership in a physical group the element (index in the block) and the tag of the group.
     """
 
     kind: int
@@ -335,53 +336,53 @@ def element_type(kind: int) -> tuple[int, int, int]:
 
 def blocks_2(values: TextValues) -> list[ElementBlock]:
     """Blocks of an ASCII format 2 ``$Elements`` section, in file order."""
-    left = one(values)
+    remaining = read_int(values)
     blocks = []
-    while left > 0:
-        head = values.window(3)
+    while remaining > 0:
+        head = values.peek(3)
         if len(head) < 3:
             raise MshError("is cut short")
         kind, n_tags = int(head[1]), int(head[2])
         nodes = element_type(kind)[2]
-        width = 3 + _tags(n_tags) + nodes
-        # rows of one type and number of tags mostly follow each other: take as many at once as do
-        run, reach = 0, 64
+        width = 3 + _check_tag_count(n_tags) + nodes
+        # consecutive rows of one type and number of tags are read at once
+        run, n_rows = 0, 64
         while True:
-            ahead = values.window(min(reach, left) * width)
+            ahead = values.peek(min(n_rows, remaining) * width)
             table = ahead[: len(ahead) // width * width].reshape(-1, width)
             same = (table[:, 1] == kind) & (table[:, 2] == n_tags)
             run = int(np.argmin(same)) if not same.all() else len(same)
-            if run < len(same) or len(same) < reach:
+            if run < len(same) or len(same) < n_rows:
                 break
-            reach *= 8
+            n_rows *= 8
         if run == 0:
             raise MshError("is cut short")
         blocks.append(_block_2(kind, values.rows(run, width)[0][:, 3:], n_tags))
-        left -= run
+        remaining -= run
     return blocks
 
 
 def blocks_2_binary(values: Values, n_elements: int) -> list[ElementBlock]:
     """Blocks of a binary format 2 ``$Elements`` section, whose count ``n_elements`` is text."""
     blocks: list[ElementBlock] = []
-    left = n_elements
-    while left > 0:
-        kind, follow, n_tags = several(values, 3)
-        if follow < 1:
-            raise MshError(f"holds a block of {follow} elements")
-        rows = values.rows(follow, 1 + _tags(n_tags) + element_type(kind)[2])[0]
+    remaining = n_elements
+    while remaining > 0:
+        kind, count, n_tags = read_ints(values, 3)
+        if count < 1:
+            raise MshError(f"holds a block of {count} elements")
+        rows = values.rows(count, 1 + _check_tag_count(n_tags) + element_type(kind)[2])[0]
         blocks.append(_block_2(kind, rows[:, 1:], n_tags))
-        left -= follow
-    return _joined(blocks)
+        remaining -= count
+    return _merge_blocks(blocks)
 
 
 def blocks_4(values: Values, physical: dict[tuple[int, int], list[int]]) -> list[ElementBlock]:
     """Blocks of a format 4.1 ``$Elements`` section; ``physical`` gives the groups of each (dim, tag)."""
     blocks = []
-    n_blocks = several(values, 4, "size")[0]
+    n_blocks = read_ints(values, 4, "size")[0]
     for _ in range(n_blocks):
-        dimension, entity, kind = several(values, 3)
-        count = one(values, "size")
+        dimension, entity, kind = read_ints(values, 3)
+        count = read_int(values, "size")
         _, corners, nodes = element_type(kind)
         rows = values.rows(count, 1 + nodes, width="size")[0]
         tags = np.array(physical.get((dimension, entity), []), dtype=np.int64)
@@ -390,7 +391,7 @@ def blocks_4(values: Values, physical: dict[tuple[int, int], list[int]]) -> list
     return blocks
 
 
-def _tags(n_tags: int) -> int:
+def _check_tag_count(n_tags: int) -> int:
     if not 0 <= n_tags <= 100_000:
         raise MshError(f"holds an element with {n_tags} tags")
     return n_tags
@@ -398,7 +399,7 @@ def _tags(n_tags: int) -> int:
 
 def _block_2(kind: int, rows: Ints, n_tags: int) -> ElementBlock:
     corners = element_type(kind)[1]
-    # a negative number marks a group that sees the entity from behind
+    # a negative tag marks a group in which the orientation of the entity is reversed
     physical = np.abs(rows[:, 0]) if n_tags > 0 else np.zeros(len(rows), dtype=np.int64)
     entity = rows[:, 1] if n_tags > 1 else np.zeros(len(rows), dtype=np.int64)
     inside = np.flatnonzero(physical)
@@ -406,21 +407,21 @@ def _block_2(kind: int, rows: Ints, n_tags: int) -> ElementBlock:
     return ElementBlock(kind, rows[:, n_tags : n_tags + corners], entity, groups)
 
 
-def _joined(blocks: list[ElementBlock]) -> list[ElementBlock]:
-    """Join neighbouring blocks of one type: some writers give each element a block."""
-    joined = []
+def _merge_blocks(blocks: list[ElementBlock]) -> list[ElementBlock]:
+    """Merge consecutive blocks of one type: some programs write a block for each element."""
+    merged = []
     for kind, same in groupby(blocks, key=lambda block: block.kind):
         run = list(same)
         first = np.cumsum([0] + [len(block.nodes) for block in run])
         groups = [block.groups + [offset, 0] for block, offset in zip(run, first, strict=False)]
         nodes = np.concatenate([block.nodes for block in run])
         entity = np.concatenate([block.entity for block in run])
-        joined.append(ElementBlock(kind, nodes, entity, np.concatenate(groups)))
-    return joined
+        merged.append(ElementBlock(kind, nodes, entity, np.concatenate(groups)))
+    return merged
 
 
 def _by_tag(members: Ints, tags: Ints) -> dict[int, Ints]:
-    """Members (n, ...) of each tag, ascending in tags, else in their order."""
+    """The ``members`` (n, …) of each tag, in their order; tags ascending."""
     order = np.argsort(tags, kind="stable")
     found, first = np.unique(tags[order], return_index=True)
     return dict(zip(found.tolist(), np.split(members[order], first[1:]), strict=True)) if len(found) else {}
@@ -429,10 +430,10 @@ def _by_tag(members: Ints, tags: Ints) -> dict[int, Ints]:
 # -- triangles and groups ----------------------------------------------------------------------------
 
 
-def assemble(
+def assemble_sheet(
     tags: Ints, points: Array, blocks: list[ElementBlock], names: Names, *, note_loose: bool
 ) -> Sheet:
-    """Sheet of the triangles in ``blocks``.
+    """Make a `Sheet` of the triangles in ``blocks``.
 
     Parameters
     ----------
@@ -444,22 +445,22 @@ def assemble(
     names : dict
         Names of physical groups by (dimension, tag).
     note_loose : bool
-        Whether dropping nodes that are in no triangle deserves a note.
+        Add a note if nodes in no triangle are dropped.
 
     Raises
     ------
     MshError
-        Tags that are used twice or belong to no node.
+        A tag that several nodes or no node has.
     NoTrianglesError
     """
     notes: list[str] = []
-    blocks = _numbered(blocks, tags)
+    blocks = _resolve_tags(blocks, tags)
     triangles, entity, members = _triangles(points, [b for b in blocks if b.dimension == 2], notes)
     if len(triangles) == 0:
         solid = any(block.dimension == 3 and len(block.nodes) for block in blocks)
         hint = ", only solid elements: save the surface mesh" if solid else ""
         raise NoTrianglesError("no triangles" + hint)
-    triangles, members = _once(triangles, entity, members)
+    triangles, members = _drop_repeated(triangles, entity, members)
     used = np.zeros(len(tags), dtype=np.bool_)
     used[triangles] = True
     new_number = np.cumsum(used) - 1
@@ -471,7 +472,7 @@ def assemble(
         NamedSet(names.get((2, tag), str(tag)), 2, inside) for tag, inside in members.items() if len(inside)
     ]
     for dimension in (1, 0):
-        groups += _lower(dimension, blocks, names, used, new_number)
+        groups += _lower_groups(dimension, blocks, names, used, new_number)
     empty = {name for (dimension, _), name in names.items() if dimension < 3} - {
         group.name for group in groups
     }
@@ -486,8 +487,8 @@ def assemble(
     )
 
 
-def _numbered(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
-    """``blocks`` up to dimension 2, with positions in the file instead of node tags."""
+def _resolve_tags(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
+    """``blocks`` up to dimension 2, with indices of nodes in file order instead of tags."""
     order = np.argsort(tags, kind="stable")
     ascending = tags[order]
     twice = np.unique(ascending[1:][ascending[1:] == ascending[:-1]])
@@ -537,11 +538,11 @@ def _triangles(
     return np.concatenate(parts), np.concatenate(entities), by_tag
 
 
-def _once(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints, dict[int, Ints]]:
-    """Drop repeated triangles: format 2 writes an element once for each group that it is in.
+def _drop_repeated(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints, dict[int, Ints]]:
+    """Drop repeated triangles: format 2 contains an element once for each group that it is in.
 
-    Only where the same triangle of the same entity stands once per group; any other repetition is left
-    for the checks of the mesh to refuse.
+    Only repetitions of a triangle in the same entity and different groups are dropped; others remain for
+    `build.check_topology` to refuse.
     """
     if len(members) < 2:
         return triangles, members
@@ -550,7 +551,7 @@ def _once(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints
     new = np.concatenate(([True], (rows[order][1:] != rows[order][:-1]).any(axis=1)))
     if new.all():
         return triangles, members
-    # lexsort is stable: the first of each run stands first in the file
+    # lexsort is stable: the first of equal triangles is the first in the file
     representative = np.empty(len(triangles), dtype=np.int64)
     representative[order] = order[new][np.cumsum(new) - 1]
     if any(len(np.unique(representative[inside])) < len(inside) for inside in members.values()):
@@ -562,10 +563,10 @@ def _once(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints
     }
 
 
-def _lower(
+def _lower_groups(
     dimension: int, blocks: list[ElementBlock], names: Names, used: Mask, new_number: Ints
 ) -> list[NamedSet]:
-    """Groups of points or curves, reduced to vertices that are kept."""
+    """Groups of points or curves, without elements whose nodes were dropped."""
     chosen = [block for block in blocks if block.dimension == dimension]
     if not chosen:
         return []

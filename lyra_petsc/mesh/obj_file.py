@@ -1,4 +1,4 @@
-"""Wavefront .obj files: positions, material coordinates (``vt``), faces and named groups."""
+"""Reader of Wavefront .obj files: positions, material coordinates (``vt``), faces and named groups."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from lyra_petsc.mesh.mesh import NamedSet, Sheet
 from lyra_petsc.mesh.readers import first_few, printable, split_polygon, split_quads
 from lyra_petsc.scene.text import read_bytes
 
-# of no use to a simulation, and no reason to worry anybody
+# keywords that are ignored without a note
 _IGNORED = re.compile(
     "v[np]|[lps]|usemtl|mtllib|maplib|usemap|bevel|[cd]_interp|lod|cstype|deg|bmat|step|curv2?|surf|parm|trim|"
     "hole|scrv|sp|end|con|mg|shadow_obj|trace_obj|[cs]tech"
 )
 
-MOST_CORNERS = 256
-"""Corners of a polygon that is split: the work grows with their square."""
+MAX_CORNERS = 256
+"""Limit on the corners of a polygon: the work of splitting it grows with their square."""
 
 
 @dataclass
 class _Raw:
-    """The content of the lines as flat lists; corner numbers from 0, -1 for a missing ``vt``."""
+    """The content of the lines as flat lists; indices count from 0, −1 stands for a missing ``vt``."""
 
     points: array[float] = field(default_factory=lambda: array("d"))
     uv: array[float] = field(default_factory=lambda: array("d"))
@@ -43,15 +43,15 @@ class _Raw:
 def read_obj(path: Path) -> Sheet:
     """Read an .obj file.
 
-    Takes ``v``, ``vt``, ``f`` (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative numbers, polygons), and ``g``
-    and ``o`` as surface groups; lines may go on after a backslash. Everything else is ignored, unknown
-    keywords with a note. Quads are split on the shorter diagonal, larger polygons as a fan.
+    It reads ``v``, ``vt``, ``f`` (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative numbers, polygons), and
+    ``g`` and ``o`` as surface groups; a backslash continues a line. Other keywords are ignored, with a note
+    if they are unknown. Quads are split along the shorter diagonal, larger polygons into a fan.
 
     Raises
     ------
     InputError
-        With the line number: what is no number, a vertex out of range, a face of fewer than three
-        corners, ``vt`` on some corners only.
+        Text that is no number, a vertex out of range, a face of fewer than three corners, or ``vt`` at some
+        corners only; the message gives the line.
     """
     data = read_bytes(path)
     if b"\0" in data:
@@ -132,28 +132,28 @@ class _FaceError(ValueError):
 def _parse_face(raw: _Raw, parts: list[str], number: int) -> None:
     if len(parts) < 4:
         raise _FaceError("a face has at least three corners")
-    if len(parts) > MOST_CORNERS + 1:
-        raise _FaceError(f"{len(parts) - 1} corners, at most {MOST_CORNERS}; split it into triangles")
+    if len(parts) > MAX_CORNERS + 1:
+        raise _FaceError(f"{len(parts) - 1} corners, at most {MAX_CORNERS}; split it into triangles")
     for corner in parts[1:]:
         fields = corner.split("/")
-        raw.corner_point.append(_position(int(fields[0]), len(raw.points) // 3, "vertex"))
+        raw.corner_point.append(_from_zero(int(fields[0]), len(raw.points) // 3, "vertex"))
         has_uv = len(fields) > 1 and fields[1] != ""
-        raw.corner_uv.append(_position(int(fields[1]), len(raw.uv) // 2, "vt") if has_uv else -1)
+        raw.corner_uv.append(_from_zero(int(fields[1]), len(raw.uv) // 2, "vt") if has_uv else -1)
     raw.face_size.append(len(parts) - 1)
     raw.face_line.append(number)
 
 
-def _position(index: int, so_far: int, what: str) -> int:
-    """Number from 0 of an .obj index, which counts from 1, or back from the newest if negative."""
+def _from_zero(index: int, count: int, kind: str) -> int:
+    """Index from 0 of an .obj index, which counts from 1, or if negative back from the last of ``count``."""
     if index > 0:
         return index - 1
-    if index == 0 or -index > so_far:
-        raise _FaceError(f"no {what} {index}; {so_far} so far, numbers count from 1")
-    return so_far + index
+    if index == 0 or -index > count:
+        raise _FaceError(f"no {kind} {index}; {count} so far, numbers count from 1")
+    return count + index
 
 
 def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Lines with their numbers, without comments; those that end in a backslash joined to the next."""
+    """Lines with their numbers, without comments; a line that ends in a backslash is joined to the next."""
     pending, start = "", 0
     for number, line in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), 1):
         if "#" in line:
@@ -169,9 +169,10 @@ def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _split(points: Array, size: Ints, line: Ints, path: Path) -> tuple[Ints, Ints]:
-    """Corner numbers (F, 3) of the triangles in file order, and the first triangle of each face (+ end).
+    """Corner numbers (F, 3) of the triangles in file order, and the first triangle of each face (n + 1,).
 
-    ``points`` (C, 3) are those of the faces' corners, ``size`` and ``line`` each face's.
+    ``points`` (C, 3) are the positions of the corners of all faces, ``size`` and ``line`` (n,) the number of
+    corners and the line of each face.
     """
     begin = np.concatenate(([0], np.cumsum(size)))
     first = np.concatenate(([0], np.cumsum(size - 2)))
@@ -197,11 +198,11 @@ def _split(points: Array, size: Ints, line: Ints, path: Path) -> tuple[Ints, Int
     return triangles, first
 
 
-def _check_range(index: Ints, count: int, what: str, line: Ints, path: Path) -> None:
+def _check_range(index: Ints, count: int, kind: str, line: Ints, path: Path) -> None:
     wrong = np.flatnonzero(index >= count)
     if wrong.size:
         raise InputError(
-            f"line {line[wrong[0]]}: no {what} {index[wrong[0]] + 1}; the file has {count}", file=path
+            f"line {line[wrong[0]]}: no {kind} {index[wrong[0]] + 1}; the file has {count}", file=path
         )
 
 

@@ -170,8 +170,8 @@ def test_another_algorithm_only_where_one_is_asked_for(script: Path) -> None:
 
 
 def test_it_is_said_what_gmsh_does_where_it_takes_long(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(geo_file, "FIRST_WORD", 0.01)
-    monkeypatch.setattr(geo_file, "LONGEST_SILENCE", 0.1)
+    monkeypatch.setattr(geo_file, "FIRST_REPORT", 0.01)
+    monkeypatch.setattr(geo_file, "MAX_INTERVAL", 0.1)
     script.write_text(SQUARE)
     said: list[str] = []
     geo_file.mesh_geo(script, 0.006, report=said.append)
