@@ -1,6 +1,6 @@
-"""Base of every block of scene keys: unknown keys are errors, an empty key counts as absent.
+"""Base class of all blocks of scene keys: unknown keys are errors, and an empty key counts as absent.
 
-Messages, JSON Schema and reference page are generated from a block's fields, rules and docstring.
+Messages, JSON Schema and the reference page are generated from the fields, rules and docstring of a block.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ _UNIT = re.compile(r"\[([^\]]*)\]")
 
 
 class Block(BaseModel):
-    """A block of a scene file; attributes are named as its keys, except keys that are no Python names."""
+    """A block of a scene file; attributes have the names of the keys where these are Python names."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    # keys for which an explicit null is a value and not the same as leaving them out
+    # keys for which an explicit null is a value; else null means that the key is absent
     null_is_a_value: ClassVar[frozenset[str]] = frozenset()
 
-    # keys that a scene may well try, and what to say of them
+    # keys that users may expect although they are not supported, with the message
     unsupported: ClassVar[dict[str, str]] = {}
 
-    # how keys depend on each other
+    # dependencies between keys
     rules: ClassVar[tuple[Rule, ...]] = ()
 
-    # keys that `with_defaults` fills in only in some cases
+    # required keys that `with_defaults` fills in in some cases
     conditional_defaults: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
@@ -64,16 +64,16 @@ class Block(BaseModel):
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Hook: defaults that depend on which other keys are given."""
+        """Hook: add defaults that depend on which other keys are given."""
         return data
 
     @model_validator(mode="after")
     def _rules_hold(self) -> Self:
         for rule in self.rules:
             if not holds(rule.condition, self):
-                told = rule.message
-                words = told.format(**self.__dict__) if isinstance(told, str) else told(self)
-                raise problem(words, *filter(None, rule.at.split(".")))
+                template = rule.message
+                text = template.format(**self.__dict__) if isinstance(template, str) else template(self)
+                raise problem(text, *filter(None, rule.at.split(".")))
         return self
 
     @classmethod
@@ -90,7 +90,7 @@ class Block(BaseModel):
                 pass
             elif optional:  # an empty key counts as absent
                 content = {"anyOf": [content, {"type": "null"}]}
-            elif "$ref" in content:  # draft 7 ignores what stands beside a reference
+            elif "$ref" in content:  # draft 7 ignores keywords beside a reference
                 content = {"allOf": [content]}
             keys[key] = {"description": described[name].sentence, **content}
             if default not in (None, math.inf):
@@ -101,7 +101,7 @@ class Block(BaseModel):
         return schema | ({"allOf": [rule.condition for rule in cls.rules]} if cls.rules else {})
 
     def get(self, key: str) -> Any:
-        """The value of a key of `keys`, None where it is absent."""
+        """The value of a key, named as in `keys`; None if it is absent."""
         aliases = {field.alias: name for name, field in type(self).model_fields.items() if field.alias}
         return getattr(self, aliases.get(key, key))
 
@@ -112,7 +112,7 @@ class Block(BaseModel):
 
 @dataclass(frozen=True)
 class Described:
-    """One entry of a docstring's list of attributes.
+    """One entry of the list of attributes in a docstring.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class Described:
 
     @property
     def sentence(self) -> str:
-        """The text with the unit behind it."""
+        """The text, followed by the unit in brackets."""
         unit = _UNIT.search(self.kind)
         return " ".join(part for part in (self.text, unit[0] if unit and unit[1] else "") if part)
 
@@ -137,14 +137,14 @@ def summary(block: type) -> str:
 
 
 def attributes(block: type) -> dict[str, Described]:
-    """The entries under ``Attributes`` of a class and those it derives from, by name."""
+    """The entries under ``Attributes`` in the docstrings of a class and its bases, by name."""
     found: dict[str, Described] = {}
     for parent in reversed(block.__mro__):
-        found |= _listed(inspect.cleandoc(parent.__dict__.get("__doc__") or ""))
+        found |= _parse_attributes(inspect.cleandoc(parent.__dict__.get("__doc__") or ""))
     return found
 
 
-def _listed(doc: str) -> dict[str, Described]:
+def _parse_attributes(doc: str) -> dict[str, Described]:
     _, _, section = doc.partition("Attributes\n----------\n")
     found: dict[str, Described] = {}
     names: list[str] = []

@@ -1,4 +1,4 @@
-"""The scene as understood: written out with every default, and compared with one that was written."""
+"""Writing of scenes with all defaults, and comparison of a scene with one that was written."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from ruamel.yaml.representer import RoundTripRepresenter
 
 ABSENT = "absent"
-LONGEST = 60
+MAX_LENGTH = 60
 
 
 @dataclass(frozen=True)
 class Change:
-    """A key with another value.
+    """A key of a scene whose value differs from that of another scene.
 
     Attributes
     ----------
     key : str
-        Dotted, as in ``handles[1].from``.
+        Path of the key, as in ``handles[1].from``.
     old, new : str
-        The values in one line; ``absent`` where there is none.
+        The values on one line; ``absent`` if there is none.
     """
 
     key: str
@@ -39,11 +39,11 @@ class Change:
     new: str
 
     def __str__(self) -> str:
-        return f"{self.key}: {_short(self.old)} → {_short(self.new)}"
+        return f"{self.key}: {_shortened(self.old)} → {_shortened(self.new)}"
 
 
 def dump_scene(scene: Scene) -> str:
-    """YAML of ``scene``, all defaults filled in; `load_scene` makes an equal scene of it.
+    """YAML text of ``scene`` with all defaults, from which `load_scene` makes an equal scene.
 
     Mesh paths are absolute. Keys whose absence means "off" or "to the end" stay absent.
     """
@@ -58,19 +58,19 @@ def dump_scene(scene: Scene) -> str:
     yaml.Representer = Representer
     yaml.width = 1_000_000  # no line is broken
     stream = io.StringIO()
-    yaml.dump(_plain(scene), stream)
+    yaml.dump(_plain_value(scene), stream)
     return stream.getvalue()
 
 
 def _float_node(representer: RoundTripRepresenter, value: float) -> ScalarNode:
-    # with a point also before an exponent: YAML 1.1 readers take 1e-06 for text
+    # with a decimal point: readers of YAML 1.1 take 1e-06 for text
     digits = repr(value)
     if "e" in digits and "." not in digits:
         digits = digits.replace("e", ".0e")
     return representer.represent_scalar("tag:yaml.org,2002:float", digits)
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     from ruamel.yaml.comments import CommentedSeq
 
     if isinstance(value, Block):
@@ -79,12 +79,12 @@ def _plain(value: Any) -> Any:
             entry = getattr(value, name)
             absent = entry is None and field.default is None
             if not absent and entry != math.inf:
-                block[field.alias or name] = _plain(entry)
+                block[field.alias or name] = _plain_value(entry)
         return block
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _plain_value(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        sequence = CommentedSeq(_plain(entry) for entry in value)
+        sequence = CommentedSeq(_plain_value(entry) for entry in value)
         if not any(isinstance(entry, dict) for entry in sequence):
             sequence.fa.set_flow_style()
         return sequence
@@ -92,12 +92,12 @@ def _plain(value: Any) -> Any:
 
 
 def scene_changes(before: Path, scene: Scene) -> list[Change]:
-    """The keys in which ``scene`` differs from a scene as understood, in a file.
+    """The keys in which ``scene`` differs from a scene that `dump_scene` wrote.
 
     Parameters
     ----------
     before : Path
-        As `dump_scene` wrote it; the meshes it names need not exist.
+        The file; its meshes need not exist.
     scene : Scene
 
     Raises
@@ -117,14 +117,14 @@ def _compare(key: str, old: Any, new: Any) -> list[Change]:
         names = [*old, *(name for name in new if name not in old)]
         pairs = [(f"{key}.{name}" if key else str(name), old.get(name), new.get(name)) for name in names]
         return [change for pair in pairs for change in _compare(*pair)]
-    if _blocks(old) and _blocks(new):
+    if _is_block_list(old) and _is_block_list(new):
         length = max(len(old), len(new))
         old, new = ([*blocks, *[None] * (length - len(blocks))] for blocks in (old, new))
         return [c for i in range(length) for c in _compare(f"{key}[{i}]", old[i], new[i])]
     return [] if old == new else [Change(key, _text(old), _text(new))]
 
 
-def _blocks(value: Any) -> bool:
+def _is_block_list(value: Any) -> bool:
     return isinstance(value, list) and any(isinstance(entry, dict) for entry in value)
 
 
@@ -134,5 +134,5 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+def _shortened(text: str) -> str:
+    return text if len(text) <= MAX_LENGTH else text[: MAX_LENGTH - 1] + "…"

@@ -1,4 +1,4 @@
-"""The block ``fit``: numbers of a scene to be found, and what was measured of it. A run does not read it."""
+"""The block ``fit``: parameters of a scene to be identified, and the measurements. A run ignores it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lyra_petsc.scene.values import (
 )
 
 
-def _pair(value: Any) -> tuple[float, float]:
+def _bounds(value: Any) -> tuple[float, float]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
         raise problem(f"must be two numbers, [lowest, highest], not {shown(value)}")
     low, high = number(value[0]), number(value[1])
@@ -50,7 +50,7 @@ def _numbers(value: Any) -> tuple[float, ...]:
 Table = Annotated[
     Path, file_beside("table", ".csv", ".txt"), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})
 ]
-_PAIR = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
+_BOUNDS = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
 _NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]}
 
 
@@ -67,18 +67,18 @@ _Axes = Annotated[
 
 
 class Parameter(Block):
-    """A number to be found.
+    """A number of the scene to be identified.
 
     Attributes
     ----------
     start : float
-        Where the search begins, in the unit of the key.
+        Initial guess, in the unit of the key.
     bounds : two floats
-        Between which it is sought.
+        Lower and upper bound.
     """
 
     start: Number
-    bounds: Annotated[tuple[float, float], BeforeValidator(_pair), JsonSchema(_PAIR)]
+    bounds: Annotated[tuple[float, float], BeforeValidator(_bounds), JsonSchema(_BOUNDS)]
 
     @model_validator(mode="after")
     def _inside(self) -> Self:
@@ -89,14 +89,14 @@ class Parameter(Block):
 
 
 class Overhang(Block):
-    """Angle below the horizontal at which a strip hangs over an edge (ASTM D1388: 41.5°).
+    """Angle below the horizontal from the edge to the tip of a hanging strip (ASTM D1388: 41.5°).
 
     Attributes
     ----------
     edge : str
-        Probe where the overhang begins.
+        Probe at the edge, where the overhang begins.
     tip : str
-        Probe at its end.
+        Probe at the end of the strip.
     """
 
     edge: Name
@@ -104,14 +104,14 @@ class Overhang(Block):
 
 
 class DrapeCoefficient(Block):
-    """Shadow beyond the support over that of the flat sheet (BS 5058), seen along z.
+    """Drape coefficient of BS 5058: projected area beyond the support over that of the flat sheet, along z.
 
     Attributes
     ----------
     radius : float [m]
-        Of the flat sheet.
+        Radius of the flat sheet.
     support : float [m]
-        Of the disc that carries it.
+        Radius of the disc that supports it.
     """
 
     radius: Positive
@@ -125,25 +125,26 @@ class DrapeCoefficient(Block):
 
 
 class Quantity(Block):
-    """What can be measured: one of ``probe``, ``points``, ``overhang``, ``drape``, ``force``.
+    """A measurable quantity: one of ``probe``, ``points``, ``overhang``, ``drape``, ``force``.
 
     Attributes
     ----------
     probe : str or None
         Mean position [m] of a probe of the scene.
     points : str or None
-        Positions [m] of many vertices: a table with a column ``vertex`` (numbers from 0) or ``probe``
-        (names), some of x, y, z, and where they differ ``time`` and ``uncertainty``.
+        Positions [m] of many vertices, from a table with a column ``vertex`` (numbers from 0) or ``probe``
+        (names) and columns x, y, z or some of them; columns ``time`` and ``uncertainty`` give these for each
+        row.
     overhang : Overhang or None
-        Angle [°] at which the sheet hangs over.
+        Angle [°] of an overhang.
     drape : DrapeCoefficient or None
         Drape coefficient, 0 to 1.
     force : int or None
-        Force [N] of a handle, by its number from 0, on the sheet.
+        Force [N] of a handle on the sheet; the handle is given by its number from 0.
     axes : tuple of "x", "y", "z" or None
-        Components of a probe or a force, in the order of their values; without: all.
+        Components of a probe or a force, in the order of the values; without this key all.
     at : float [s] or None
-        When; in a static analysis a load factor. Without: at the end.
+        Time, or in a static analysis load factor; without this key the end.
     """
 
     rules: ClassVar[tuple[Rule, ...]] = (
@@ -165,16 +166,17 @@ class Quantity(Block):
 
 
 class Measurement(Quantity):
-    """What was measured, and how well.
+    """A measured quantity with its value and uncertainty.
 
     Attributes
     ----------
     value : float or list of float or None
-        What was found, in the order of ``axes``; in the quantity's unit.
+        Measured value, or values in the order of ``axes``, in the unit of the quantity.
     table : str or None
-        A table of values over time instead: columns ``time``, and x, y, z, ``degrees`` or ``coefficient``.
+        Instead of ``value``, a table of values over time: columns ``time``, and x, y, z, ``degrees`` or
+        ``coefficient``.
     uncertainty : float or None
-        Standard deviation of each value, in its unit; a column of that name takes its place.
+        Standard deviation of each value, in its unit; a column ``uncertainty`` of the table replaces it.
     """
 
     rules = (
@@ -195,14 +197,14 @@ class Measurement(Quantity):
 
 
 class Fit(Block):
-    """Numbers of the scene that are to be found from measurements, by ``fit``.
+    """Numbers of the scene that the command ``fit`` identifies from measurements.
 
     Attributes
     ----------
     parameters : dict of Parameter
-        By their keys in the scene, as in ``material.bending``.
+        The numbers, named by their keys in the scene, as ``material.bending``.
     measurements : list of Measurement
-        What was measured.
+        The measured quantities.
     """
 
     parameters: Annotated[dict[Name, Parameter], block_of("keys of the scene", minimum=1)]

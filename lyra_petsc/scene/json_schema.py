@@ -1,4 +1,4 @@
-"""The JSON Schema of scene files, for editors: generated from the blocks of the scene."""
+"""JSON Schema of scene files, for editors; generated from the blocks of the scene."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ FILE = f"lyra_petsc-{lyra_petsc.__version__}.schema.json"
 
 
 def scene_schema() -> dict[str, Any]:
-    """The schema (draft 7) of a scene.
+    """JSON Schema (draft 7) of a scene.
 
-    It refuses what the loader refuses as far as JSON Schema can say it. Beyond it are: files that do not
-    exist, groups of the mesh, names of motions that are not there, a membrane that is not positive definite,
-    and the order of times.
+    It refuses what the loader refuses, except what JSON Schema cannot express: files that do not exist,
+    unknown groups and motions, a membrane stiffness that is not positive definite, and the order of times.
     """
     content = Scene.model_json_schema(ref_template="#/definitions/{model}")
     definitions = content.pop("$defs")
@@ -39,15 +38,14 @@ def scene_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as the text of a file: what ``check --schema`` prints."""
+    """The schema as JSON text, as ``check --schema`` prints it."""
     return json.dumps(scene_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def schema_file() -> Path:
-    """A file with the schema in the user's cache folder, written if it is not there yet.
+    """A file with the schema in the user's cache folder, written if it is missing or different.
 
-    Where it cannot be written: the name under which a user may keep what ``check --schema`` prints beside the
-    scene.
+    If it cannot be written: ``scene.schema.json``, which users can make by ``check --schema``.
     """
     try:
         path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lyra_petsc" / FILE

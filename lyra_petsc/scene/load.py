@@ -1,4 +1,4 @@
-"""From a scene file and the command line's ``--set`` to a checked `Scene`."""
+"""Loading of a checked `Scene` from a scene file and the ``--set`` options of the command line."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
 from lyra_petsc.scene.values import shown
 
-# A JSON file with one of these is a scene of ours, not one of the original program.
+# A JSON file with one of these keys is a scene of this program, not of the original one.
 _OUR_KEYS = {"mesh", "material", "time"}
 
-STORED, BESIDE_STORED = "scene.yaml", "mesh.h5"
-"""Of a run's folder: the scene, whose materials have no bending_model if there were hinges only, and what
-shows that it is one."""
+STORED, MESH_OF_RUN = "scene.yaml", "mesh.h5"
+"""Scene and mesh in the folder of a run. Scenes stored before ``bending_model`` existed mean hinges; the mesh
+shows that a ``scene.yaml`` is a stored one."""
 
 
 def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed: bool = True) -> Scene:
@@ -30,32 +30,32 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
     ----------
     path : Path
     overrides : sequence of ``key.path=value``
-        Applied to the scene as understood, before it is checked; see `apply_overrides`.
+        Changes of keys, applied before the scene is checked (`apply_overrides`).
     meshes_needed : bool
-        Whether the mesh files must be there.
+        Whether the mesh files must exist.
 
     Returns
     -------
     Scene
-        Mesh paths absolute, taken to stand beside the scene file; ``scene.source`` is ``path``.
+        Mesh paths are absolute; relative ones are relative to the scene file. ``scene.source`` is ``path``.
 
     Raises
     ------
     InputError
-        On anything that cannot be used, naming file and key.
+        The scene cannot be used; the message names file and key.
     """
     path = Path(path)
     text = read_text(path)
-    data = _read(path, text)
+    data = _read_plain(path, text)
     if not isinstance(data, dict):
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
-    with _of_finite_depth(path):
+    with _refuse_recursion(path):
         data = plain(data)
-        if path.name == STORED and (path.parent / BESIDE_STORED).exists():
-            for block in _without_model(data):
+        if path.name == STORED and (path.parent / MESH_OF_RUN).exists():
+            for block in _blocks_without_model(data):
                 block["bending_model"] = "hinge"
         overridden = apply_overrides(data, overrides)
-    return _checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
+    return _load_checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
 
 
 def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> Scene:
@@ -64,77 +64,77 @@ def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) 
     Parameters
     ----------
     data : mapping
-        Mesh paths stand under the working directory.
+        Mesh paths are relative to the working directory.
     changes : mapping of ``key.path`` to value, optional
         As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
 
     Raises
     ------
     InputError
-        On anything that cannot be used, naming the key.
+        The scene cannot be used; the message names the key.
     """
-    return _changed(data, changes or {}, None, Path.cwd())
+    return _load_changed(data, changes or {}, None, Path.cwd())
 
 
-def _without_model(data: Any) -> list[dict[str, Any]]:
-    """The material blocks of a scene as plain values that name no bending model."""
-    return [block for block in _materials(data) if block.get("bending_model") is None]
+def _blocks_without_model(data: Any) -> list[dict[str, Any]]:
+    """The material blocks without ``bending_model`` of a scene given as plain values."""
+    return [block for block in _material_blocks(data) if block.get("bending_model") is None]
 
 
-def _materials(data: Any) -> list[dict[str, Any]]:
+def _material_blocks(data: Any) -> list[dict[str, Any]]:
     blocks = data.get("material") if isinstance(data, dict) else None
     return [block for block in (blocks if isinstance(blocks, list) else [blocks]) if isinstance(block, dict)]
 
 
 def with_stored_bending_model(scene: Scene, stored: Path) -> Scene:
-    """The scene of a resumed run: hinges where neither it nor the ``stored`` one names a bending model.
+    """The scene of a resumed run, with hinges where neither it nor the ``stored`` scene names a model.
 
-    As it is where the stored one cannot be read.
+    It is unchanged if the stored scene cannot be read.
     """
     try:
         before = parse_yaml(read_text(stored), file=stored)
     except InputError:
         return scene
-    if not _without_model(before) or scene._given is None:
+    if not _blocks_without_model(before) or scene._given is None:
         return scene
-    blocks = _materials(scene._given)
+    blocks = _material_blocks(scene._given)
     chosen = [number for number, block in enumerate(blocks) if block.get("bending_model") is None]
     return change_scene(scene, {f"material[{number}].bending_model": "hinge" for number in chosen})
 
 
 def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
-    """Another scene: the first one's keys as they were given, with some changed as in `scene_of`.
+    """A copy of ``scene`` with some keys changed as in `scene_of`; defaults follow the changes.
 
     Raises
     ------
     InputError
-        On anything that cannot be used, naming the key.
+        The scene cannot be used; the message names the key.
     """
     if scene._given is None:
-        other = _changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
+        other = _load_changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
     else:
-        other = _changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+        other = _load_changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
     return other.trusting_meshes() if scene.trusts_meshes else other
 
 
-def _changed(
+def _load_changed(
     given: Mapping[str, Any], changes: Mapping[str, Any], source: Path | None, directory: Path
 ) -> Scene:
-    with _of_finite_depth(source):
+    with _refuse_recursion(source):
         data = plain(given)
         apply_changes(data, changes)
-    return _checked(data, source, directory)
+    return _load_checked(data, source, directory)
 
 
 @contextmanager
-def _of_finite_depth(file: Path | None) -> Iterator[None]:
+def _refuse_recursion(file: Path | None) -> Iterator[None]:
     try:
         yield
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=file) from None
 
 
-def _checked(
+def _load_checked(
     data: dict[str, Any],
     source: Path | None,
     directory: Path,
@@ -142,7 +142,7 @@ def _checked(
     *,
     meshes_needed: bool = True,
 ) -> Scene:
-    with _of_finite_depth(source):
+    with _refuse_recursion(source):
         scene = validated(Scene, data, file=source, overridden=overridden, context={"directory": directory})
     if meshes_needed:
         for key, mesh in scene.mesh_files.items():
@@ -151,8 +151,8 @@ def _checked(
     return scene
 
 
-def _read(path: Path, text: str) -> Any:
-    """The scene as plain values with the keys of this program, also from a file of the original one."""
+def _read_plain(path: Path, text: str) -> Any:
+    """The scene as plain values with the keys of this program, also for a file of the original program."""
     start = text.lstrip()
     if path.suffix.lower() == ".json" or start.startswith(("//", "/*")):
         data = parse_json(text, file=path)
@@ -179,7 +179,7 @@ def _check_mesh_file(file: Path, key: str, scene: Path | None) -> None:
 
 
 def default_scene() -> Path:
-    """The scene of a run without one: in the wheel beside the package's modules, else in the checkout."""
+    """Path of the default scene: in an installed package, else in the checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "configs" / "flag.yaml"
     return inside if inside.exists() else package.parent / "configs" / "flag.yaml"

@@ -1,4 +1,4 @@
-"""Pydantic's errors as one line that names the key as the user wrote it."""
+"""Conversion of pydantic's errors to one line, which names the key as the user wrote it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def dotted(path: Sequence[str | int], data: Any = None) -> str:
-    """``path`` as a key like ``handles[1].group``.
+    """``path`` written like ``handles[1].group``.
 
-    Where ``data`` holds a single block in place of a list, the index 0 that stands for it is left
-    out.
+    The index 0 is left out where ``data`` has a single block instead of a list.
     """
     key = ""
     for part in path:
@@ -34,26 +33,26 @@ def dotted(path: Sequence[str | int], data: Any = None) -> str:
 def input_error(
     error: ValidationError, data: Any, *, file: object | None, overridden: Sequence[str] = ()
 ) -> InputError:
-    """The first of pydantic's errors as an `InputError`, with the number of further ones.
+    """The first of pydantic's errors as an `InputError`, with the number of further errors.
 
     Parameters
     ----------
     error : pydantic.ValidationError
     data : dict
-        What was validated, for the way keys are written.
+        The validated values, which determine how keys are written.
     file : path
         The scene file.
     overridden : keys
-        Given on the command line and not in the file: the message says so.
+        Keys set on the command line, for which the message says so.
     """
     findings = error.errors(include_url=False)
     first = findings[0]
     context: dict[str, Any] = first.get("ctx", {})
-    # parts in brackets are pydantic's: of a name of a mapping, of the kind of a value
+    # pydantic adds parts in brackets, for names in mappings and kinds of values
     parts = [part for part in first["loc"] if not str(part).startswith("[")]
     path = parts + list(context.get("at", ()))
     key = one_line(dotted(path, data))
-    message = one_line(_words(first["type"], first["msg"], first.get("input"), context))
+    message = one_line(_message(first["type"], first["msg"], first.get("input"), context))
     if any(key == given or key.startswith((f"{given}.", f"{given}[")) for given in overridden):
         message += " (from --set)"
     if len(findings) > 1:
@@ -69,12 +68,12 @@ def validated(
     overridden: Sequence[str] = (),
     context: dict[str, Any] | None = None,
 ) -> Model:
-    """The block of this kind that plain values describe.
+    """The block of this kind with these plain values.
 
     Raises
     ------
     InputError
-        As `input_error` words it.
+        As `input_error` makes it.
     """
     try:
         return kind.model_validate(data, context=context)
@@ -82,7 +81,7 @@ def validated(
         raise input_error(error, data, file=file, overridden=overridden) from None
 
 
-def _words(kind: str, message: str, value: Any, context: dict[str, Any]) -> str:
+def _message(kind: str, message: str, value: Any, context: dict[str, Any]) -> str:
     if kind == "scene":
         return message
     if kind == "missing":

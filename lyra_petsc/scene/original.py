@@ -1,9 +1,8 @@
-"""Scenes of the original Lyra program (conf.json, with its material tables and vertex labels) in our keys.
+"""Conversion of scenes of the original Lyra program (conf.json, material tables, vertex labels) to our keys.
 
-What differs from a scene of ours, and is kept as the original has it: Δt = frame_time/frame_steps
-with one linearised step each (``semi-implicit``); handles are springs of 1000 N/m; measured
-cloths lose a negative c12; absent gravity is none. ``end_time`` is honoured, which the original
-does not do. ``texture`` is for its window only and has no counterpart.
+As in the original, Δt = frame_time/frame_steps with one linear solve a step (``semi-implicit``), handles are
+springs of 1000 N/m, a negative c12 of a measured cloth is set to 0, and there is no gravity by default. Other
+than in the original, ``end_time`` has an effect; ``texture`` has none, as it is for the original's window.
 """
 
 from __future__ import annotations
@@ -67,12 +66,12 @@ def _motion_keyframes(value: Any) -> Any:
 
 
 def _motion_number(value: Any) -> Any:
-    # the original writes "none" as -1
+    # −1 means none in the original
     return None if value == -1 else value
 
 
 class Placement(Block):
-    """``transform``: scale, then rotate, then translate."""
+    """``transform`` of the original: scaling, then rotation, then translation."""
 
     translate: Vector = (0.0, 0.0, 0.0)
     scale: Number = 1.0
@@ -85,7 +84,7 @@ class Placement(Block):
         return self
 
     def in_our_keys(self) -> dict[str, Any]:
-        """As our ``transform``, or as the spatial part of a keyframe."""
+        """As our ``transform``, or as the keys of a keyframe other than time and velocity."""
         block: dict[str, Any] = {"scale": self.scale, "translate": list(self.translate)}
         degrees, *axis = self.rotate
         if degrees != 0.0:
@@ -158,7 +157,7 @@ class OriginalWind(Block):
 
 
 class OriginalScene(Block):
-    """The keys of a conf.json, with the original's defaults."""
+    """The keys of a conf.json, with the defaults of the original."""
 
     frame_time: Positive = DEFAULT_FRAME_TIME
     frame_steps: Count
@@ -174,7 +173,7 @@ class OriginalScene(Block):
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Without a frame_time the step is that of the shipped scene, else one step a frame."""
+        """``frame_steps`` is 1 by default, but without ``frame_time`` that of the original's own scene."""
         return {"frame_steps": 1 if "frame_time" in data else DEFAULT_FRAME_STEPS, **data}
 
     @model_validator(mode="after")
@@ -218,7 +217,7 @@ def _table(shape: tuple[int, int]) -> BeforeValidator:
 
 
 class MaterialFile(Block):
-    """The tables of one cloth as the original's material files have them."""
+    """The tables of one cloth in a material file of the original."""
 
     density: Positive
     stretching: Annotated[list[list[float]], _table(STRETCHING_SHAPE)]
@@ -226,15 +225,15 @@ class MaterialFile(Block):
 
 
 def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
-    """density, membrane and bending in our keys of the material that a conf.json names.
+    """density, membrane and bending in our keys, for the material ``data`` of a conf.json.
 
-    The file if it exists, else the library's cloth of that name. Negative entries count as 0, as
-    in the original.
+    It is read from the file of that name if there is one, else from the library. Negative entries count as
+    0, as in the original.
 
     Raises
     ------
     InputError
-        Neither a file nor a known name; a table that no sheet can have.
+        Neither a file nor a known name; a stiffness that is not positive definite.
     """
     found = find_beside(data, scene)
     if found is not None:
@@ -278,9 +277,9 @@ class ObjVertices:
     ----------
     count : int
     labels : dict of str to set of int
-        Vertices that bear a label (``nl`` lines, each after its vertex).
+        Vertices with each label (``nl`` lines, each after its vertex).
     textured : bool
-        Whether ``vt`` lines give the rest shape.
+        Whether the file has ``vt`` lines, which give the rest shape.
     """
 
     count: int = 0
@@ -301,14 +300,14 @@ def read_vertices(file: Path) -> ObjVertices:
 
 
 def import_original(data: Any, path: Path) -> dict[str, Any]:
-    """A conf.json, parsed, as plain values in our keys.
+    """Convert a parsed conf.json to plain values in our keys.
 
     Parameters
     ----------
     data : parsed JSON
     path : Path
-        The file: its meshes and materials are looked for beside it, beside its folder and in the
-        working directory, the last two because the original is run from above ``conf/``.
+        The file. Its meshes and materials are searched in its folder, in the parent folder and in the
+        working directory, as the original is run from the folder that contains ``conf/``.
 
     Raises
     ------
@@ -317,7 +316,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     """
     scene = validated(OriginalScene, data, file=path)
     files = [_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)]
-    vertices = cache(lambda cloth: read_vertices(files[cloth]))  # read when asked for
+    vertices = cache(lambda cloth: read_vertices(files[cloth]))  # few scenes need them
     several = len(scene.cloths) > 1
     ours: dict[str, Any] = {
         "title": path.stem,
@@ -345,7 +344,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
         ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.in_our_keys(), **name})
         ours["material"].append({**_material(cloth.materials[0], i, path), **group})
     ours["motions"] = {
-        f"motion{i}": _the_shortest_way([_keyframe(keyframe) for keyframe in keyframes])
+        f"motion{i}": _shortest_rotations([_keyframe(keyframe) for keyframe in keyframes])
         for i, keyframes in enumerate(scene.motions)
     }
     ours["handles"] = [_handle(handle, i, vertices, path) for i, handle in enumerate(scene.handles)]
@@ -380,19 +379,19 @@ def _keyframe(keyframe: OriginalKeyframe) -> dict[str, Any]:
     return block
 
 
-def _the_shortest_way(keyframes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The same rotations, by angles that lead from one to the next by at most 180°.
+def _shortest_rotations(keyframes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Keyframes with angles changed by multiples of 360° so that successive ones differ by at most 180°.
 
-    The original interpolates quaternions, which know no more than that.
+    The original interpolates quaternions, which represent rotations only up to such multiples.
     """
     before: dict[str, Any] = {"axis": [0.0, 0.0, 1.0], "degrees": 0.0}
     for keyframe in keyframes:
         turn = keyframe.get("rotate", {"axis": before["axis"], "degrees": 0.0})
         size = math.hypot(*turn["axis"]) * math.hypot(*before["axis"])
         along = sum(a * b for a, b in zip(turn["axis"], before["axis"], strict=True)) / size
-        near = math.copysign(1.0, along) * before["degrees"] if abs(along) > 1.0 - 1e-12 else 0.0
-        whole = (turn["degrees"] - near) / 360.0
-        turn["degrees"] -= 360.0 * math.copysign(math.ceil(abs(whole) - 0.5), whole)
+        previous = math.copysign(1.0, along) * before["degrees"] if abs(along) > 1.0 - 1e-12 else 0.0
+        turns = (turn["degrees"] - previous) / 360.0
+        turn["degrees"] -= 360.0 * math.copysign(math.ceil(abs(turns) - 0.5), turns)
         if turn["degrees"] != 0.0:
             keyframe["rotate"] = turn
         else:
@@ -409,7 +408,7 @@ def _handle(
         nodes = sorted(vertices(handle.cloth).labels.get(str(handle.label), ()))
         if not nodes:
             raise InputError(f"no vertex has label {handle.label}", file=path, key=f"handles[{i}].label")
-    # all are numbered consecutively
+    # our numbers are consecutive over all sheets
     first = sum(vertices(earlier).count for earlier in range(handle.cloth))
     block: dict[str, Any] = {
         "nodes": [first + node for node in nodes],

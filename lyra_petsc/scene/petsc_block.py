@@ -1,8 +1,7 @@
-"""The ``petsc`` block of a scene: options that are data, and none that run code or name a file.
+"""The ``petsc`` block of a scene: options that are data; options that run code or name a file are refused.
 
-PETSc can load Python classes and shared libraries, start debuggers, and write what it shows into files,
-all by options. On the command line that is the user's affair; a scene, which may come from anywhere, does
-not get to do it.
+Options can make PETSc load Python classes and shared libraries, start debuggers, and write files. Users may
+give such options on the command line, but a scene, which may come from anywhere, may not.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def _petsc_value(value: Any) -> Any:
     if value is None or isinstance(value, (str, bool)):
         return value
     if isinstance(value, int):
-        number(value)  # it must not be beyond all numbers
+        number(value)  # refuses integers too large for a float
         return value
     if isinstance(value, float):
         return number(value)
@@ -42,7 +41,7 @@ PetscValue = Annotated[str | int | float | bool | None, PlainValidator(_petsc_va
 
 
 def petsc_options(value: Any) -> Any:
-    """Check the names of a ``petsc`` block, and that its values are data."""
+    """Check the names and values of a ``petsc`` block."""
     if not isinstance(value, dict):
         raise problem(f"must be a block of options like {{ksp_type: cg}}, not {shown(value)}")
     for key, given in value.items():
@@ -50,15 +49,15 @@ def petsc_options(value: Any) -> Any:
             word = key if isinstance(key, str) else shown(key)
             dash = " without the dash" if word.startswith("-") else ""
             raise problem(f"is not an option name; write it as in ksp_type: cg{dash}", word)
-        if _reaches_out(key.lower(), given):
+        if _is_unsafe(key.lower(), given):
             raise problem(
                 "may run code or name a file, which a scene must not; give it on the command line", key
             )
     return value
 
 
-def _reaches_out(name: str, value: Any) -> bool:
-    """Whether an option would make PETSc do more than compute and print."""
+def _is_unsafe(name: str, value: Any) -> bool:
+    """Whether an option may make PETSc do more than compute and print."""
     if _REFUSED.fullmatch(name):
         return True
     if not isinstance(value, str):
@@ -66,29 +65,29 @@ def _reaches_out(name: str, value: Any) -> bool:
     if _SHOWS.fullmatch(name):
         return not _SCREEN.fullmatch(value)
     if name == "pc_type" and value == "python":
-        return False  # the program's own multigrid, as nothing else can be named
+        return False  # means the multigrid of this program: a scene cannot name another class
     return not _PLAIN.fullmatch(value) or (name.endswith("type") and value in ("python", "shell"))
 
 
-def _of_any_case(pattern: re.Pattern[str]) -> str:
-    """A pattern for lower-case names as JSON Schema, which knows no flags, needs it."""
+def _ignoring_case(pattern: re.Pattern[str]) -> str:
+    """A pattern for names in lower case, for names in any case; JSON Schema has no flag for this."""
     letters = re.sub(r"(?<!\\)[a-z]", lambda letter: f"[{letter[0]}{letter[0].upper()}]", pattern.pattern)
     return f"^({letters})$"
 
 
-def _or_no_text(pattern: str) -> dict[str, Any]:
+def _text_or_number(pattern: str) -> dict[str, Any]:
     return {"anyOf": [{"type": "string", "pattern": pattern}, FINITE, {"type": ["boolean", "null"]}]}
 
 
-_SHOWING = _of_any_case(_SHOWS)
+_SHOWING = _ignoring_case(_SHOWS)
 PETSC_BLOCK: dict[str, Any] = {
     "type": "object",
-    "propertyNames": {"pattern": rf"^({_NAME.pattern})$", "not": {"pattern": _of_any_case(_REFUSED)}},
+    "propertyNames": {"pattern": rf"^({_NAME.pattern})$", "not": {"pattern": _ignoring_case(_REFUSED)}},
     "patternProperties": {
-        _SHOWING: _or_no_text(rf"^{_SCREEN.pattern}$"),
-        rf"^(?!{_SHOWING[1:]})": _or_no_text(rf"^{_PLAIN.pattern}$"),
+        _SHOWING: _text_or_number(rf"^{_SCREEN.pattern}$"),
+        rf"^(?!{_SHOWING[1:]})": _text_or_number(rf"^{_PLAIN.pattern}$"),
         "[tT][yY][pP][eE]$": {"not": {"const": "shell"}},
         "^(?![pP][cC]_[tT][yY][pP][eE]$).*[tT][yY][pP][eE]$": {"not": {"const": "python"}},
     },
 }
-"""The same in words of JSON Schema."""
+"""JSON Schema of `petsc_options`."""

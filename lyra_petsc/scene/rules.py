@@ -1,4 +1,4 @@
-"""Rules of a scene, each stated once: in words of JSON Schema (draft 7), by which the loader checks, too."""
+"""Rules between the keys of a scene, written as JSON Schema (draft 7), by which the loader checks, too."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """A condition on the keys of a block, and the message where it is violated.
+    """A condition on the keys of a block, and the message if it is violated.
 
     Attributes
     ----------
     condition : dict
-        Words of JSON Schema.
+        JSON Schema.
     message : str or callable
-        A template for ``str.format`` with the keys of the block, or what makes the message of the block.
+        A template for ``str.format`` with the keys of the block, or a function of the block.
     at : str
-        The key below the block that is to be changed, dotted; without, the block itself.
+        Path of the key that the message names, relative to the block; empty: the block itself.
     """
 
     condition: Condition
@@ -45,79 +45,80 @@ class Rule:
 
 
 def holds(condition: Condition, value: Any) -> bool:
-    """Whether a value obeys a condition.
+    """Whether a value satisfies a condition.
 
     Parameters
     ----------
     condition : dict
-        Those words of JSON Schema that rules are made of.
-    value : number, text, path, list, or what has keys (a dictionary, a block)
+        JSON Schema, of the keywords that `_satisfies` knows.
+    value : number, text, path, list, dictionary or block
         A key that is None is absent.
     """
-    return all(_obeys(value, word, said, condition) for word, said in condition.items())
+    return all(_satisfies(value, keyword, expected, condition) for keyword, expected in condition.items())
 
 
-def _obeys(value: Any, word: str, said: Any, condition: Condition) -> bool:
-    match word:
+def _satisfies(value: Any, keyword: str, expected: Any, condition: Condition) -> bool:
+    """Whether a value satisfies one ``keyword`` of ``condition``, which has the value ``expected``."""
+    match keyword:
         case "type":
-            kinds = said if isinstance(said, list) else [said]
+            kinds = expected if isinstance(expected, list) else [expected]
             return any(
                 hasattr(value, "get") if k == "object" else isinstance(value, _TYPES[k]) for k in kinds
             )
         case "const":
-            return bool(value == said)
+            return bool(value == expected)
         case "enum":
-            return value in said
+            return value in expected
         case "pattern":
-            return re.search(said, str(value)) is not None
+            return re.search(expected, str(value)) is not None
         case "items":
-            return all(holds(said, entry) for entry in value)
+            return all(holds(expected, entry) for entry in value)
         case "required":
-            return all(value.get(key) is not None for key in said)
+            return all(value.get(key) is not None for key in expected)
         case "properties":
-            entries = [(value.get(key), part) for key, part in said.items()]
+            entries = [(value.get(key), part) for key, part in expected.items()]
             return all(holds(part, entry) for entry, part in entries if entry is not None)
         case "not":
-            return not holds(said, value)
+            return not holds(expected, value)
         case "allOf":
-            return all(holds(part, value) for part in said)
+            return all(holds(part, value) for part in expected)
         case "anyOf":
-            return any(holds(part, value) for part in said)
+            return any(holds(part, value) for part in expected)
         case "oneOf":
-            return sum(holds(part, value) for part in said) == 1
+            return sum(holds(part, value) for part in expected) == 1
         case "if":
-            return not holds(said, value) or holds(condition["then"], value)
+            return not holds(expected, value) or holds(condition["then"], value)
         case "then":
             return True
-    return bool(_BOUNDS[word](value, said))
+    return bool(_BOUNDS[keyword](value, expected))
 
 
 def given(*keys: str, **values: Condition) -> Condition:
-    """Holds if all ``keys`` have a value, and those of ``values`` one that fits."""
+    """Condition: all ``keys`` have a value, and each key of ``values`` one that satisfies its condition."""
     something = {"not": {"type": "null"}}
     return {"required": [*keys, *values], "properties": {**dict.fromkeys(keys, something), **values}}
 
 
 def absent(*keys: str) -> Condition:
-    """Holds if none of ``keys`` has a value."""
+    """Condition: none of ``keys`` has a value."""
     return {"properties": {key: {"type": "null"} for key in keys}}
 
 
 def any_of(*keys: str) -> Condition:
-    """Holds if any of ``keys`` has a value."""
+    """Condition: at least one of ``keys`` has a value."""
     return {"anyOf": [given(key) for key in keys]}
 
 
 def one_of(*keys: str) -> Condition:
-    """Holds if exactly one of ``keys`` has a value."""
+    """Condition: exactly one of ``keys`` has a value."""
     return {"oneOf": [given(key) for key in keys]}
 
 
 def when(condition: Condition, then: Condition) -> Condition:
-    """``then`` where ``condition`` holds."""
+    """Condition: if ``condition`` holds, ``then`` must hold."""
     return {"if": condition, "then": then}
 
 
 def exactly_one(*keys: str) -> Rule:
-    """Of several ways to say something, one."""
+    """Rule that exactly one of ``keys`` has a value."""
     return Rule(one_of(*keys), f"must have exactly one of {', '.join(keys)}")

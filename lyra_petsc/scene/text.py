@@ -1,4 +1,4 @@
-"""Reading scene text: files, YAML, and JSON with comments; every failure names file and line."""
+"""Reading of text files, YAML, and JSON with comments; errors name file and line."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from ruamel.yaml.nodes import Node
 
 LARGEST_SCENE = 32 * 2**20
-"""Bytes of a scene file; a list of some million vertices. Meshes have files of their own."""
+"""Limit on the bytes of a scene file: enough for lists of some million vertices."""
 
-MOST_ENTRIES = 2_000_000
-"""Entries of a scene once its YAML anchors are expanded."""
+MAX_ENTRIES = 2_000_000
+"""Limit on the entries of a scene whose YAML anchors are expanded."""
 
 
 def read_text(path: Path, *, largest: float = LARGEST_SCENE, remedy: str = "") -> str:
-    """The text of a file; ``remedy`` says what to do where it is too large.
+    """The text of a file; ``remedy`` is added to the message if it is too large.
 
     Raises
     ------
     InputError
-        As `read_bytes`; not UTF-8.
+        As `read_bytes`, or if the file is not UTF-8.
     """
     try:
         return read_bytes(path, largest=largest, remedy=remedy).decode("utf-8-sig")
@@ -51,8 +51,8 @@ def read_bytes(path: Path, *, largest: float = math.inf, remedy: str = "") -> by
             raise InputError(what if path.exists() else "no such file", file=path)
         size = path.stat().st_size
         if size > largest:
-            words = f"holds {size} bytes; at most {largest} are read"
-            raise InputError(f"{words}; {remedy}" if remedy else words, file=path)
+            message = f"holds {size} bytes; at most {largest} are read"
+            raise InputError(f"{message}; {remedy}" if remedy else message, file=path)
         content = path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else None
@@ -63,18 +63,18 @@ def read_bytes(path: Path, *, largest: float = math.inf, remedy: str = "") -> by
 
 
 def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any:
-    """YAML 1.2 text as plain values; duplicate keys are refused, and anchors that grow beyond memory."""
+    """YAML 1.2 text as plain values; duplicate keys and anchors that expand without bound are refused."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     yaml = YAML(typ="safe", pure=True)
     try:
-        # nodes first: there a block that many anchors refer to stands once
+        # the nodes are counted before values are made: a block with an anchor is one node
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an anchor may be set anew
+            warnings.simplefilter("ignore")  # an anchor may be redefined
             node = yaml.compose(io.StringIO(text))
-        if (entries := _entries(node, {})) > MOST_ENTRIES:
-            grown = f"holds more than {MOST_ENTRIES} entries once its anchors are expanded"
+        if (entries := _count_entries(node, {})) > MAX_ENTRIES:
+            grown = f"holds more than {MAX_ENTRIES} entries once its anchors are expanded"
             raise InputError("refers to itself" if entries == math.inf else grown, file=file, key=key)
         return None if node is None else yaml.constructor.construct_document(node)
     except MarkedYAMLError as error:
@@ -84,21 +84,21 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
     except RecursionError:
         raise InputError("is nested too deeply", file=file, key=key) from None
     except (YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
-        # the reader lets such slip out for odd scalars (a 13th month, tags on the wrong kind of node)
+        # ruamel raises these for some invalid scalars (a 13th month, tags on the wrong kind of node)
         raise InputError(one_line(f"is not YAML: {error}"), file=file, key=key) from None
 
 
-def _entries(node: Node | None, known: dict[int, float]) -> float:
-    """Number of entries below a node, those of an anchor counted at each use; inf for a loop.
+def _count_entries(node: Node | None, known: dict[int, float]) -> float:
+    """Number of entries below a node, with anchors expanded; inf for a node that contains itself.
 
-    ``known`` holds the counts by the nodes' identities.
+    ``known`` has the counts by identity of the nodes.
     """
     if node is None or isinstance(node.value, str):
         return 1.0
     if id(node) not in known:
-        known[id(node)] = math.inf  # what it is below itself
+        known[id(node)] = math.inf  # found again below itself
         entries = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
-        known[id(node)] = 1.0 + sum(_entries(entry, known) for entry in entries)
+        known[id(node)] = 1.0 + sum(_count_entries(entry, known) for entry in entries)
     return known[id(node)]
 
 
@@ -143,5 +143,5 @@ _JSON_PARTS = re.compile(
 
 
 def _plain_json(text: str) -> str:
-    """``text`` with comments and trailing commas blanked, so that line and column stay true."""
+    """``text`` with blanks for comments and trailing commas, which keep line and column in errors right."""
     return _JSON_PARTS.sub(lambda part: part["text"] or re.sub(r"[^\n]", " ", part[0]), text)

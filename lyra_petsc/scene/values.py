@@ -1,8 +1,7 @@
-"""Checked values that scene keys are made of: numbers, vectors, scales, names.
+"""Types of the values of scene keys: numbers, vectors, scales, names.
 
-Each is strict: text is not taken for a number, nor a yes for a one, and nothing is NaN or
-infinite. The messages say what is wrong and what is allowed; the key is added by
-``scene.messages``.
+Checks are strict: text and booleans are no numbers, and no number is NaN or infinite. The messages say what
+is wrong and what is allowed; `scene.messages` adds the key.
 """
 
 from __future__ import annotations
@@ -25,58 +24,58 @@ Vec3 = tuple[float, float, float]
 Direction = Literal["x", "y", "z"]
 AXES: tuple[Direction, ...] = ("x", "y", "z")
 
-# Largest vertex number that every index type downstream can hold.
+# Largest vertex number that the index types of all libraries can hold.
 LARGEST_INDEX = 2**31 - 2
 
-# Looks at a few entries only: a value made of YAML anchors can be larger than memory.
+# Shows few entries only: a value with YAML anchors can be larger than memory.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 6, 4
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 
 
 def problem(message: str, *at: str | int) -> PydanticCustomError:
-    """Error of a scene value; ``at`` is the key below the block that is being checked."""
-    # braces in user text would be taken for a template
+    """Error of a scene value; ``at`` is the path of the key relative to the block that is being checked."""
+    # not in the template, as text of the user may contain braces
     return PydanticCustomError("scene", "{message}", {"message": message, "at": list(at)})
 
 
 def shown(value: object) -> str:
-    """``value`` as one short piece of a message."""
+    """``value`` as short text for a message."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
         return "true" if value else "false"
     try:
         text = _SHORT.repr(value)
-    except ValueError:  # more digits than Python is willing to write
+    except ValueError:  # an integer with more digits than Python converts
         return f"a very long {type(value).__name__}"
     return cut(text)
 
 
 def cut(text: str) -> str:
-    """``text``, or its beginning where it is too long to be quoted."""
+    """``text``, or its beginning if it is too long to be quoted."""
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def one_line(text: str) -> str:
-    """``text`` on one line, with what cannot be printed written as an escape."""
+    """``text`` on one line, with escapes for characters that cannot be printed."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
 def path_beside(value: Any, info: ValidationInfo) -> Path:
-    """A path, of which a relative one stands beside the scene file."""
+    """An absolute path; a relative ``value`` is relative to the scene file."""
     directory = (info.context or {}).get("directory", Path.cwd())
     path = Path(value)
-    # normalised by name only: a symbolic link may be what the user wants to see
+    # symbolic links are not resolved: messages shall show the user's name
     return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
 
 
-def file_beside(what: str, *endings: str) -> BeforeValidator:
-    """Checks the path of a ``what`` with one of these endings; see `path_beside`."""
+def file_beside(kind: str, *endings: str) -> BeforeValidator:
+    """Validator of the path of a ``kind`` with one of these endings (`path_beside`)."""
 
     def check(value: Any, info: ValidationInfo) -> Path:
         if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
-            raise problem(f"must be the path of a {what}, not {shown(value)}")
+            raise problem(f"must be the path of a {kind}, not {shown(value)}")
         if Path(value).suffix.lower() not in endings:
             raise problem(f"{Path(value).name!r} must end in {', '.join(endings)}")
         return path_beside(value, info)
@@ -109,7 +108,7 @@ def _reads_as_number(text: str) -> bool:
 
 
 def list_of(what: str = "", *, minimum: int = 0) -> BeforeValidator:
-    """Checks a list of at least so many entries; ``what`` follows the word list in the message."""
+    """Validator of a list of at least ``minimum`` entries; ``what`` follows the word list in the message."""
 
     def check(value: Any) -> list[Any]:
         if not isinstance(value, (list, tuple)) or len(value) < minimum:
@@ -122,7 +121,7 @@ def list_of(what: str = "", *, minimum: int = 0) -> BeforeValidator:
 
 
 def block_of(what: str, *, minimum: int = 0) -> BeforeValidator:
-    """Checks a block of at least so many keys."""
+    """Validator of a block of at least ``minimum`` keys."""
 
     def check(value: Any) -> dict[Any, Any]:
         if not isinstance(value, dict) or len(value) < minimum:
@@ -140,7 +139,7 @@ def axes(value: Any) -> tuple[Any, ...]:
 
 
 def _until(value: Any) -> float:
-    # "never" may be said outright
+    # an explicit .inf means "to the end"
     return math.inf if value == math.inf and isinstance(value, float) else number(value)
 
 
@@ -153,7 +152,7 @@ def vector(value: Any) -> Vec3:
 
 
 def _pair(value: Any) -> tuple[float, float]:
-    """A number that counts twice, or two, none of them negative."""
+    """One number, which is used twice, or two; none is negative."""
     values = value if isinstance(value, (list, tuple)) else (value, value)
     if len(values) != 2:
         raise problem(f"must be a number, or two (warp, weft), not {shown(value)}")
@@ -186,7 +185,7 @@ def _text(value: Any) -> str:
 
 
 def _name(value: Any) -> str:
-    # a gmsh group without a name is called by its number
+    # gmsh groups without name have a number instead
     if isinstance(value, int) and not isinstance(value, bool):
         value = shown(value)
     name = _text(value)
@@ -211,7 +210,7 @@ def _step_length(value: Any) -> float | str:
 
 @dataclass(frozen=True, eq=False)
 class JsonSchema:
-    """What JSON Schema says of a value; pydantic gets a copy, as some versions write into what they get."""
+    """JSON Schema of a value; pydantic gets a copy, as some versions modify it."""
 
     schema: Condition
 
@@ -221,7 +220,7 @@ class JsonSchema:
 
 @dataclass(frozen=True, eq=False)
 class Value(JsonSchema):
-    """How a value is checked, beside what JSON Schema says of it."""
+    """JSON Schema of a value, and the function that checks and converts it."""
 
     check: Callable[[Any], Any]
 
@@ -229,8 +228,8 @@ class Value(JsonSchema):
         return core_schema.no_info_plain_validator_function(self.check)
 
 
-def _obeying(schema: Condition, convert: Callable[[Any], Any], *allowed: tuple[Condition, str]) -> Value:
-    """A value whose numbers obey conditions, each with the message for where it does not hold."""
+def _constrained(schema: Condition, convert: Callable[[Any], Any], *allowed: tuple[Condition, str]) -> Value:
+    """A value whose numbers satisfy the conditions ``allowed``, each given with its message."""
 
     def check(value: Any) -> Any:
         result = convert(value)
@@ -243,16 +242,16 @@ def _obeying(schema: Condition, convert: Callable[[Any], Any], *allowed: tuple[C
 
 
 def _real(allowed: str, **bounds: float) -> Value:
-    """A number within bounds, named by their words in JSON Schema; ``allowed`` says them to the user."""
+    """A number within bounds, given as keywords of JSON Schema; ``allowed`` is their text in messages."""
     schema = FINITE | bounds
     if "exclusiveMinimum" in bounds:
         del schema["minimum"]
-    return _obeying(schema, number, (bounds, f"must be {allowed}, not VALUE"))
+    return _constrained(schema, number, (bounds, f"must be {allowed}, not VALUE"))
 
 
 def _one_or_three(*allowed: tuple[Condition, str]) -> Value:
     schema = FINITE | allowed[-1][0]
-    return _obeying({"anyOf": [schema, _triple(schema)]}, _number_or_vector, *allowed)
+    return _constrained({"anyOf": [schema, _triple(schema)]}, _number_or_vector, *allowed)
 
 
 def _number_or_vector(value: Any) -> float | Vec3:
@@ -260,7 +259,7 @@ def _number_or_vector(value: Any) -> float | Vec3:
 
 
 def _whole(lowest: int, highest: int) -> Value:
-    return _obeying(
+    return _constrained(
         {"type": "integer", "minimum": lowest, "maximum": highest},
         integer,
         ({"minimum": lowest}, f"must be a whole number >= {lowest}, not VALUE"),
@@ -272,7 +271,7 @@ def _triple(of: Condition) -> Condition:
     return {"type": "array", "items": of, "minItems": 3, "maxItems": 3}
 
 
-# what JSON Schema can say of the values; .inf is a number to YAML
+# JSON Schema of values; the bounds exclude .inf, a number in YAML
 FINITE: Condition = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
 VECTOR = _triple(FINITE)
 ANY_AXES: Condition = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
@@ -296,10 +295,10 @@ Vector = Annotated[Vec3, Value(VECTOR, vector)]
 Axis = Annotated[Vec3, Value(VECTOR | {"contains": {"not": {"const": 0}}}, _axis)]
 Scale = Annotated[float | Vec3, _one_or_three(_NONZERO)]
 PositiveScale = Annotated[float | Vec3, _one_or_three(_NONZERO, _ABOVE_ZERO)]
-_PART: Condition = FINITE | {"minimum": 0}
+_ENTRY: Condition = FINITE | {"minimum": 0}
 Pair = Annotated[
     tuple[float, float],
-    Value({"anyOf": [_PART, {"type": "array", "items": _PART, "minItems": 2, "maxItems": 2}]}, _pair),
+    Value({"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 2, "maxItems": 2}]}, _pair),
 ]
 Bending = Annotated[float | Vec3, _one_or_three(({"minimum": 0}, "must be >= 0 [N·m], not VALUE"))]
 Count = Annotated[int, _whole(1, LARGEST_INDEX)]

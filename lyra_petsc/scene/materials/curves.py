@@ -1,4 +1,4 @@
-"""Measured curves of force by strain: read from files, checked, and interpolated without a wiggle."""
+"""Measured curves of force over strain: reading, checks, and monotonic interpolation."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from lyra_petsc.scene.text import read_text
 from lyra_petsc.scene.values import cut
 
 Points = tuple[tuple[float, float], ...]
-Place = tuple[str, float, float]
-"""Where a point stands, in words; strain, force [N/m]."""
+LocatedPoint = tuple[str, float, float]
+"""Text for messages that locates the point, as file and line; strain; force [N/m]."""
 
-MOST_POINTS = 1000
-"""Of a curve: every triangle looks its strain up in them."""
+MAX_POINTS = 1000
+"""Limit on the points of a curve: every triangle searches its strain among them."""
 
 LARGEST_FILE = 2**20
-"""Bytes."""
+"""Limit on the bytes of a file."""
 
 LARGEST_STRAIN = 10.0
-"""What is more was meant in percent, or as an angle."""
+"""Limit on strains; larger numbers are percent or degrees."""
 
 OTHER_UNITS = ("%", "°", "gf", "/cm", "/mm")
-"""Of headings."""
+"""Units that a heading must not contain."""
 
 
-def read_curve(path: Path) -> list[Place]:
-    """What the lines of a file hold: strain and force, with commas, semicolons or blanks between.
+def read_curve(path: Path) -> list[LocatedPoint]:
+    """Read a file with strain and force in each line, separated by commas, semicolons or blanks.
 
-    A first line without numbers is a heading, what follows # a comment; quotes are left out.
+    A first line without numbers is a heading, # begins a comment; quotes are ignored.
 
     Raises
     ------
     InputError
-        If it cannot be read, or a line has not two numbers.
+        The file cannot be read, or a line does not have two numbers.
     """
-    found: list[Place] = []
-    remedy = f"thin the curve out to at most {MOST_POINTS} points"
+    found: list[LocatedPoint] = []
+    remedy = f"thin the curve out to at most {MAX_POINTS} points"
     text = read_text(path, largest=LARGEST_FILE, remedy=remedy)
     for number, line in enumerate(text.splitlines(), start=1):
         columns = re.sub("[;,\"']", " ", line.split("#")[0]).split()
@@ -71,17 +71,17 @@ def _refuse_units(heading: str, path: Path) -> None:
             )
 
 
-def checked_points(points: list[Place], whole: str = "the curve") -> Points:
-    """Check a curve and begin it at (0, 0); ``whole`` names it in messages.
+def checked_points(points: list[LocatedPoint], whole: str = "the curve") -> Points:
+    """Check a curve and insert (0, 0) if it is missing; ``whole`` names the curve in messages.
 
     Raises
     ------
     InputError
-        Naming the first place where strain or force does not grow.
+        Strain or force does not increase, or is not a curve in these units; the message locates the point.
     """
     count = sum(strain != 0.0 for _, strain, _ in points)
-    if not points or count > MOST_POINTS:
-        raise InputError(f"{whole} has {count} points; give 1 to {MOST_POINTS} (beside that at no strain)")
+    if not points or count > MAX_POINTS:
+        raise InputError(f"{whole} has {count} points; give 1 to {MAX_POINTS} (beside that at no strain)")
     where, strain, force = points[0]
     if strain == 0.0 and force != 0.0:
         raise InputError(f"{where}: no strain has no force; take {force:g} N/m from all forces")
@@ -93,17 +93,17 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
         )
     if len(points) == 1:
         raise InputError(f"{whole} has no point but the origin; give some with strain")
-    for (_, x0, y0), (place, x1, y1) in pairwise(points):
+    for (_, x0, y0), (location, x1, y1) in pairwise(points):
         for what, before, after in (("strain", x0, x1), ("force", y0, y1)):
             if not after > before:
                 raise InputError(
-                    f"{place}: {what} {after:g} is not more than {before:g} before it; sort by strain and "
+                    f"{location}: {what} {after:g} is not more than {before:g} before it; sort by strain and "
                     "leave out or smooth what does not grow"
                 )
-    place, strain, _ = points[-1]
+    location, strain, _ = points[-1]
     if strain > LARGEST_STRAIN:
         raise InputError(
-            f"{place}: strain {strain:g} is {100.0 * strain:g} %; give fractions, as 0.05 for 5 %"
+            f"{location}: strain {strain:g} is {100.0 * strain:g} %; give fractions, as 0.05 for 5 %"
         )
     found = tuple((x, y) for _, x, y in points)
     with np.errstate(all="ignore"):
@@ -113,7 +113,7 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
 
 
 def force_at(points: Points, strain: float) -> float:
-    """Force [N/m] of a curve at a strain >= 0."""
+    """Force [N/m] of a curve at a strain ≥ 0."""
     rows = interpolation(points)
     i = min(int(np.searchsorted(rows[:, 0], strain)), len(rows)) - 1
     if i + 1 == len(rows):
@@ -129,8 +129,8 @@ def force_at(points: Points, strain: float) -> float:
 def interpolation(points: Points) -> Array:
     """Strain, force [N/m], slope [N/m] and integral of the force [N/m] at the points of a curve, (n, 4).
 
-    Cubic between them, as monotonic as they are: F. N. Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5
-    (1984) 300-304. Slopes at the ends are those of the first and last chord.
+    The interpolation is cubic and monotonic (F. N. Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5 (1984)
+    300-304). Slopes at the ends are those of the first and last chord.
     """
     x, y = np.array(points).T
     width = np.diff(x)

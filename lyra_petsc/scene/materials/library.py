@@ -1,16 +1,16 @@
-"""Materials: the library's names and numbers, and from a scene's block to the constants of the kernels.
+"""Material library, and constants of materials for the kernels.
 
-Conventions, in one place:
+Conventions:
 
-- measured cloths follow the original program, which multiplies its stretching tables by 2 and
-  whose hinge energy k_e l² (θ − θ̄)² / (8 (A0 + A1)) bends a structured mesh with k_e/4:
+- measured cloths follow the original program, which multiplies its stretching tables by 2 and whose hinge
+  energy k_e l² (θ − θ̄)² / (8 (A0 + A1)) gives a structured mesh the bending stiffness k_e/4:
   C11, C12, C22 = 2 × table, C33 (engineering shear) = table, B = k_e/4;
 - an isotropic sheet is in plane stress: c11 = c22 = E h/(1 − ν²), c12 = ν c11,
   c33 = E h/(2 (1 + ν)), B = E h³/(12 (1 − ν²)), d11 = d22 = B, d12 = ν B, d33 = B (1 − ν)/2;
-- B at 0°, 45°, 90° makes d11 = B0, d22 = B90, d12 = 0, 2 d33 = 2 B45 − (B0 + B90)/2, which is raised to
-  0.2 √(d11 d22) where it is less;
-- explicit numbers are used as they stand;
-- then density × density_scale × thicken, membrane × stretching_scale × thicken,
+- B at 0°, 45°, 90° gives d11 = B0, d22 = B90, d12 = 0, 2 d33 = 2 B45 − (B0 + B90)/2, raised to at least
+  0.2 √(d11 d22);
+- explicit numbers are used unchanged;
+- factors: density × density_scale × thicken, membrane × stretching_scale × thicken,
   bending × bending_scale × thicken³.
 """
 
@@ -32,23 +32,23 @@ if TYPE_CHECKING:
 TABLE_LIBRARIES = ("wang2011.json", "original.json")
 ISOTROPIC_LIBRARIES = ("engineering.json",)
 
-# Smallest eigenvalue a projected membrane stiffness keeps, over the largest: an exactly singular
-# one would let the sheet stretch along one direction without any force.
+# Smallest eigenvalue of a projected membrane stiffness over the largest: with a singular stiffness the sheet
+# would stretch along one direction without force.
 PROJECTION_FLOOR = 0.01
 
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
 
 MIN_FRICTION = 1e-3
-"""Of warp or weft over that of the other, where that has some."""
+"""Smallest friction moment of warp or weft over that of the other, if only one is given."""
 
 MIN_TWIST = 0.2
-"""Least 2 d33 of a measured cloth over √(d11 d22)."""
+"""Smallest 2 d33 of a measured cloth over √(d11 d22)."""
 
 
 @dataclass(frozen=True)
 class ShellMaterial:
-    """Constants of one shell material, ready for the kernels.
+    """Constants of one shell material for the kernels.
 
     Attributes
     ----------
@@ -58,8 +58,8 @@ class ShellMaterial:
         Orthotropic St. Venant-Kirchhoff membrane stiffness [N/m]; energy per rest area is
         ½ (c11 E_uu² + 2 c12 E_uu E_vv + c22 E_vv² + c33 (2E_uv)²).
     bending : tuple of three floats
-        Cylindrical bending stiffness B [N·m] for hinges whose rest edge lies at 0°, 45°, 90° to
-        the warp; interpolated linearly in the angle. All three zero: no bending.
+        Cylindrical bending stiffness B [N·m] of hinges whose rest edge is at 0°, 45°, 90° to the warp,
+        interpolated linearly in the angle. All three zero: no bending stiffness.
     damping : float
         γ [s] of stiffness-proportional damping.
     warp_degrees : float
@@ -69,20 +69,20 @@ class ShellMaterial:
     law : str
         Name of the membrane law.
     cloth : str
-        Name in the library, for laws with further numbers of it.
+        Name in the library, for laws with further constants of the cloth.
     stretching : float
-        Factor on these, and on forces of curves.
+        Factor on these constants, and on the forces of ``curves``.
     curves : tuple of three curves
-        Strain and force [N/m] along warp and weft and in shear, of the law ``curves``.
+        Strain and force [N/m] along warp and weft and in shear, for the law ``curves``.
     model : str
         Name of the bending model.
     plate : tuple of four floats
-        d11, d12, d22, d33 [N·m] of ``midedge``; energy per rest area is
+        d11, d12, d22, d33 [N·m] for ``midedge``; energy per rest area is
         ½ (d11 κ11² + 2 d12 κ11 κ22 + d22 κ22² + d33 (2 κ12)²).
     friction_moment : tuple of two floats
-        Moment [N m/m] by which friction resists bending of the warp, and of the weft.
+        Moment [N m/m] of internal friction against bending of warp and weft.
     friction_force : float
-        Force [N/m] by which it resists shear.
+        Force [N/m] of internal friction against shear.
     """
 
     density: float
@@ -110,13 +110,13 @@ class ShellMaterial:
         return (d11, d12, 0.0), (d12, d22, 0.0), (0.0, 0.0, d33)
 
     def bends_with(self, model: str) -> bool:
-        """Whether it resists bending, by this model."""
+        """Whether the material has bending stiffness, of this bending model."""
         return self.model == model and max(*self.bending, self.plate[0]) > 0.0
 
 
 @dataclass(frozen=True)
 class ClothTable:
-    """The part of a measured cloth's tables that a St. Venant-Kirchhoff shell uses.
+    """Numbers from the tables of a measured cloth that a St. Venant-Kirchhoff shell uses.
 
     Attributes
     ----------
@@ -125,9 +125,9 @@ class ClothTable:
     c11, c12, c22, c33 : float
         Small-strain row of the stretching table [N/m].
     bending : (3,)
-        First column of the bending table, k_e [N·m], edges at 0°, 45°, 90° to the warp.
+        First column of the bending table, k_e [N·m], for edges at 0°, 45°, 90° to the warp.
     measured : bool
-        Whether a fabric was.
+        Whether the numbers were measured at a fabric.
     """
 
     density: float
@@ -139,31 +139,31 @@ class ClothTable:
     measured: bool = False
 
 
-def _read(library: str) -> dict[str, Any]:
+def _read_library(library: str) -> dict[str, Any]:
     text = files(__package__).joinpath(library).read_text(encoding="utf-8")
     return json.loads(text)
 
 
 @cache
 def library_entries() -> dict[str, ClothTable | ShellMaterial]:
-    """Every material of every library, by name."""
+    """All materials of all libraries, by name."""
     found: dict[str, ClothTable | ShellMaterial] = {}
     for library in TABLE_LIBRARIES:
-        for name, row in _read(library)["tables"].items():
+        for name, row in _read_library(library)["tables"].items():
             found[name] = ClothTable(
                 **{key: row[key] for key in ("density", "c11", "c12", "c22", "c33")},
                 bending=tuple(row["bending"]),
                 measured=row.get("measured", True),
             )
     for library in ISOTROPIC_LIBRARIES:
-        for name, row in _read(library)["isotropic"].items():
+        for name, row in _read_library(library)["isotropic"].items():
             areal = row["density"] * row["thickness"]
             found[name] = isotropic_shell(row["young"], row["poisson"], row["thickness"], areal)
     return found
 
 
 def material_names() -> list[str]:
-    """The names a scene's ``cloth`` may take, sorted."""
+    """The values of the scene key ``cloth``, sorted."""
     return sorted(library_entries())
 
 
@@ -178,31 +178,31 @@ def isotropic_names() -> list[str]:
 
 
 def is_isotropic(name: object) -> bool:
-    """Whether an engineering material of the library has this name."""
+    """Whether ``name`` is that of an engineering material of the library."""
     return isinstance(name, str) and isinstance(library_entries().get(name), ShellMaterial)
 
 
 def resolve_material(
     material: Material, *, file: object | None = None, key: str = "material"
 ) -> tuple[ShellMaterial, list[str]]:
-    """Constants of one material block, all conventions and factors applied.
+    """Constants of one material block, with all conventions and factors applied.
 
     Parameters
     ----------
     material : scene.schema.Material
     file, key : optional
-        Where the block stands, for messages.
+        File and key of the block, for messages.
 
     Returns
     -------
     ShellMaterial
     list of str
-        Notes for the user (a stiffness that had to be changed), one line each.
+        Notes for the user, one line each, as on a stiffness that had to be changed.
 
     Raises
     ------
     InputError
-        Numbers so large that they overflow, or so small that they vanish.
+        Numbers that overflow or underflow, or friction in bending without bending stiffness.
     """
     notes: list[str] = []
     name = key
@@ -216,13 +216,14 @@ def resolve_material(
     else:
         assert material.density is not None
         if (c := material.membrane) is not None:
-            shell = _bent(ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33), material.bending)
-        elif material.young is None:  # what is left is by curves, see below
-            shell = _bent(ShellMaterial(material.density, 1.0, 0.0, 1.0, 1.0), material.bending)
+            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33)
+        elif material.young is None:  # the law is by curves, which set the membrane stiffness below
+            shell = ShellMaterial(material.density, 1.0, 0.0, 1.0, 1.0)
         else:
             assert material.poisson is not None
             assert material.thickness is not None
             shell = isotropic_shell(material.young, material.poisson, material.thickness, material.density)
+        shell = _with_bending(shell, material.bending)
     if material.bending_model == "midedge":
         shell, more = _with_plate(shell, name)
         notes += more
@@ -252,9 +253,9 @@ def resolve_material(
 def shell_of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
     """Constants of a measured cloth, and notes; see the module's conventions.
 
-    A negative c12 is kept where the stiffness is positive definite. Where it is not, the
-    eigenvalues of [[c11, c12], [c12, c22]] are raised to at least `PROJECTION_FLOOR` of the
-    largest, which is the nearest such matrix in the Frobenius norm.
+    If the stiffness is not positive definite, the eigenvalues of [[c11, c12], [c12, c22]] are raised to at
+    least `PROJECTION_FLOOR` times the largest: the nearest such matrix in the Frobenius norm. Else a negative
+    c12 is kept.
     """
     c11, c12, c22 = 2 * table.c11, 2 * table.c12, 2 * table.c22
     notes: list[str] = []
@@ -279,7 +280,7 @@ def isotropic_shell(young: float, poisson: float, thickness: float, density: flo
 
 
 def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[str]]:
-    """A shell that bends by its plate stiffness, made of B where there is none yet; and notes."""
+    """``shell`` with the model ``midedge`` and a plate stiffness, if it has none from B; and notes."""
     shell = replace(shell, model="midedge")
     at_0, at_45, at_90 = shell.bending
     if shell.plate[0] > 0.0 or max(shell.bending) <= 0.0:
@@ -301,13 +302,13 @@ GF_PER_CM = 0.980665
 
 
 def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
-    """A shell with friction, and with the numbers of a KES report."""
+    """``shell`` with friction, and with the numbers of a KES report."""
     moment, force = material.friction_moment or (0.0, 0.0), material.friction_force or 0.0
     if (kes := material.kes) is not None:
         if kes.B is not None:
             warp, weft = (1e-4 * GF_PER_CM * b for b in kes.B)
             mean = 0.5 * (warp + weft)
-            # a hinge at 0° to the warp bends the weft
+            # a hinge whose edge is along the warp bends the weft
             shell = replace(shell, bending=(weft, mean, warp))
             if shell.model == "midedge":
                 shell = replace(shell, plate=(warp, 0.0, weft, 0.5 * mean))
@@ -323,17 +324,19 @@ def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
     return replace(shell, friction_moment=moment, friction_force=force)
 
 
-def _bent(shell: ShellMaterial, bending: float | Triple | PlateStiffness | None) -> ShellMaterial:
-    """A shell with the bending stiffness that a scene gives."""
+def _with_bending(shell: ShellMaterial, bending: float | Triple | PlateStiffness | None) -> ShellMaterial:
+    """``shell`` with the bending stiffness of a scene, if that has one."""
+    if bending is None:
+        return shell
     if isinstance(bending, float):
         bending = bending, bending, bending
-    if bending is None or isinstance(bending, tuple):
-        return replace(shell, bending=bending or (0.0, 0.0, 0.0))
+    if isinstance(bending, tuple):
+        return replace(shell, bending=bending)
     return replace(shell, plate=(bending.d11, bending.d12, bending.d22, bending.d33))
 
 
 def _projected(c11: float, c12: float, c22: float) -> Triple:
-    """[[c11, c12], [c12, c22]] with both eigenvalues at least the floor; (c11, c12, c22)."""
+    """c11, c12, c22 with both eigenvalues of [[c11, c12], [c12, c22]] at least the floor."""
     mean, half_difference = (c11 + c22) / 2, (c11 - c22) / 2
     radius = math.hypot(half_difference, c12)
     largest = mean + radius
@@ -346,7 +349,7 @@ def _projected(c11: float, c12: float, c22: float) -> Triple:
 def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
     thicken = material.thicken
     stretch = material.stretching_scale * thicken
-    # a product and not a power: too large a factor becomes inf here and is refused above
+    # a power would raise OverflowError; a product becomes inf, which `resolve_material` refuses
     bend = material.bending_scale * thicken * thicken * thicken
     at_0, at_45, at_90 = (b * bend for b in shell.bending)
     d11, d12, d22, d33 = (d * bend for d in shell.plate)
