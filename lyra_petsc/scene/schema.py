@@ -1,8 +1,9 @@
-"""The scene: every key, its unit, its range and its default.
+"""The scene: all keys with units, ranges and defaults.
 
-Attribute names are the keys of the scene file, except ``from``, which Python calls
-``start``. SI units throughout. Blocks are frozen; ``None`` means the key is absent and its
-term is off.
+Attributes have the names of the keys in scene files, except ``start`` for the key ``from``, a keyword of
+Python. Units are SI. Blocks are immutable; None means that the key is absent and its term is off.
+
+The docstrings are the text of the reference page and of the JSON Schema.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ from lyra_petsc.scene.values import (
 MESH_SUFFIXES = (".geo", ".msh", ".obj")
 
 _BY_KIND = Discriminator(lambda value: "[block]" if isinstance(value, (dict, Block)) else "[plain]")
-"""Of what may be a block instead of numbers or a word; messages leave out the tags."""
+"""Discriminator of values that may be a block or plain values; messages omit the tags."""
 
 
 class Rotation(Block):
@@ -104,7 +105,7 @@ class Transform(Block):
     rotate : Rotation or None
         Rotation after the scaling.
     translate : (3,) [m]
-        Displacement after the rotation.
+        Translation after the rotation.
     """
 
     scale: PositiveScale = 1.0
@@ -113,16 +114,16 @@ class Transform(Block):
 
 
 class Grid(Block):
-    """A rectangle of cells in the xy plane, one corner at the origin.
+    """A rectangular grid of cells in the xy plane, with one corner at the origin.
 
     Attributes
     ----------
     width, height : float [m]
-        Extent in x and y.
+        Length in x and y.
     nx, ny : int
-        Cells in x and y.
+        Number of cells in x and y.
     pattern : str
-        How cells are cut into triangles: all diagonals alike, alternating, or four triangles a cell.
+        Triangles of the cells: parallel diagonals, alternating diagonals, or four triangles in each cell.
     """
 
     width: Positive
@@ -133,7 +134,7 @@ class Grid(Block):
 
 
 def _file(*endings: str) -> dict[str, Any]:
-    """Schema of a file name with one of these endings, in any case."""
+    """JSON Schema of a file name with one of these endings, in upper or lower case."""
     any_case = ("".join(f"[{letter}{letter.upper()}]" for letter in ending) for ending in endings)
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
@@ -142,22 +143,23 @@ MeshPath = Annotated[Path, file_beside("mesh file", *MESH_SUFFIXES), JsonSchema(
 
 
 class MeshSource(Block):
-    """Where one sheet comes from: a file or a grid.
+    """Source of one sheet: a file or a grid.
 
     Attributes
     ----------
     file : Path or None
-        A .geo, .msh or .obj; a relative path stands beside the scene file.
+        A .geo, .msh or .obj file; the path is relative to the scene file.
     grid : Grid or None
-        A rectangle instead of a file.
+        A rectangular grid instead of a file.
     size : float [m] or None
-        Element size for a .geo.
+        Element size for a .geo file; replaces the sizes in the script.
     algorithm : str or None
-        gmsh's algorithm for the triangles of a .geo; without it the script's, or gmsh's own choice.
+        gmsh's algorithm for the triangles of a .geo file; by default that of the script, or gmsh's default.
     transform : Transform
-        Where the sheet starts; without ``vt`` its scaling counts for the rest shape, too.
+        Transform from the mesh to the start positions. Its scaling applies to the rest shape, too, unless
+        ``vt`` give the rest shape.
     name : str or None
-        Name of the sheet; a surface group of that name holds its triangles.
+        Name of the sheet, and of a surface group with its triangles.
     """
 
     rules = (
@@ -186,11 +188,11 @@ class MembraneStiffness(Block):
     Attributes
     ----------
     c11, c22 : float [N/m]
-        Along warp and weft.
+        Stiffness along warp and weft.
     c12 : float [N/m]
-        Coupling of the two; c12² < c11 c22.
+        Coupling of warp and weft; c12² < c11 c22.
     c33 : float [N/m]
-        Shear modulus of engineering shear.
+        Shear modulus, for engineering shear strain.
     """
 
     c11: Positive
@@ -216,16 +218,16 @@ def _check_coupling(letter: str, first: float, coupling: float, second: float, u
 
 
 class PlateStiffness(Block):
-    """Orthotropic bending stiffness [N·m]: moments per width of curvatures; axis 1 is the warp.
+    """Orthotropic bending stiffness [N·m], moment per width over curvature; axis 1 is the warp.
 
     Attributes
     ----------
     d11, d22 : float [N·m]
-        Along warp and weft.
+        Stiffness along warp and weft.
     d12 : float [N·m]
-        Coupling of the two; d12² < d11 d22.
+        Coupling of warp and weft; d12² < d11 d22.
     d33 : float [N·m]
-        Of twist, on 2 κ12; D (1 − ν)/2 of an isotropic plate.
+        Stiffness against twist, for 2 κ12; in an isotropic plate D (1 − ν)/2.
     """
 
     d11: Positive
@@ -244,7 +246,7 @@ MembraneLaw = Literal["stvk", "measured", "neo-hookean"]
 
 
 def _curve(value: Any, info: ValidationInfo) -> Points:
-    """A curve from a file beside the scene, or as its points: so a scene as understood needs no files."""
+    """A curve from a file or as its points; stored scenes have points, and so do not need the file."""
     try:
         if isinstance(value, str):
             path = path_beside(value, info)
@@ -254,7 +256,7 @@ def _curve(value: Any, info: ValidationInfo) -> Points:
             return checked_points([(f"point {n}", x, y) for n, (x, y) in enumerate(pairs, start=1)])
     except InputError as error:
         raise problem(": ".join(part for part in (error.file, error.message) if part)) from None
-    except ValueError:  # no pair, or no numbers
+    except ValueError:  # a point that is no pair of numbers
         pass
     raise problem(f"must be a file, or points like [[0.01, 5.0], [0.02, 12.0]], not {shown(value)}")
 
@@ -273,27 +275,28 @@ Curve = Annotated[Points, BeforeValidator(_curve), JsonSchema(_CURVE)]
 
 
 KES_CURVATURE, KES_ANGLE = 2.5, 8.0
-"""To which KES-F 2 bends [1/cm], and KES-F 1 shears [°]."""
+"""Largest curvature [1/cm] of KES-F 2, and largest shear angle [°] of KES-F 1."""
 
 KES_RANGES = {"B": ((1e-4, 50.0), "gf·cm²/cm"), "G": ((1e-3, 100.0), "gf/(cm·degree)")}
-"""Wider than those of fabrics: numbers outside are in other units."""
+"""Ranges wider than those of fabrics: numbers outside are in other units."""
 
 
 class KesReport(Block):
-    """Numbers of a KES-F report as it prints them; each takes the place of the material's own.
+    """Numbers of a KES-F report in its units, which replace those of the material.
 
-    One number, or two along warp and weft. What no fabric has is refused: it is in other units.
+    Each is one number, or two for warp and weft. Numbers that no fabric has are refused, as they are in other
+    units.
 
     Attributes
     ----------
     B : float or (2,) [gf·cm²/cm]
         Bending stiffness.
     width_of_bending : float or (2,) [gf·cm/cm]
-        Width of the loop of bending: twice ``friction_moment``.
+        Width of the hysteresis loop in bending, twice ``friction_moment``.
     G : float or (2,) [gf/(cm·degree)]
-        Shear stiffness, of which the mean counts.
+        Shear stiffness; of two numbers the mean is used.
     width_of_shear : float or (2,) [gf/cm]
-        Width of the loop of shear, likewise: twice ``friction_force``.
+        Width of the hysteresis loop in shear, twice ``friction_force``; of two numbers the mean is used.
     """
 
     B: Pair | None = None
@@ -324,18 +327,19 @@ class KesReport(Block):
 
 
 class LawCurves(Block):
-    """One's own measurements: force [N/m], per width at rest, by strain.
+    """Measured curves of force [N/m], per width at rest, over strain.
 
-    Each is a file of two columns (commas, semicolons or blanks between), beside the scene file, or a list of
-    points. Strains are fractions, and both columns grow. A curve begins at (0, 0), goes on straight after its
-    last point, and warp and weft do so under compression. Nothing couples the three.
+    Each curve is a list of points, or a file of two columns, separated by commas, semicolons or blanks, with
+    its path relative to the scene file. Strains are fractions, and both columns increase. A curve begins at
+    (0, 0) and is linear beyond its last point; those of warp and weft are linear under compression. The three
+    curves are not coupled.
 
     Attributes
     ----------
     warp, weft : curve of strain and N/m
-        Strips pulled along warp and weft.
+        Strain and force of strips pulled along warp and weft.
     shear : curve of shear strain and N/m
-        Tangent of the angle by which warp and weft are sheared, and the force.
+        Tangent of the shear angle between warp and weft, and shear force.
     """
 
     warp: Curve
@@ -349,16 +353,16 @@ _AnyBending = Annotated[
     Annotated[Bending, Tag("[plain]")] | Annotated[PlateStiffness, Tag("[block]")], _BY_KIND
 ]
 
-# the ways to give a material's numbers: the keys of each, and those it needs
-_MATERIAL_WAYS = (
+# the alternatives for the numbers of a material: the keys of each, and the required ones
+_ALTERNATIVES = (
     (("cloth",), ()),
     (("membrane", "bending"), ("membrane", "density")),
     (("young", "poisson", "thickness"), ("young", "poisson", "thickness", "density")),
 )
 
 
-def _several_ways(material: Material) -> str:
-    used = [keys[0] for keys in (material.given(*way) for way, _ in _MATERIAL_WAYS) if keys]
+def _not_one_alternative(material: Material) -> str:
+    used = [given[0] for given in (material.given(*keys) for keys, _ in _ALTERNATIVES) if given]
     found = f"; {' and '.join(used)} are given" if used else ""
     return (
         "must be given in exactly one way: cloth, or density + membrane + bending,"
@@ -366,14 +370,14 @@ def _several_ways(material: Material) -> str:
     )
 
 
-def _needed(way: tuple[str, ...], key: str) -> Rule:
-    """A key that has to be given beside any of the others."""
-    ways = any_of(*way) if key != "membrane" else {"allOf": [any_of(*way), {"not": _BY_CURVES}]}
-    return Rule(when(ways, given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
+def _required(keys: tuple[str, ...], key: str) -> Rule:
+    """Rule that ``key`` is given if any of the ``keys`` of its alternative is."""
+    used = any_of(*keys) if key != "membrane" else {"allOf": [any_of(*keys), {"not": _BY_CURVES}]}
+    return Rule(when(used, given(key)), lambda m: f"missing (needed beside {m.given(*keys)[0]})", key)
 
 
 _NO_SHEAR = 1.0
-"""c33 of what has G of a KES report, where it counts for nothing."""
+"""Placeholder for c33 in a membrane with G of a KES report, which replaces it."""
 
 _FRICTION = {
     "anyOf": [
@@ -381,7 +385,7 @@ _FRICTION = {
         {"type": "array", "not": {"items": {"enum": [0]}}},
     ]
 }
-_RUBS = {
+_HAS_FRICTION = {
     "anyOf": [
         given(friction_moment=_FRICTION),
         given(kes={"type": "object", **given(**{"2HB": _FRICTION})}),
@@ -390,34 +394,33 @@ _RUBS = {
 
 
 class Material(Block):
-    """One material, named from a library or given by its numbers.
+    """One material, from the library or by its numbers.
 
-    Exactly one of three ways: ``cloth``; ``density`` + ``membrane`` (+ ``bending``);
+    Exactly one of three alternatives is given: ``cloth``; ``density`` + ``membrane`` (+ ``bending``);
     ``young`` + ``poisson`` + ``thickness`` + ``density``.
 
     Attributes
     ----------
     group : str or None
-        Surface group it is for; without: all triangles that no other block names.
+        Surface group of this material; without it all triangles in no other material's group.
     cloth : str or None
-        Name of a measured cloth or an engineering material of the library, instead of numbers.
+        Name of a measured cloth or an engineering material in the library.
     density : float [kg/m²] or None
         Areal density.
     membrane : MembraneStiffness or None
         Stretching stiffness.
-    bending : float or (3,) [N·m], PlateStiffness or None
-        Cylindrical stiffness B; three values hold at 0°, 45°, 90° to the warp (of a hinge's edge). Or four
-        numbers of an orthotropic plate.
+    bending : float or (3,) or PlateStiffness [N·m] or None
+        Cylindrical bending stiffness B; three values are for hinges whose edge is at 0°, 45°, 90° to the
+        warp. Or a block with the four numbers of an orthotropic plate.
     bending_model : str or None
-        ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
-        ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
-        poisson and thickness, also of the library, for an orthotropic plate and with friction_moment, else
-        ``hinge``.
+        ``hinge``: angles between neighbouring triangles; fast, but the stiffness of plates depends on the
+        mesh. ``midedge``: an additional unknown on every edge; converges on any mesh. The default is
+        ``midedge`` for isotropic materials (young, poisson and thickness, or such a material of the library),
+        for an orthotropic plate and with friction_moment, else ``hinge``.
     law : str or LawCurves
-        How the membrane's stiffness depends on strain. ``stvk``: not at all; ``measured``: as measured on a
-        cloth of the library; ``neo-hookean``: as that of rubber, for young, poisson and thickness, also of
-        the library. At rest it is the same. Or curves of one's own, instead of ``membrane``. Under
-        compression ``stvk`` softens, the others do not.
+        Membrane law. ``stvk``: constant stiffness (softens under compression); ``measured``: stiffness
+        measured over strain, for cloths of the library; ``neo-hookean``: rubber, for isotropic materials. All
+        have the same stiffness at rest. Or a block of measured curves, instead of ``membrane``.
     young : float [Pa] or None
         Young's modulus of an isotropic shell.
     poisson : float or None
@@ -427,26 +430,26 @@ class Material(Block):
     damping : float [s]
         γ of stiffness-proportional damping.
     warp_degrees : float [°]
-        Rotation of the warp in the material plane, anticlockwise.
+        Anticlockwise rotation of the warp in the material plane.
     density_scale, stretching_scale, bending_scale : float
         Factors on density, membrane and bending.
     thicken : float
-        t: density × t, membrane × t, bending × t³.
+        Factor t on the thickness: density × t, membrane × t, bending × t³.
     rest_curvature : (3,) [1/m] or None
         Curvature κ11, κ22, κ12 at rest, in the material axes.
     friction_moment : float or (2,) [N m/m]
-        Moment per width by which friction within the fabric resists bending, of warp and weft: hysteresis,
-        and folds that stay. Half of KES's 2HB. Scaled as bending; by ``midedge`` only.
+        Moment per width of internal friction against bending, for warp and weft; causes hysteresis and
+        remaining folds. Half of 2HB of a KES report. Scaled as bending; needs ``midedge``.
     friction_force : float [N/m]
-        Force per width by which it resists shear, half of 2HG. Scaled as membrane.
+        Force per width of internal friction against shear, half of 2HG. Scaled as membrane.
     kes : KesReport or None
-        Instead of bending, c33, friction_moment and friction_force.
+        Numbers of a KES report, instead of bending, c33, friction_moment and friction_force.
     """
 
     rules = (
-        Rule({"oneOf": [any_of(*way) for way, _ in _MATERIAL_WAYS]}, _several_ways),
+        Rule({"oneOf": [any_of(*keys) for keys, _ in _ALTERNATIVES]}, _not_one_alternative),
         Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
-        *(_needed(way, key) for way, needed in _MATERIAL_WAYS for key in needed),
+        *(_required(keys, key) for keys, required in _ALTERNATIVES for key in required),
         Rule(
             when(_BY_CURVES, absent("membrane", "young")),
             "curves take the place of membrane; give them beside a cloth, or density and bending",
@@ -458,8 +461,8 @@ class Material(Block):
             "bending",
         ),
         Rule(
-            when(_RUBS, given(bending_model={"const": "midedge"})),
-            "friction_moment (2HB of kes) is for bending_model: midedge; hinges would lose more or less",
+            when(_HAS_FRICTION, given(bending_model={"const": "midedge"})),
+            "friction_moment (2HB of kes) is for bending_model: midedge; with hinges it depends on the mesh",
             "bending_model",
         ),
         Rule(
@@ -533,7 +536,7 @@ class Material(Block):
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Numbers without ``bending`` mean a membrane: the zero is written out."""
+        """Defaults of ``bending`` (0), ``bending_model``, and of c33 if G of ``kes`` replaces it."""
         by_curves = isinstance(data.get("law"), (dict, LawCurves)) and not {"cloth", "young"} & data.keys()
         if "membrane" in data or by_curves:
             data = {"bending": 0.0, **data}
@@ -542,8 +545,8 @@ class Material(Block):
             data["membrane"] = {"c33": _NO_SHEAR, **membrane}
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))
-        rubs = holds(_RUBS, data)
-        return {"bending_model": "midedge" if isotropic or plate or rubs else "hinge", **data}
+        friction = holds(_HAS_FRICTION, data)
+        return {"bending_model": "midedge" if isotropic or plate or friction else "hinge", **data}
 
     @field_validator("cloth")
     @classmethod
@@ -562,7 +565,7 @@ _ALL_AXES = {
 
 
 MAX_SPEED = 1e8
-"""Largest speed [m/s] that anything may have; squares of larger ones are soon no numbers."""
+"""Largest speed [m/s] in a scene; squares of much larger ones overflow."""
 
 _SPEEDS = {"items": {"minimum": -MAX_SPEED, "maximum": MAX_SPEED}}
 _NOT_TOO_FAST = Rule(
@@ -578,9 +581,9 @@ class UniformWind(Block):
     Attributes
     ----------
     velocity : (3,) [m/s]
-        Of the air; zeros are still air.
+        Velocity of the air; zero is still air.
     density : float [kg/m³]
-        Of the air.
+        Density of the air.
     drag : float [kg/(m² s)]
         Tangential drag coefficient.
     """
@@ -597,16 +600,16 @@ _BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
 
 
 class VertexChoice(Block):
-    """The three ways to name vertices.
+    """Vertices by group, nodes or box.
 
     Attributes
     ----------
     group : str or None
-        A group of the mesh, or a sheet's name.
+        A group of the mesh, or the name of a sheet.
     nodes : list of int or None
-        Vertex numbers, from 0, in file order.
+        Numbers of vertices from 0, in file order.
     box : two (3,) [m] or None
-        Lower and upper corner; start positions, faces included.
+        Lower and upper corner of a box; it selects by start positions and includes its faces.
     """
 
     group: Name | None = None
@@ -645,28 +648,28 @@ def _ends_later(block: Any) -> Any:
 
 
 class Handle(Selector):
-    """Vertices whose motion is prescribed, or pulled by springs.
+    """Vertices whose motion is prescribed, or which springs pull.
 
     Attributes
     ----------
     axes : tuple of "x", "y", "z"
-        Directions that are held.
+        Directions in which the vertices are held.
     clamp : bool
-        Keep the slope of held boundary edges. With part of the ``axes`` they slide along the others, in the
-        sheet's plane; by ``midedge`` only.
+        Keep the slope of held boundary edges, too. If only part of the ``axes`` is held, the edges slide
+        along the others in the plane of the sheet; needs ``midedge``.
     symmetry : "x", "y" or "z", or None
-        The vertices lie in a plane normal to this axis, in which the sheet is mirrored: they stay in it, and
-        the sheet stays normal to it. Takes the place of ``axes``; bends by ``midedge`` only.
+        The vertices are in a symmetry plane normal to this axis: they stay in the plane, and the sheet stays
+        normal to it. Replaces ``axes``; needs ``midedge``.
     motion : str or None
-        Name in ``motions``; without: held in place.
+        Name in ``motions``; without it the vertices keep their positions.
     interpolation : str
-        Of the motion in time, between keyframes.
+        Interpolation of the motion between keyframes.
     start, until : float [s]
-        Held for from ≤ t ≤ until (without: to the end).
+        The handle acts for from ≤ t ≤ until; by default always.
     fade : float [s]
-        After ``until`` the hold fades as (1 − (t − until)/fade)⁴.
+        After ``until`` the handle fades by the factor (1 − (t − until)/fade)⁴.
     stiffness : float [N/m] or None
-        Per vertex and axis: a spring instead of a constraint.
+        Stiffness for each vertex and axis of springs that replace the constraint.
     """
 
     rules = (
@@ -711,12 +714,12 @@ class Handle(Selector):
 
     @property
     def axis_numbers(self) -> tuple[int, ...]:
-        """The directions that are held as 0, 1, 2, ascending."""
+        """Directions in which the vertices are held, as 0, 1, 2, ascending."""
         return tuple(AXES.index(axis) for axis in (self.symmetry or self.axes))
 
     @property
     def holds_slope(self) -> bool:
-        """Whether it holds the directors of its edges, where they have them."""
+        """Whether the handle holds the directors of its edges, which ``midedge`` has."""
         return self.clamp or self.symmetry is not None
 
     @field_validator("axes", mode="before")
@@ -729,20 +732,21 @@ class Handle(Selector):
 
 
 class Keyframe(Block):
-    """Where a motion has carried the held vertices at one time: scaled, rotated, translated.
+    """Scaling, rotation and translation of the vertices, or of an obstacle, from their start to one time.
 
     Attributes
     ----------
     time : float [s]
-        Later than the keyframe before.
+        Time, later than that of the keyframe before.
     scale : float or (3,)
         Factor about the origin, or one for each axis; not 0.
     rotate : Rotation or None
         Rotation after the scaling.
     translate : (3,) [m]
-        Displacement after the rotation.
+        Translation after the rotation.
     velocity : (3,) [m/s] or None
-        Of the translation; without: by central differences, zero at both ends.
+        Velocity of the translation; by default from central differences, and zero at the first and last
+        keyframe.
     """
 
     rules = (_NOT_TOO_FAST,)
@@ -758,21 +762,21 @@ Keyframes = Annotated[list[Keyframe], list_of(), Field(json_schema_extra={"minIt
 
 
 class Friction(Block):
-    """Coulomb friction whose coefficient at rest is not that of sliding.
+    """Coulomb friction with different static and kinetic coefficients.
 
     Attributes
     ----------
     static : float
-        Coefficient at rest.
+        Coefficient of static friction.
     kinetic : float
-        Coefficient while sliding; at most the static one.
+        Coefficient of kinetic friction, at most the static one.
     """
 
     static: NonNegative
     kinetic: NonNegative
 
     @model_validator(mode="after")
-    def _rest_holds_more(self) -> Self:
+    def _kinetic_at_most_static(self) -> Self:
         if self.kinetic > self.static:
             raise problem(f"must be at most static = {self.static:g}, not {self.kinetic:g}", "kinetic")
         return self
@@ -796,14 +800,14 @@ class Contact(Block):
     Attributes
     ----------
     gap : float [m] or None
-        Distance below which surfaces feel each other; by default the smaller of a quarter of the mean edge
-        and half of the shortest.
+        Distance of surfaces below which contact forces act; by default the smaller of a quarter of the mean
+        edge and half of the shortest edge.
     thickness : float [m]
-        Distance kept between mid-surfaces.
+        Distance of mid-surfaces at which surfaces touch.
     self : bool
-        Whether sheets meet themselves and other sheets, not obstacles alone.
+        Contact of sheets with themselves and other sheets, too; else with obstacles only.
     friction : float or Friction
-        Coulomb's coefficient, or a block of two.
+        Coulomb's friction coefficient, or a block of two coefficients.
     """
 
     gap: Positive | None = None
@@ -813,14 +817,14 @@ class Contact(Block):
 
 
 class Plane(Block):
-    """A plane without end.
+    """An unbounded plane.
 
     Attributes
     ----------
     point : (3,) [m]
-        Any point of it.
+        A point of the plane.
     normal : (3,)
-        Towards the side that is free; not zero, need not be a unit vector.
+        Normal towards the free side; not zero, need not be a unit vector.
     """
 
     point: Vector
@@ -833,9 +837,9 @@ class Sphere(Block):
     Attributes
     ----------
     center : (3,) [m]
-        Its middle.
+        Centre.
     radius : float [m]
-        Of the surface.
+        Radius of the sphere.
     """
 
     center: Vector
@@ -843,14 +847,14 @@ class Sphere(Block):
 
 
 class Capsule(Block):
-    """A cylinder with half spheres as ends.
+    """A cylinder with hemispheres at its ends.
 
     Attributes
     ----------
     start, to : (3,) [m]
-        Ends of its axis, the centres of the half spheres.
+        Ends of the axis: the centres of the hemispheres.
     radius : float [m]
-        Of cylinder and half spheres.
+        Radius of cylinder and hemispheres.
     """
 
     start: Vector = Field(alias="from")
@@ -865,7 +869,7 @@ class Capsule(Block):
 
 
 class Cuboid(Block):
-    """A box with sides along x, y and z (at t = 0).
+    """A box with edges along x, y and z at t = 0.
 
     Attributes
     ----------
@@ -885,14 +889,14 @@ class Cuboid(Block):
 
 
 class ObstacleMesh(Block):
-    """Any triangle mesh, closed or open, of which both sides are met.
+    """A triangle mesh, closed or open, with contact on both sides.
 
     Attributes
     ----------
     file : Path
-        A .geo, .msh or .obj; a relative path stands beside the scene file.
+        A .geo, .msh or .obj file; the path is relative to the scene file.
     transform : Transform
-        Where it stands at t = 0.
+        Transform from the mesh to the position at t = 0.
     """
 
     file: MeshPath
@@ -900,32 +904,32 @@ class ObstacleMesh(Block):
 
 
 SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
-"""Kinds of obstacles."""
+"""Keys for the shapes of obstacles."""
 
 
 class Obstacle(Block):
-    """What sheets cannot pass: one shape, still or moving rigidly.
+    """A rigid obstacle of one shape, which sheets cannot penetrate.
 
     Attributes
     ----------
     plane : Plane or None
         A plane, free on the side of its normal.
     sphere : Sphere or None
-        A sphere, kept out of or in.
+        A sphere.
     capsule : Capsule or None
-        A rod with round ends.
+        A cylinder with hemispheres at its ends.
     box : Cuboid or None
-        A box, at first along x, y and z.
+        A box, at t = 0 along x, y and z.
     mesh : ObstacleMesh or None
         A triangle mesh.
     inside : bool
-        Sheets stay inside of the sphere, capsule or box.
+        Whether sheets are inside of the sphere, capsule or box instead of outside.
     motion : str or list of Keyframe or None
-        Name in ``motions``, or keyframes; without: stands still. Rigid, hence without ``scale``.
+        Name in ``motions``, or keyframes, without ``scale``; by default the obstacle is at rest.
     interpolation : str
-        Of the motion in time, between keyframes.
+        Interpolation of the motion between keyframes.
     friction : float or Friction or None
-        Wins over that of ``contact``.
+        Friction coefficient, instead of that of ``contact``.
     """
 
     rules = (
@@ -955,7 +959,7 @@ class Obstacle(Block):
 
     @property
     def shape(self) -> str:
-        """The one of `SHAPES` that it is."""
+        """The key of `SHAPES` that is given."""
         return self.given(*SHAPES)[0]
 
 
@@ -965,19 +969,19 @@ class AppliedLoad(VertexChoice):
     Attributes
     ----------
     group : str or None
-        A group of the mesh, or a sheet's name; for pressure and traction a surface group, or nothing (every
-        triangle); for a moment one of boundary edges.
+        A group of the mesh, or the name of a sheet. For pressure and traction a surface group, by default all
+        triangles; for a moment a group of boundary edges.
     force : (3,) [N] or None
-        Total, shared by the selected vertices.
+        Total force, shared by the selected vertices.
     pressure : float [Pa] or None
-        Along the current normal.
+        Pressure along the current normal.
     traction : (3,) [N/m²] or None
-        Per rest area, direction fixed in space.
+        Force per rest area, of fixed direction.
     moment : float [N·m/m] or None
-        Per rest length about the boundary edges of the group, which it follows; positive lifts their free
-        side towards the sheet's normal. Bends by ``midedge`` only.
+        Moment per rest length about the current direction of the boundary edges; a positive one lifts their
+        free side towards the normal of the sheet. Needs ``midedge``.
     start, until : float [s]
-        Acts for from ≤ t ≤ until (without: to the end).
+        The load acts for from ≤ t ≤ until; by default always.
     """
 
     rules = (
@@ -1006,19 +1010,19 @@ class AppliedLoad(VertexChoice):
 
 
 class Initial(Block):
-    """State at t = 0, beside the start positions.
+    """Initial velocities, and noise on the start positions.
 
     Attributes
     ----------
     velocity : (3,) [m/s]
-        Of all vertices.
+        Velocity of all vertices.
     angular_velocity : (3,) [rad/s]
-        About the centre of mass.
+        Angular velocity about the centre of mass.
     noise : float [m]
-        Standard deviation of a normally distributed displacement of every vertex that no
-        handle holds, along the vertex normal of the start shape.
+        Standard deviation of a normally distributed displacement, along the initial vertex normal, of each
+        vertex that no handle holds.
     seed : int
-        Of the noise.
+        Seed of the random numbers for the noise.
     """
 
     rules = (_NOT_TOO_FAST,)
@@ -1058,26 +1062,27 @@ _MEANINGLESS = "has no meaning in a static analysis; leave it out"
 
 
 class Time(Block):
-    """Time stepping, or the way to an equilibrium.
+    """Time stepping, or load steps of a static analysis.
 
     Attributes
     ----------
     analysis : str
-        ``dynamic``: a motion in time; ``static``: the equilibrium under the loads, which grow with a
-        load factor from 0 to 1 that takes the place of time.
+        ``dynamic``: motion in time; ``static``: equilibrium under loads that are multiplied by a load factor,
+        which goes from 0 to 1 and replaces time.
     end : float [s]
         Time at which the run ends; 1 in a static analysis.
     step : float [s] or "auto"
-        Nominal and largest Δt; ``auto``: as the tolerance asks. In a static analysis the first
-        increment of the load factor.
+        Nominal and largest Δt; ``auto``: adaptive steps. In a static analysis the first increment of the load
+        factor.
     tolerance : float or None
-        With ``step: auto``: error in the positions that the steps may add up to by the end, as a fraction
-        of the diagonal of the rest shape's bounding box.
+        Tolerance of adaptive steps: accumulated time integration error of the positions at the end, over the
+        diagonal of the bounding box of the rest shape.
     integrator : str or None
         ``beuler`` (first order, full Newton), ``semi-implicit`` (one linear solve a step), ``midpoint``,
-        ``alpha2`` (generalised-α), ``bdf2`` (second order); none in a static analysis. By default ``beuler``.
+        ``alpha2`` (generalised-α), ``bdf2`` (second order). The default is ``beuler``; a static analysis has
+        none.
     spectral_radius : float or None
-        Spectral radius of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
+        Spectral radius of ``alpha2`` at high frequencies: 0 damps them within a step, 1 not at all.
     """
 
     rules = (
@@ -1155,14 +1160,14 @@ class Time(Block):
 
 
 class CheckpointInterval(Block):
-    """How often a checkpoint is written at least.
+    """Largest interval between checkpoints.
 
     Attributes
     ----------
     seconds : float [s]
         Wall time.
     steps : int or None
-        Accepted steps; without: only by wall time.
+        Number of accepted steps; by default wall time alone counts.
     """
 
     seconds: Positive = 60.0
@@ -1170,21 +1175,22 @@ class CheckpointInterval(Block):
 
 
 class Output(Block):
-    """What is written.
+    """Files of a run.
 
     Attributes
     ----------
     every : float [s] or None
-        Simulated time between states; empty: every step.
+        Simulated time between states; empty: a state after every step.
     fields : list of str
-        What a state holds beside the positions.
+        Fields in the states besides the positions.
     checkpoint : CheckpointInterval
-        How often a checkpoint is written at least.
+        Largest interval between checkpoints.
     reactions : bool
-        Write the forces [N] at the handles to reactions.csv, and under ``midedge`` the moments [N·m] about
-        the mean position of those with ``clamp`` or ``symmetry``.
+        Write the forces [N] at the handles to reactions.csv; with ``midedge`` also the moments [N·m] of
+        handles with ``clamp`` or ``symmetry``, about their mean positions.
     vtkhdf : bool
-        Announce the states also in states.vtkhdf, which newer ParaView reads faster than the XDMF.
+        Write an index of the states for ParaView to states.vtkhdf, too, which recent versions read faster
+        than the XDMF file.
     """
 
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
@@ -1208,18 +1214,20 @@ class Output(Block):
 
 
 class Solver(Block):
-    """When a step counts as converged, and how Newton treats its Hessian.
+    """Convergence of Newton's method, and its Hessian.
 
     Attributes
     ----------
     force_tolerance : float
-        Force residual over the forces at work.
+        Tolerance on the norm of the force residual, relative to its largest part (internal forces, inertia,
+        loads, …).
     step_tolerance : float
-        How far a coordinate is expected to move yet, over element size.
+        Tolerance on the estimated remaining correction of a coordinate, relative to the element size.
     max_iterations : int
-        Newton iterations a step may take.
+        Largest number of Newton iterations in a step.
     hessian : str
-        ``exact``, ``regularised`` (always positive definite), or ``adaptive``: as exact as it can be.
+        ``exact``, ``regularised`` (positive definite), or ``adaptive``: a blend, as close to the exact one as
+        possible.
     """
 
     force_tolerance: Positive = 1e-6
@@ -1233,24 +1241,24 @@ PARALLEL = 1e-6
 
 
 class Camera(Block):
-    """Where the pictures are taken from; what is left out is found from the whole motion.
+    """Camera of the pictures; keys left out are computed from the whole motion.
 
     Attributes
     ----------
     direction : (3,) or None
-        From the sheet towards the camera; its distance is fitted to the whole motion.
+        Direction from the sheet towards the camera, whose distance is fitted to the whole motion.
     position : (3,) [m] or None
-        Where it stands, instead of a direction; needs a target.
+        Position of the camera, instead of a direction; needs a target.
     target : (3,) [m] or None
-        What it looks at.
+        Point at which the camera looks.
     up : (3,) or None
-        Upwards in the picture; without: against gravity, or z.
+        Direction upwards in the picture; by default against gravity, else z.
     angle : float [degrees]
-        Height of the field of view, from 1 to 120.
+        Vertical angle of view, from 1 to 120.
     zoom : float
-        With a fitted distance: how much larger than it fits.
+        Magnification relative to the fitted distance.
     frame : float [percent]
-        With a fitted distance: the share of the states that are wholly in the picture (95), from 50 to 100.
+        Percentage of the states that the fitted distance shows completely, from 50 to 100; by default 95.
     """
 
     rules = (
@@ -1291,7 +1299,7 @@ class Camera(Block):
 
     @property
     def line_of_sight(self) -> Vec3 | None:
-        """Direction from what is seen to the camera, of any length, if the scene gives it."""
+        """Direction from the target to the camera, of any length; None if the scene does not give it."""
         if self.position is None or self.target is None:
             return self.direction
         x, y, z = (a - b for a, b in zip(self.position, self.target, strict=True))
@@ -1306,19 +1314,19 @@ def parallel(a: Vec3, b: Vec3) -> bool:
 
 
 class Render(Block):
-    """How ``render`` shows the scene.
+    """Settings of the command ``render``.
 
     Attributes
     ----------
     camera : Camera or None
-        Where the pictures are taken from; without: where most of the sheet is seen.
+        Camera of the pictures; by default one that sees most of the sheet.
     """
 
     camera: Camera | None = None
 
 
 SMALLEST_STEP = 2.0**-52
-"""Step over the end of the run below which the time, a 64-bit number, would stand still."""
+"""Smallest step over the end time: the time, a 64-bit float, does not change by smaller ones."""
 
 
 def _too_small(step: float, end: float) -> str:
@@ -1337,46 +1345,46 @@ def _one_or_many(value: Any) -> Any:
 
 
 class Scene(Block):
-    """The whole input of a run.
+    """All input of a run.
 
     Attributes
     ----------
     title : str
         One line for summaries and pages.
     mesh : list of MeshSource
-        Where the sheets come from: one block, or a list whose vertices are numbered consecutively.
+        Source of a sheet, or a list of sources; their vertices are numbered consecutively.
     material : list of Material
-        One block, or a list; at most one without a group: it serves the triangles that no other block names.
+        One material, or a list. At most one has no group; it applies to the triangles in no other's group.
     gravity : (3,) [m/s²] or None
         Acceleration of gravity; without this key there is none.
     wind : UniformWind or None
         Uniform wind; without this key there is no air.
     handles : list of Handle
-        Vertices that are held or moved.
+        Vertices whose motion is prescribed, or which springs pull.
     motions : dict of list of Keyframe
-        Motions of handles and obstacles, by name; times strictly ascending.
+        Motions of handles and obstacles, by name; times are strictly ascending.
     contact : Contact or None
-        How surfaces meet; without this key they pass through each other.
+        Contact; without this key surfaces penetrate each other.
     obstacles : dict of Obstacle or None
-        What sheets meet beside themselves, by name.
+        Rigid obstacles, by name.
     loads : list of AppliedLoad
-        Forces, pressures and tractions.
+        Forces, pressures, tractions and moments.
     initial : Initial or None
-        State at t = 0, where it is not rest.
+        Initial velocities and noise; without this key the scene starts at rest.
     time : Time
-        Time stepping, or the way to an equilibrium.
+        Time stepping, or load steps of a static analysis.
     output : Output
-        What is written, and how often.
+        Files of the run.
     probes : dict of Selector
-        Vertices whose mean position goes into probes.csv at every step, by name.
+        Vertices whose mean position is written to probes.csv at every step, by name.
     solver : Solver
-        When a step counts as converged.
+        Convergence of Newton's method, and its Hessian.
     render : Render or None
-        What ``render`` shows; a run does not read it.
+        Settings of the command ``render``; a run ignores them.
     fit : Fit or None
-        Numbers to be found from measurements, by ``fit``; a run does not read it.
+        Parameters and measurements for the command ``fit``; a run ignores them.
     petsc : dict
-        PETSc options without the leading dash; an empty value is an option without one.
+        PETSc options without the leading dash; an empty value is an option without value.
     """
 
     # a static analysis starts at rest
@@ -1393,7 +1401,7 @@ class Scene(Block):
     ) + (
         Rule(
             when(given("obstacles"), given("contact")),
-            # a template would take the braces for a key
+            # a function, as the braces in a template would mean a key
             lambda _: "are met only with contact; add the line 'contact: {friction: 0.3}'",
             "obstacles",
         ),
@@ -1427,12 +1435,12 @@ class Scene(Block):
 
     @property
     def source(self) -> Path | None:
-        """The file this scene was read from, for messages; no part of its value."""
+        """The file from which the scene was read, for messages; ignored in comparisons."""
         return self._source
 
     @property
     def trusts_meshes(self) -> bool:
-        """Whether gmsh gets this scene's scripts unchecked; the caller decides that, not the file."""
+        """Whether gmsh gets the scripts of this scene unchecked; set by the caller, not by the file."""
         return self._trusts_meshes
 
     @property
@@ -1449,31 +1457,31 @@ class Scene(Block):
 
     @property
     def has_scripts(self) -> bool:
-        """Whether some of its meshes are made by gmsh."""
+        """Whether gmsh makes any of the meshes."""
         return any(file.suffix.lower() == ".geo" for file in self.mesh_files.values())
 
     def trusting_meshes(self) -> Scene:
-        """The same scene, whose mesh scripts the caller trusts."""
+        """A copy of the scene with trusted mesh scripts."""
         trusting = self.model_copy()
         trusting._trusts_meshes = True
         return trusting
 
     def changed(self, changes: Mapping[str, Any]) -> Scene:
-        """Another scene with some keys changed, as in ``{"time.end": 2.0, "handles[0].until": 1.0}``.
+        """A copy with some keys changed, as in ``{"time.end": 2.0, "handles[0].until": 1.0}``.
 
-        None removes a key. The other keys stand as they were given: defaults follow the changes.
+        None removes a key. Defaults follow the changes.
 
         Raises
         ------
         InputError
-            On anything that cannot be used, naming the key.
+            The scene cannot be used; the message names the key.
         """
         from lyra_petsc.scene.load import change_scene
 
         return change_scene(self, changes)
 
     def __eq__(self, other: object) -> bool:
-        # equal in value: which file it came from does not count
+        # private attributes, as the file it came from, are ignored
         return isinstance(other, Scene) and self.model_dump() == other.model_dump()
 
     __hash__ = None  # type: ignore[assignment]
@@ -1528,7 +1536,7 @@ class Scene(Block):
             raise problem(f"unknown motion {motion!r}, {nearest(motion, self.motions)}", *at, "motion")
 
     def keyframes(self, obstacle: Obstacle) -> list[Keyframe]:
-        """Of the motion of one of its obstacles; none where it stands still."""
+        """Keyframes of the motion of an obstacle of the scene; none if it is at rest."""
         motion = obstacle.motion
         return self.motions[motion] if isinstance(motion, str) else motion or []
 
