@@ -1,4 +1,4 @@
-"""The kinds of cases, by name, and their shares of a hundred."""
+"""The kinds of fuzz cases by name, each with its percentage."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ KINDS: dict[str, tuple[int, st.SearchStrategy[Case]]] = {
 def for_each(
     strategy: st.SearchStrategy[Case], number: int, seed: int, run: Callable[[Case], object]
 ) -> None:
-    """Give ``number`` cases, the same for the same seed, to ``run``.
+    """Call ``run`` with ``number`` cases, which depend on the seed only.
 
-    Hypothesis draws constants of the modules loaded so far, too: then cases would depend on earlier tests.
+    Constants of loaded modules, which Hypothesis draws, too, are excluded: they depend on earlier tests.
     """
     with suppress(ImportError, AttributeError):
         providers = importlib.import_module("hypothesis.internal.conjecture.providers")

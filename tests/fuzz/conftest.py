@@ -1,4 +1,4 @@
-"""These tests start the program as those of the command line do."""
+"""Makes the helpers of tests/cli importable, which start the program."""
 
 import sys
 from pathlib import Path

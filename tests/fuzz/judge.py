@@ -1,8 +1,8 @@
-"""Runs a fuzz case as the program would, in a forked process, and judges what it leaves.
+"""Runs a fuzz case in a forked process as the program would, and judges its output and files.
 
-Allowed are a run (exit 0, finite states), one line of bad input (exit 2, nothing written) and one line
-of a solver that could not go on (exit 3, the last good state kept). Anything else is a bug: a traceback,
-a signal, a warning of numpy's, CPU time or memory without end, more than one line, a left-over file.
+Allowed are a run (exit 0, finite states), one line on bad input (exit 2, nothing written) and one line on a
+solver that failed (exit 3, the last good state kept). All else is a bug: a traceback, a signal, a warning of
+numpy, unbounded CPU time or memory, more than one line, another file.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 CPU_SECONDS = 60
-"""After which a case counts as hanging; the first ones in a fresh checkout compile kernels."""
+"""Limit on the CPU time of a case; the first cases in a new checkout compile kernels."""
 
 WALL_SECONDS = 300.0
 MEMORY = 4 * 2**30
-"""Address space [B] of a case, beside what the process that it is forked from has."""
+"""Limit on the address space [B] of a case, in addition to that of its parent process."""
 
 LONGEST_LINE = 1000
 STEPS = 2
-"""Steps a case runs for at most."""
+"""Largest number of steps of a case."""
 
 UNSTABLE = 71
-"""Exit code of a case whose scene changes when it is written and read again."""
+"""Exit code of a case whose scene is another one after writing and reading."""
 
 WARM = """\
 mesh: {grid: {width: 1.0, height: 1.0, nx: 2, ny: 2}}
@@ -48,12 +48,12 @@ time: {end: 0.02, step: 0.01}
 
 @dataclass(frozen=True)
 class Case:
-    """Files in a folder, the scene among them, and what the command line adds.
+    """Files, among them a scene, and arguments of the command line.
 
     Attributes
     ----------
     kind : str
-        What was drawn, for the statistics.
+        Kind of the case, for statistics.
     files : mapping of name → content
     scene : str
         Name of the scene file.
@@ -70,14 +70,14 @@ class Case:
     verb: str = "run"
 
     def write(self, folder: Path) -> None:
-        """Put the files into an empty folder."""
+        """Write the files to an empty folder."""
         for name, content in self.files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
 
     @property
     def arguments(self) -> list[str]:
-        """Those of the command line."""
+        """Arguments of the command line."""
         chosen = [word for setting in self.settings for word in ("--set", setting)]
         folder = ["--out", "out"] if self.verb == "run" else []
         return [self.verb, self.scene, *chosen, *folder]
@@ -92,9 +92,9 @@ class Outcome:
     code : int
         Exit code, negative for a signal.
     line : str
-        The line of ours, if there is one.
+        The line with which the program reports how it ended; empty if there is none.
     complaint : str
-        What is wrong with that; empty if nothing is.
+        What is wrong with the outcome; empty if nothing is.
     seconds : float
     """
 
@@ -106,16 +106,16 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        return "".join(_said(self.err.splitlines())[:1])
+        return "".join(_report_lines(self.err.splitlines())[:1])
 
 
-def _said(lines: list[str]) -> list[str]:
-    """Lines by which the program says how it ended; a warning of unused options is none."""
+def _report_lines(lines: list[str]) -> list[str]:
+    """Lines with which the program reports how it ended, without warnings."""
     return [line for line in lines if line.startswith("lyra-petsc: ") and ": warning: " not in line]
 
 
 def warm(folder: Path) -> None:
-    """Load all that a run needs into this process, so that each case finds it there."""
+    """Import and compile all that a run needs in this process, from which cases are forked."""
     scene = folder / "warm.yaml"
     scene.write_text(WARM)
     from lyra_petsc.cli.app import run_command_line
@@ -123,20 +123,20 @@ def warm(folder: Path) -> None:
     for module in ("scene.original", "mesh.obj_file", "mesh.msh_file", "mesh.geo_file"):
         importlib.import_module(f"lyra_petsc.{module}")
     with (
-        (folder / "warm.txt").open("w") as words,
-        redirect_stdout(words),
-        redirect_stderr(words),
+        (folder / "warm.txt").open("w") as output,
+        redirect_stdout(output),
+        redirect_stderr(output),
     ):
         for integrator in ("beuler", "bdf2", "alpha2", "midpoint", "semi-implicit"):
             out = str(folder / f"warm-{integrator}")
             arguments = ["run", str(scene), "--set", f"time.integrator={integrator}", "--out", out]
             assert run_command_line(["lyra-petsc", *arguments]) == 0
     gc.collect()
-    gc.freeze()  # else the collector of each forked process has all of it copied
+    gc.freeze()  # else the garbage collector of each forked process would copy all memory pages
 
 
 def judge(case: Case, folder: Path) -> Outcome:
-    """Run a case in an empty folder, in a process of its own, and judge it."""
+    """Run a case in an empty folder, in a child process, and judge it."""
     inside = folder / "case"
     inside.mkdir()
     case.write(inside)
@@ -172,7 +172,7 @@ def _wait(pid: int) -> int:
 
 
 def _child(case: Case, inside: Path, folder: Path) -> None:
-    """Be the program; never returns."""
+    """Run the program in the child process; never returns."""
     code = 99
     try:
         os.setsid()
@@ -232,9 +232,9 @@ def complaint(outcome: Outcome, inside: Path, before: Mapping[str, float]) -> st
     before : mapping
         `listing` of it before.
     """
-    # what a busy machine makes gmsh take long for
+    # without reports of gmsh's progress, which depend on the load of the machine
     lines = [line for line in outcome.err.splitlines() if not line.endswith(" s so far")]
-    ours = _said(lines)
+    ours = _report_lines(lines)
     if outcome.code < 0:
         return f"ended by {signal.Signals(-outcome.code).name}"
     if outcome.code not in (0, 2, 3):
@@ -287,7 +287,7 @@ def _unreadable(out: Path) -> str:
 
 
 def listing(folder: Path) -> dict[str, float]:
-    """When each file of a folder was changed."""
+    """Times of the last modification of all files of a folder."""
     return {
         str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()
     }

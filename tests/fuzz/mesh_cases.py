@@ -1,4 +1,4 @@
-"""Meshes: .obj, .msh of both formats in text and binary, .geo, and what mutation makes of them."""
+"""Cases with mutated meshes: .obj, .msh of both formats in text and binary, .geo."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Draw = Any
 
 
 def _rows(binary: bool, *rows: Any) -> bytes:
-    """Rows of numbers, each behind its format for `struct`."""
+    """Rows as bytes; each row is a format for `struct`, followed by numbers."""
     if binary:
         return b"".join(struct.pack(f"<{form}", *numbers) for form, *numbers in rows) + b"\n"
     return "".join(" ".join(map(str, numbers)) + "\n" for _, *numbers in rows).encode()
@@ -61,7 +61,7 @@ def msh_2(*, binary: bool) -> bytes:
 def msh_4(*, binary: bool) -> bytes:
     """The sheet in format 4.1."""
     n, curve, surface = len(POINTS), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, 0.1)
-    places = [*(("Q", tag) for tag in range(1, n + 1)), *(("3d", *point) for point in POINTS)]
+    nodes = [*(("Q", tag) for tag in range(1, n + 1)), *(("3d", *point) for point in POINTS)]
     edges = [("3Q", i, *edge) for i, edge in enumerate(EDGES, 1)]
     faces = [("4Q", i, *triangle) for i, triangle in enumerate(TRIANGLES, 3)]
     sections: dict[str, list[Any]] = {
@@ -70,7 +70,7 @@ def msh_4(*, binary: bool) -> bytes:
             ("i6dQiQ", 1, *curve, 1, 7, 0),
             ("i6dQiQi", 1, *surface, 1, 3, 1, 1),
         ],
-        "Nodes": [("4Q", 1, n, 1, n), ("3iQ", 2, 1, 0, n), *places],
+        "Nodes": [("4Q", 1, n, 1, n), ("3iQ", 2, 1, 0, n), *nodes],
         "Elements": [("4Q", 2, 6, 1, 6), ("3iQ", 1, 1, 1, 2), *edges, ("3iQ", 2, 1, 2, 4), *faces],
     }
     return _msh("4.1", binary, {name: _rows(binary, *rows) for name, rows in sections.items()})
@@ -203,7 +203,7 @@ def _scene(draw: Draw, name: str) -> bytes:
 
 
 def _with_odd_words(draw: Draw, data: bytes) -> bytes:
-    """Text with one to three of its words replaced."""
+    """Text in which one to three words are replaced."""
     lines = data.split(b"\n")
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, len(lines) - 1))
@@ -215,7 +215,7 @@ def _with_odd_words(draw: Draw, data: bytes) -> bytes:
 
 
 def _with_odd_bytes(draw: Draw, data: bytes) -> bytes:
-    """Binary with one to three places overwritten by a number that a C program might write there."""
+    """Binary data in which one to three numbers are overwritten by other numbers."""
     content = bytearray(data)
     for _ in range(draw(st.integers(1, 3))):
         form = draw(st.sampled_from("iqd"))
@@ -232,7 +232,7 @@ def _with_odd_bytes(draw: Draw, data: bytes) -> bytes:
 
 @st.composite
 def mesh_cases(draw: Draw) -> Case:
-    """A small scene of a mutated .obj or .msh."""
+    """A small scene with a mutated .obj or .msh."""
     form = draw(st.sampled_from(["obj", "msh2-text", "msh2-binary", "msh4-text", "msh4-binary"]))
     binary = form.endswith("binary")
     data = {"o": OBJ, "2": msh_2(binary=binary), "4": msh_4(binary=binary)}[
@@ -251,7 +251,7 @@ def mesh_cases(draw: Draw) -> Case:
 
 @st.composite
 def geo_cases(draw: Draw) -> Case:
-    """A small scene of a mutated .geo."""
+    """A small scene with a mutated .geo."""
     data = GEO
     for _ in range(draw(st.integers(0, 2))):
         lines = data.split(b"\n")

@@ -1,4 +1,4 @@
-"""Odd values as a YAML file might hold them, and numbers of every size."""
+"""Unusual values in YAML, and numbers of all magnitudes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 
 class Raw(str):
-    """A piece of YAML that is written as it stands."""
+    """A piece of YAML that is written unchanged."""
 
 
 def listed(text: str) -> list[str]:
-    """The pieces of a text between white space."""
+    """The words of a text."""
     return text.split()
 
 
@@ -95,32 +95,32 @@ BLOCKS = [
 
 
 def raw(pieces: list[str]) -> st.SearchStrategy[Any]:
-    """One of the pieces, to be written as it stands."""
+    """One of the pieces, to be written unchanged."""
     return st.sampled_from([Raw(piece) for piece in pieces])
 
 
 def anything() -> st.SearchStrategy[Any]:
-    """A number, a word or a block that hardly fits."""
+    """An unusual number, word or block."""
     return raw(NUMBERS) | raw(WORDS) | raw(BLOCKS)
 
 
 def magnitude() -> st.SearchStrategy[float]:
-    """A positive number of any size a double has."""
+    """A positive number of any magnitude of a double."""
     return st.floats(-323.0, 308.0).map(lambda power: max(10.0**power, 5e-324))
 
 
 def rarely(odd: st.SearchStrategy[Any], else_: st.SearchStrategy[Any], one_in: int) -> st.SearchStrategy[Any]:
-    """One in so many odd values among others."""
+    """``odd`` values with probability 1/``one_in``, else others."""
     return st.integers(0, one_in - 1).flatmap(lambda which: odd if which == one_in - 1 else else_)
 
 
 def usual(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
-    """A number of a usual size; one in ``wild`` of any size."""
+    """A number between bounds; with probability 1/``wild`` of any magnitude."""
     return rarely(magnitude(), st.floats(low, high), wild)
 
 
 def signed(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
-    """The same, of either sign."""
+    """As `usual`, of either sign or zero."""
     return st.tuples(usual(low, high, wild=wild), st.sampled_from([1.0, -1.0, 0.0])).map(
         lambda pair: pair[0] * pair[1]
     )
@@ -133,17 +133,17 @@ def vector(low: float = 0.0, high: float = 10.0, *, wild: int = 10) -> st.Search
 
 @st.composite
 def sometimes(draw: Any, one_in: int, entries: dict[str, st.SearchStrategy[Any]]) -> dict[str, Any]:
-    """A block in which each entry stands once in so many times."""
+    """A block that has each entry with probability 1/``one_in``."""
     return {key: draw(value) for key, value in entries.items() if draw(st.integers(0, one_in - 1)) == 0}
 
 
 def joined(*blocks: st.SearchStrategy[dict[str, Any]]) -> st.SearchStrategy[dict[str, Any]]:
-    """A block with the entries of all of these."""
+    """A block with the entries of all ``blocks``."""
     return st.tuples(*blocks).map(lambda parts: reduce(or_, parts))
 
 
 def emit(value: Any) -> str:
-    """YAML of plain values in flow style; `Raw` pieces as they stand."""
+    """YAML of plain values in flow style; `Raw` pieces are unchanged."""
     if isinstance(value, Raw):
         return str(value)
     if isinstance(value, dict):
@@ -158,16 +158,16 @@ def emit(value: Any) -> str:
 
 
 def document(blocks: dict[str, Any]) -> str:
-    """A scene file: one top-level key a line."""
+    """Text of a scene file with one key in each line."""
     return "".join(f"{key}: {emit(value)}\n" for key, value in blocks.items())
 
 
-def places_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+def paths_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths of all entries below ``value``."""
     found = []
     entries = (
         value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     )
     for key, entry in entries:
-        found += [(*path, key), *places_of(entry, (*path, key))]
+        found += [(*path, key), *paths_of(entry, (*path, key))]
     return found

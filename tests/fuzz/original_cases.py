@@ -1,4 +1,4 @@
-"""The original program's conf.json, and what mutation makes of it."""
+"""Cases with mutated conf.json files of the original program."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
-from odd_values import Raw, joined, listed, magnitude, places_of, signed, sometimes, usual, vector
+from odd_values import Raw, joined, listed, magnitude, paths_of, signed, sometimes, usual, vector
 from scene_cases import SHEET
 from text_damage import damaged
 
@@ -82,7 +82,7 @@ ORIGINALS = joined(
         },
     ),
 )
-"""A conf.json that is meant to be sound."""
+"""A valid conf.json, if its numbers are in range."""
 
 
 @st.composite
@@ -92,7 +92,7 @@ def original_cases(draw: Draw) -> Case:
     kind = draw(st.sampled_from(["sound", "mutated", "mutated", "damaged"]))
     if kind == "mutated":
         for _ in range(draw(st.integers(1, 2))):
-            *path, last = draw(st.sampled_from(places_of(data)))
+            *path, last = draw(st.sampled_from(paths_of(data)))
             block = data
             for key in path:
                 block = block[key]

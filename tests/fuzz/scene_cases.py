@@ -1,4 +1,4 @@
-"""Scenes: sound ones of every kind, with numbers of every size, and what mutation makes of them."""
+"""Cases with valid and mutated scenes, and numbers of all magnitudes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from odd_values import (
     joined,
     listed,
     magnitude,
-    places_of,
+    paths_of,
     rarely,
     raw,
     signed,
@@ -254,7 +254,7 @@ SELDOM = sometimes(
 
 @st.composite
 def scenes(draw: Draw) -> dict[str, Any]:
-    """Blocks of a scene that is meant to be sound, numbers of any size among the usual ones."""
+    """Blocks of a valid scene, in which some numbers may be of any magnitude."""
     motions = [f"m{i}" for i in range(draw(st.integers(0, 2)))]
     blocks: dict[str, Any] = {
         "title": "fuzz",
@@ -274,13 +274,13 @@ def scenes(draw: Draw) -> dict[str, Any]:
 
 @st.composite
 def mutated(draw: Draw) -> dict[str, Any]:
-    """Blocks of a scene with one to three entries that are out of place."""
-    blocks = deepcopy(draw(scenes()))  # some of it is shared between scenes
+    """Blocks of a scene in which one to three entries are mutated."""
+    blocks = deepcopy(draw(scenes()))  # scenes share some blocks
     for _ in range(draw(st.integers(1, 3))):
-        places = places_of(blocks)
-        if not places:
+        paths = paths_of(blocks)
+        if not paths:
             break
-        *path, last = draw(st.sampled_from(places))
+        *path, last = draw(st.sampled_from(paths))
         block = blocks
         for key in path:
             block = block[key]
@@ -356,7 +356,7 @@ def nested(depth: int, form: str) -> bytes:
 
 @st.composite
 def text_bombs(draw: Draw) -> Case:
-    """Small files that grow."""
+    """Small files whose content expands."""
     which = draw(st.integers(0, 3))
     if which == 0:
         form = draw(st.sampled_from(["lists", "blocks", "merges"]))

@@ -1,6 +1,6 @@
-"""Some hundred fuzz cases, the same each time; ``scripts/fuzz.py`` runs thousands of others.
+"""Some hundred fuzz cases, always the same; ``scripts/fuzz.py`` runs thousands of others.
 
-Most run in a forked process (see ``judge``), a sample in the real program, a handful on two ranks.
+Most run in a forked process (`judge`), a sample in the program itself, and a few on two ranks.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def fresh() -> Iterator[Path]:
 
 
 def drawn(kind: str, number: int, seed: int) -> list[Case]:
-    """``number`` cases of a kind, the same for the same seed."""
+    """``number`` cases of a kind, which depend on the seed only."""
     cases: list[Case] = []
     for_each(KINDS[kind][1], number, seed, cases.append)
     return cases
@@ -46,7 +46,7 @@ def drawn(kind: str, number: int, seed: int) -> list[Case]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_case_ends_in_a_run_or_in_one_line(kind: str, tmp_path: Path) -> None:
+def test_each_case_is_a_run_or_one_line(kind: str, tmp_path: Path) -> None:
     number = CASES * KINDS[kind][0] // 100
     codes: Counter[int] = Counter()
     wrong = []
@@ -61,7 +61,7 @@ def test_each_case_ends_in_a_run_or_in_one_line(kind: str, tmp_path: Path) -> No
     assert codes.total() >= number // 2
     assert codes[2] > 0
     ran = kind in ("bombs", "scripts") or codes[0] > 0
-    assert ran, f"no case ran, of {codes}; the last one said {outcome.err[-500:]}"
+    assert ran, f"no case ran, of {codes}; the last one printed {outcome.err[-500:]}"
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_a_sample_in_the_program_itself(ranks: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["obj", "msh2", "msh2-binary", "msh4", "msh4-binary", "geo"])
-def test_the_meshes_that_are_mutated_are_sound(name: str, fresh: Path) -> None:
+def test_the_meshes_before_mutation_are_valid(name: str, fresh: Path) -> None:
     form, _, binary = name.partition("-")
     data = {"obj": OBJ, "geo": GEO}.get(form) or {"msh2": msh_2, "msh4": msh_4}[form](binary=bool(binary))
     file = f"mesh.{form[:3]}"
@@ -110,13 +110,13 @@ def test_the_meshes_that_are_mutated_are_sound(name: str, fresh: Path) -> None:
         (b"a: !!python/object/apply:os.system ['touch mark']\n", "could not determine a constructor"),
     ],
 )  # fmt: skip
-def test_small_files_do_not_grow(text: bytes, words: str, fresh: Path) -> None:
+def test_small_files_with_large_content_are_refused(text: bytes, words: str, fresh: Path) -> None:
     outcome = judge(Case("bomb", {"scene.yaml": text}), fresh)
     assert (outcome.code, outcome.complaint) == (2, ""), outcome.err
     assert words in outcome.line
 
 
-def test_what_is_wrong_is_seen(fresh: Path) -> None:
+def test_complaints(fresh: Path) -> None:
     before = listing(fresh)
     line = "lyra-petsc: scene.yaml: wrong\n"
     assert complaint(Outcome(2, "", line), fresh, before) == ""

@@ -1,4 +1,4 @@
-"""Damage to a file's bytes: flips, cuts, splices, encodings, line ends."""
+"""Mutation of the bytes of a file: changes, deletions, copies, encodings, line ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _coded(text: bytes, name: str) -> bytes:
 
 @st.composite
 def damaged(draw: Any, content: bytes) -> bytes:
-    """``content`` after one to four injuries."""
+    """``content`` after one to four mutations."""
     data = bytearray(content)
     for _ in range(draw(st.integers(1, 4))):
         size = len(data)

@@ -1,4 +1,4 @@
-"""Joining sources, transforms, orientation, and what is refused."""
+"""Joining of sources, transforms, orientation, and refused meshes."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_random_orientations_are_repaired_piece_by_piece(tmp_path: Path) -> None
 
 
 def strip(n: int, twist: float) -> str:
-    """A closed band of n quads that turns by ``twist`` half turns."""
+    """A closed band of n quads that is twisted by ``twist`` times 180°."""
     points = []
     for i in range(n):
         around, tilt = 2 * np.pi * i / n, np.pi * twist * i / n
@@ -140,7 +140,7 @@ CORNERS: list[tuple[float, float, float]] = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0
         ),
     ],
 )
-def test_what_cannot_be_simulated_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_degenerate_meshes_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         obj_mesh(tmp_path, text)
     assert caught.value.file == str(tmp_path / "mesh.obj")

@@ -1,4 +1,4 @@
-"""Distribution: every vertex owned once, every element where it is needed and counted once."""
+"""Distribution: each vertex has one owner; each element is on all ranks that need it, and counted on one."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_every_vertex_has_one_owner_and_contiguous_numbers(
     np.testing.assert_array_equal(part.vertex_data["number"], points.mesh_vertices)
 
 
-def test_a_rank_has_every_element_that_touches_what_it_owns(
+def test_a_rank_has_every_element_that_couples_its_rows(
     comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
 ) -> None:
     triangles, n_vertices = mesh
@@ -83,7 +83,7 @@ def test_a_rank_has_every_element_that_touches_what_it_owns(
     for name, elements in part.elements.items():
         expected = np.flatnonzero(mine[whole.elements[name].stencil].any(axis=1))
         np.testing.assert_array_equal(np.sort(elements.index), expected)
-        # local numbers lead back to the vertices of the mesh, in the same order within the element
+        # local numbers mean the same vertices of the mesh, in the same order within the element
         back = numbers[part.layout.global_number[elements.stencil]]
         np.testing.assert_array_equal(back, whole.elements[name].stencil[elements.index])
         if "number" in elements.data:
@@ -99,10 +99,10 @@ def test_every_element_is_counted_on_one_rank(
         np.testing.assert_array_equal(np.sort(counted), np.arange(len(whole.elements[name].stencil)))
 
 
-def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Comm, part: LocalMesh) -> None:
+def test_ghosts_are_coupled_rows_with_the_values_of_their_owners(comm: MPI.Comm, part: LocalMesh) -> None:
     points = part.layout
-    touched = np.unique(np.concatenate([e.stencil.ravel() for e in part.elements.values()]))
-    ghosts = touched[touched >= points.n_owned]
+    coupled = np.unique(np.concatenate([e.stencil.ravel() for e in part.elements.values()]))
+    ghosts = coupled[coupled >= points.n_owned]
     np.testing.assert_array_equal(ghosts, np.arange(points.n_owned, points.n_local))
     assert not np.any((points.ghosts >= points.start) & (points.ghosts < points.start + points.n_owned))
     values = np.full((points.n_local, 3), np.nan)
@@ -112,7 +112,7 @@ def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Co
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_owners_get_the_sum_of_what_ranks_have(comm: MPI.Comm, part: LocalMesh, kind: type) -> None:
+def test_owners_get_the_sum_over_ranks(comm: MPI.Comm, part: LocalMesh, kind: type) -> None:
     points = part.layout
     values = np.ones((points.n_local, 3), dtype=kind)
     values[:, 1] = comm.rank
@@ -132,7 +132,7 @@ def test_a_large_mesh_is_cut_evenly_with_few_ghosts(comm: MPI.Comm) -> None:
     part = distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)
     sizes = comm.allgather(part.layout.n_owned)
     assert max(sizes) <= 1.15 * mesh[1] / comm.size
-    # a straight cut has 41 vertices a side, hinges reach one row further
+    # a straight cut has 41 vertices on each side; hinges couple one row more
     assert len(part.layout.ghosts) <= (0 if comm.size == 1 else 4 * 41)
 
 
@@ -145,21 +145,21 @@ def layers() -> GlobalMesh:
     return whole
 
 
-def test_sheets_that_lie_on_each_other_are_cut_through_all(comm: MPI.Comm) -> None:
+def test_each_rank_has_an_equal_part_of_all_layers(comm: MPI.Comm) -> None:
     part = distribute(comm, layers() if comm.rank == 0 else None)
     layer = part.layout.mesh_vertices // 169
-    share = np.bincount(layer, minlength=4) / 169.0
-    assert np.abs(share - 1.0 / comm.size).max() < 13.0 / 169.0  # to a row of vertices
+    fraction = np.bincount(layer, minlength=4) / 169.0
+    assert np.abs(fraction - 1.0 / comm.size).max() < 13.0 / 169.0  # within a row of vertices
 
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("ranks", [2, 3, 7])
 def test_bisection_is_even_and_across_the_longest_side(ranks: int) -> None:
-    places = np.random.default_rng(1).random((1001, 3)) * [1.0, 40.0, 0.1]
-    owner = bisection(places, ranks)
+    x = np.random.default_rng(1).random((1001, 3)) * [1.0, 40.0, 0.1]
+    owner = bisection(x, ranks)
     sizes = np.bincount(owner, minlength=ranks)
     assert sizes.max() - sizes.min() <= 2
-    along = [places[owner == rank, 1] for rank in range(ranks)]
+    along = [x[owner == rank, 1] for rank in range(ranks)]
     assert all(low.max() < high.min() for low, high in pairwise(along))
 
 
@@ -173,8 +173,8 @@ def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
         np.testing.assert_array_equal(np.sort(np.unique(owner)), np.arange(comm.size))
 
 
-def test_a_partitioner_that_petsc_has_not_is_refused(comm: MPI.Comm) -> None:
-    if comm.size == 1:  # nothing is cut, hence nothing asked for
+def test_a_partitioner_that_petsc_lacks_is_refused(comm: MPI.Comm) -> None:
+    if comm.size == 1:  # one rank needs no partitioner
         return
     PETSc.Options()["mat_partitioning_type"] = "scissors"
     with pytest.raises(InputError, match="scissors"):
@@ -183,11 +183,11 @@ def test_a_partitioner_that_petsc_has_not_is_refused(comm: MPI.Comm) -> None:
 
 def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:
     rng = np.random.default_rng(1)
-    names = rng.permutation(200)  # a path whose vertices are numbered at random
-    graph = vertex_graph([np.column_stack([names[:-1], names[1:]])], 200)
+    path = rng.permutation(200)  # vertices with random numbers
+    graph = vertex_graph([np.column_stack([path[:-1], path[1:]])], 200)
     position = locality_order(graph)
     np.testing.assert_array_equal(np.sort(position), np.arange(200))
-    assert np.abs(np.diff(position[names])).max() == 1
+    assert np.abs(np.diff(position[path])).max() == 1
 
 
 def test_numbering_is_by_owner_then_by_position() -> None:
@@ -199,7 +199,7 @@ def test_numbering_is_by_owner_then_by_position() -> None:
 def test_split_counts_an_element_where_its_first_point_is_owned() -> None:
     split = split_elements(np.array([[0, 1], [1, 0], [2, 2]]), 4)
     assert [(sorted(index), n) for index, n in split] == [([0, 1], 1), ([0, 1], 1), ([2], 1), ([], 0)]
-    assert split[1][0][0] == 1  # what a rank counts comes first
+    assert split[1][0][0] == 1  # counted elements come first
 
 
 def with_edges(triangles: Ints, n_vertices: int) -> GlobalMesh:
@@ -225,24 +225,24 @@ def test_rows_of_vertices_and_of_edges(comm: MPI.Comm, mesh: tuple[Ints, int], m
     assert indices is not None
     n_edges = len(np.unique(indices))
     assert (layout.n_vertices_global, layout.n_edges_global) == (mesh[1], n_edges)
-    # every vertex, and every edge that carries an unknown, once
+    # every vertex, and every edge with an unknown, once
     for own, count in ((layout.mesh_vertices, mesh[1]), (layout.edges, n_edges)):
         np.testing.assert_array_equal(np.sort(np.concatenate(comm.allgather(own))), np.arange(count))
     assert layout.n_owned == layout.n_vertices + -(-layout.n_edges // 3)
-    # a rank's rows are contiguous: its vertices, its edges, and what is left of the last row
+    # a rank's unknowns are contiguous: those of its vertices, of its edges, and padding
     vertices = np.arange(3 * layout.n_vertices)
-    places = np.concatenate([vertices, layout.edge_indices, layout.padding])
-    np.testing.assert_array_equal(places, np.arange(3 * layout.n_owned))
+    indices = np.concatenate([vertices, layout.edge_indices, layout.padding])
+    np.testing.assert_array_equal(indices, np.arange(3 * layout.n_owned))
     assert len(layout.padding) < 3
     np.testing.assert_array_equal(mixed.vertex_data["number"], layout.mesh_vertices)
     numbers = np.arange(layout.n_global)
     assert np.count_nonzero(layout.are_vertices(numbers)) == mesh[1]
     own = layout.start + np.arange(layout.n_owned)
     np.testing.assert_array_equal(layout.are_vertices(own), np.arange(layout.n_owned) < layout.n_vertices)
-    # numbered alone, vertices are contiguous on each rank too
-    alone = layout.vertex_numbers(own[: layout.n_vertices])
+    # numbers that count only vertices are contiguous on each rank, too
+    numbers = layout.vertex_numbers(own[: layout.n_vertices])
     bounds = layout.vertex_bounds
-    np.testing.assert_array_equal(alone, np.arange(bounds[comm.rank], bounds[comm.rank + 1]))
+    np.testing.assert_array_equal(numbers, np.arange(bounds[comm.rank], bounds[comm.rank + 1]))
     np.testing.assert_array_equal(layout.local(layout.global_number), np.arange(layout.n_local))
 
 
@@ -254,7 +254,7 @@ def test_elements_find_the_unknowns_of_their_edges(
     assert indices is not None
     assert whole.edges is not None
     carrying = np.unique(indices)
-    # every row holds what it stands for: a vertex its number in the mesh, an edge its index
+    # the value of a vertex is its number in the mesh, the value of an edge its index
     vertices = np.repeat(layout.mesh_vertices[:, None], 3, axis=1).astype(float)
     owned = layout.join(vertices, carrying[layout.edges].astype(float))
     found = layout.split(owned)
@@ -296,7 +296,7 @@ def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: LocalM
 
 
 def test_points_in_any_order_are_exchanged(comm: MPI.Comm) -> None:
-    # a ring of points dealt out to the ranks; each rank sees the next rank's last two, the last one first
+    # a ring of points; the ghosts of each rank are the last two points of the next rank, in reverse order
     n = 4 * comm.size
     numbering = Numbering.build(np.arange(n) // 4, np.arange(n), comm.size)
     after = 4 * ((comm.rank + 1) % comm.size)

@@ -1,4 +1,4 @@
-"""gmsh scripts: meshing, sizes, errors, and what gmsh must not leave behind."""
+"""gmsh scripts: meshing, sizes, errors, and side effects of gmsh."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_shipped_meshes(name: str, spans: tuple[float, ...] | None, groups: dict
     assert (longest**2 < 16 * 4 / np.sqrt(3) * rest_areas(mesh)).all()
 
 
-def test_flag_lies_where_the_scene_expects_it() -> None:
+def test_position_of_the_flag() -> None:
     mesh = mesh_of(MESHES / "flag.geo")
     assert 2000 < mesh.n_triangles < 2500
     assert mesh.positions[mesh.groups["tip"].vertices].tolist() == [[1.5, 0, 1]]
@@ -90,14 +90,14 @@ def test_size_overrides_the_script(script: Path, size: float, options: str) -> N
     assert mesh.notes == []
 
 
-def test_fixed_divisions_win_and_are_told(script: Path) -> None:
+def test_fixed_divisions_stay_with_a_note(script: Path) -> None:
     script.write_text(SQUARE + "Transfinite Curve {1, 2, 3, 4} = 3; Transfinite Surface {1};\n")
     (note,) = mesh_of(script, size=0.05).notes
     assert "fixes its divisions" in note
 
 
-def test_a_last_line_counts_however_it_ends(script: Path) -> None:
-    """gmsh on its own leaves it out without a word."""
+def test_a_last_line_without_newline_counts(script: Path) -> None:
+    """gmsh by itself ignores it silently."""
     script.write_text(SQUARE + 'Physical Surface("square") = {1}; Physical Curve("west") = {4};')
     assert set(mesh_of(script).groups) == {"west", "square"}
 
@@ -158,7 +158,7 @@ def test_quiet_and_without_traces(script: Path, capfd: pytest.CaptureFixture[str
         assert not gmsh.isInitialized()
 
 
-def test_another_algorithm_only_where_one_is_asked_for(script: Path) -> None:
+def test_another_algorithm_on_request_only(script: Path) -> None:
     script.write_text(SQUARE + "Mesh.Algorithm = 5;\n")
     own, same = mesh_of(script, size=0.1), mesh_of(script, size=0.1, algorithm="delaunay")
     assert np.array_equal(own.triangles, same.triangles)
@@ -169,14 +169,14 @@ def test_another_algorithm_only_where_one_is_asked_for(script: Path) -> None:
     assert mesh_of(script).n_triangles <= mesh_of(script, algorithm="mesh-adapt").n_triangles + 4
 
 
-def test_it_is_said_what_gmsh_does_where_it_takes_long(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_of_gmsh_is_reported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(geo_file, "FIRST_REPORT", 0.01)
     monkeypatch.setattr(geo_file, "MAX_INTERVAL", 0.1)
     script.write_text(SQUARE)
-    said: list[str] = []
-    geo_file.mesh_geo(script, 0.006, report=said.append)
-    assert said[0].startswith("script.geo: gmsh is ")
-    assert any("gmsh is meshing, roughly 60,000 triangles, " in line for line in said)
+    lines: list[str] = []
+    geo_file.mesh_geo(script, 0.006, report=lines.append)
+    assert lines[0].startswith("script.geo: gmsh is ")
+    assert any("gmsh is meshing, roughly 60,000 triangles, " in line for line in lines)
 
 
 def test_same_mesh_every_time(script: Path) -> None:
@@ -187,7 +187,7 @@ def test_same_mesh_every_time(script: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(gmsh, "isInitialized"), reason="gmsh cannot tell before 4.9")
-def test_a_session_of_the_caller_goes_on(script: Path) -> None:
+def test_a_gmsh_session_of_the_caller_continues(script: Path) -> None:
     script.write_text(SQUARE)
     gmsh.initialize(readConfigFiles=False)
     try:
@@ -199,18 +199,18 @@ def test_a_session_of_the_caller_goes_on(script: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fake", "words"),
+    ("fake", "message"),
     [
         ("raise ImportError('no library')", r"need gmsh \(no library\)"),
         ("def initialize(**_): raise AttributeError('undefined symbol')", r"start \(undefined symbol\)"),
     ],
 )
-def test_a_gmsh_that_does_not_start_is_told(
-    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: str, words: str
+def test_a_gmsh_that_does_not_start_is_reported(
+    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: str, message: str
 ) -> None:
     (tmp_path / "fake").mkdir()
     (tmp_path / "fake" / "gmsh.py").write_text(fake)
     script.write_text(SQUARE)
     monkeypatch.syspath_prepend(tmp_path / "fake")
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         mesh_of(script)

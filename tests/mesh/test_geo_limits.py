@@ -1,4 +1,4 @@
-"""A .geo is a program: what it may not do, and how one that does not end is ended."""
+"""A .geo is a program: refused statements, the sandbox, and limits on time and memory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def meshed(folder: Path, text: str, **options: object) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ('SystemCall "touch mark";', "line 5: 'SystemCall' starts other programs"),
         ('\n\n  SystemCall\n"touch mark";', "line 7: 'SystemCall'"),
@@ -67,7 +67,7 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         ('Merge "part.gz";', "'Merge' of 'part.gz'"),
         ('Include StrCat("a", ".geo");', "name in quotes"),
         ('name = "part.geo"; Include name;', "name in quotes"),
-        # words that are on no list, and names that gmsh would find in a text
+        # words that are on no list, and names that gmsh takes from a text
         ('PoolAcid "touch mark";', "line 5: 'PoolAcid' is no statement that is known here"),
         ('x = 1; x "touch mark";', "line 5: 'x' is no statement"),
         ('SystemCall = 1; SystemCall "touch mark";', "'SystemCall' starts other programs"),
@@ -80,7 +80,7 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         ("General.SaveOptions = 1;", "'SaveOptions' is no option"),
         ('Geometry.DoubleClickedPointCommand = "touch mark";', "'DoubleClickedPointCommand' is no option"),
         ("Mesh.EndIf = 1;", "'EndIf' is no option"),
-        ("Mesh.None = 1;", "Mesh.None"),  # gmsh's own words
+        ("Mesh.None = 1;", "Mesh.None"),  # in gmsh's message
         ('PostProcessing.GraphPointCommand = "touch mark";', "'PostProcessing'"),
         ('DefineConstant[ a = {1, GmshOption "Solver.Executable0"} ];', "'GmshOption'"),
         ('DefineConstant[ a = {1, Macro "touch"} ];', "'Macro' must be followed by a name"),
@@ -92,7 +92,7 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         ('Save View[0] "mark";', "'Save' writes files"),
         ("a = 1 @ 2;", "'@' has no meaning"),
         ('a = "touch', "a text in quotes does not end"),
-        # where gmsh skips and jumps it takes quotes otherwise than they look
+        # at jumps gmsh does not recognise quotes
         ('If (0)\n" EndIf SystemCall "touch mark"; "\nEndIf', "line 6: 'EndIf' stands in a quoted text"),
         ('If (0) E" EndIf SystemCall "touch mark"; //"\nEndIf', "line 5: 'EndIf' stands in a quoted text"),
         ('If (0) E// EndIf SystemCall\n"touch mark";\nEndIf', "line 5: 'E'"),
@@ -101,7 +101,7 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         (f"For i In {{0:1}}\n{'a = 1; ' * 800}\nEndFor", "line 6: 5600 characters"),
         (f'a = "{"a" * 1100}"; //', "a text of 1102 characters"),
         ("// \0 hidden", "no text file"),
-        # formats, by which gmsh would write over its own memory
+        # formats with which gmsh would write to arbitrary memory
         ('Printf("%n%n%n");', "line 5: a '%' in a text of 'Printf' must begin the format of a number"),
         ('Error("%s%s%s%n");', "a '%' in a text of 'Error'"),
         ('Printf("%999999999g", 1);', "a '%' in a text of 'Printf'"),
@@ -113,11 +113,11 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         (f"{'a' * 1500} = 1;", "line 5: a name of 1500 characters"),
     ],
 )
-def test_refused_with_line_and_command(tmp_path: Path, text: str, words: str) -> None:
-    assert words in meshed(tmp_path, text + "\n")
+def test_refused_with_line_and_command(tmp_path: Path, text: str, message: str) -> None:
+    assert message in meshed(tmp_path, text + "\n")
 
 
-def test_what_is_included_is_checked_alike_and_told(tmp_path: Path) -> None:
+def test_included_files_are_checked_with_a_note(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     part = tmp_path / "parts" / "part.geo"
     part.write_text('// one\nSystemCall "touch mark";\n')
@@ -132,7 +132,7 @@ def test_what_is_included_is_checked_alike_and_told(tmp_path: Path) -> None:
     assert "script.geo: the script includes part.geo" in mesh.notes
 
 
-def test_the_options_that_gmsh_reads_beside_a_file_are_checked_alike(tmp_path: Path) -> None:
+def test_option_files_beside_scripts_are_checked(tmp_path: Path) -> None:
     (tmp_path / "script.geo.opt").write_text('SystemCall "touch mark";\n')
     assert "line 1: 'SystemCall'" in meshed(tmp_path, "")
 
@@ -166,14 +166,14 @@ def test_words_that_only_look_like_commands_are_allowed(tmp_path: Path, text: st
     assert [path.name for path in tmp_path.iterdir()] == ["script.geo"]
 
 
-# -- files that are not what they are called ---------------------------------------------------------
+# -- files whose content does not fit their ending ------------------------------------------------------
 
 CALL = 'SystemCall "touch mark";\n'
 MSH = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
+    ("name", "content", "message"),
     [
         ("x.msh", CALL, "x.msh: line 1: 'SystemCall'"),
         ("X.MSH", CALL, "X.MSH: line 1: 'SystemCall'"),
@@ -196,19 +196,19 @@ MSH = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
         ("x.msh", "\x1f\x8b\x08\x00 zipped", "line 1: is no text file"),
     ],
 )
-def test_what_is_merged_is_recognised_by_its_content(
-    tmp_path: Path, name: str, content: str, words: str
+def test_merged_files_are_recognised_by_their_content(
+    tmp_path: Path, name: str, content: str, message: str
 ) -> None:
     (tmp_path / name).write_text(content, encoding="latin-1")
     script = tmp_path / "script.geo"
     script.write_text(f'{SQUARE}Merge "{name}";\n')
     with pytest.raises(InputError) as caught:
         mesh_of(script)
-    assert words in str(caught.value)
+    assert message in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["script.geo", name])
 
 
-def test_what_is_included_is_a_script_whatever_it_begins_with(tmp_path: Path) -> None:
+def test_included_files_are_always_scripts(tmp_path: Path) -> None:
     (tmp_path / "x.geo").write_text(MSH + CALL)
     assert "line 1: '$'" in meshed(tmp_path, 'Include "x.geo";\n')
     assert "line 1: '$'" in meshed(tmp_path, 'Merge "x.geo"; Include "x.geo";\n')
@@ -220,7 +220,7 @@ def test_what_is_included_is_a_script_whatever_it_begins_with(tmp_path: Path) ->
     assert "sheet" in mesh_of(tmp_path / "script.geo").groups
 
 
-def test_a_trusted_script_may_say_what_it_likes_within_what_the_kernel_lets_it(tmp_path: Path) -> None:
+def test_trusted_scripts_are_limited_by_the_sandbox_only(tmp_path: Path) -> None:
     script = tmp_path / "script.geo"
     script.write_text(f'{SQUARE}a = Str("x");\nPrintf("note") > "mark";\nSystemCall "touch called";\n')
     with pytest.raises(InputError, match="writes files"):
@@ -234,18 +234,18 @@ def test_a_trusted_script_may_say_what_it_likes_within_what_the_kernel_lets_it(t
     assert len(geo.mesh_geo(script, 0.3, trusted=True).triangles) > 10
 
 
-# -- what the kernel holds back ----------------------------------------------------------------------
+# -- the sandbox of the kernel -----------------------------------------------------------------------
 
 ATTEMPTS = """
 import os, resource, socket, subprocess, sys, threading
 from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
 written = open("before", "w")
-stands = enter_sandbox([os.getcwd(), "/usr", sys.prefix])
+layers = enter_sandbox([os.getcwd(), "/usr", sys.prefix])
 def outcome(work):
     try:
         return work()
     except OSError:
-        return "held"
+        return "refused"
 thread = threading.Thread(target=lambda: print("thread"))
 thread.start()
 thread.join()
@@ -262,15 +262,15 @@ for name, work in {
 }.items():
     print(name, outcome(work))
 print("system", os.system("touch mark") != 0)
-print("outside", outcome(lambda: open("/etc/passwd")) == "held", "Landlock" in stands)
+print("outside", outcome(lambda: open("/etc/passwd")) == "refused", "Landlock" in layers)
 written.write("still open")
 """
 
 
 @pytest.mark.skipif("seccomp" not in supported_layers(), reason="the kernel has no seccomp for us")
-def test_the_kernel_holds_back_what_gmsh_does_not_need(tmp_path: Path) -> None:
+def test_the_sandbox_refuses_what_gmsh_does_not_need(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", ATTEMPTS],
         cwd=tmp_path,
         env=environment,
@@ -278,10 +278,10 @@ def test_the_kernel_holds_back_what_gmsh_does_not_need(tmp_path: Path) -> None:
         text=True,
         timeout=60,
     )
-    *attempts, system, outside = told.stdout.splitlines()
-    assert attempts.pop(0) == "thread", told.stderr
+    *attempts, system, outside = done.stdout.splitlines()
+    assert attempts.pop(0) == "thread", done.stderr
     assert len(attempts) == 16
-    assert [line for line in attempts if not line.endswith(" held")] == []
+    assert [line for line in attempts if not line.endswith(" refused")] == []
     assert system == "system True"
     assert outside in ("outside True True", "outside False False")
     assert (tmp_path / "before").read_text() == "still open"
@@ -289,18 +289,18 @@ def test_the_kernel_holds_back_what_gmsh_does_not_need(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("For i In {0:1e15}\na = i;\nEndFor\n", "did not finish reading the script in 1 s"),
         ("Macro f\nCall f;\nReturn\nCall f;\n", ""),
         ('Include "script.geo";\n', ""),
     ],
 )
-def test_scripts_that_do_not_end_are_ended(
-    tmp_path: Path, text: str, words: str, monkeypatch: pytest.MonkeyPatch
+def test_endless_scripts_are_stopped(
+    tmp_path: Path, text: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(geo, "SCRIPT_SECONDS", 1)
-    assert words in meshed(tmp_path, text)
+    assert message in meshed(tmp_path, text)
 
 
 def test_meshes_larger_than_memory_are_refused_with_their_size(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Built-in grids: order, patterns, groups."""
+"""Grids: order of vertices, patterns, groups."""
 
 from __future__ import annotations
 

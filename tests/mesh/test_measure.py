@@ -1,4 +1,4 @@
-"""Areas, rest matrices and the layout of curved surfaces."""
+"""Areas, rest matrices and coordinates in the planes of triangles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_rest_matrices_recover_the_deformation_gradient() -> None:
 
 def test_warp_turns_anticlockwise() -> None:
     mesh = grid_mesh(nx=1, ny=1)
-    # cloth stretched by 2 along y: the warp at 90° to x feels it as its own stretch
+    # stretch by 2 along y: with the warp at 90° to x it is a stretch along the warp
     x = mesh.rest * [1, 2, 1]
     corners = x[mesh.triangles]
     sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
@@ -61,19 +61,19 @@ def test_clockwise_sheet_keeps_its_material_axes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degrees", [0, 20, 45, 80, 90, 135, 180])
-def test_layout_of_a_turned_sheet_keeps_its_metric(degrees: float) -> None:
+def test_plane_coordinates_of_a_rotated_sheet_keep_lengths(degrees: float) -> None:
     flat = grid_mesh(nx=3, ny=2)
     mesh = grid_mesh(Transform(rotate=turn((0.3, -1, 0.2), degrees)), nx=3, ny=2)
     uv = plane_coordinates(mesh.positions, mesh.triangles)
     lengths = [np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) for c in (uv, flat.triangle_uv)]
     assert np.allclose(*lengths)
-    # continuous over a flat sheet: each vertex has one place
-    place = np.empty((mesh.n_vertices, 2))
-    place[mesh.triangles] = uv
-    assert np.allclose(place[mesh.triangles], uv)
+    # continuous on a flat sheet: the corners at a vertex have the same coordinates
+    of_vertex = np.empty((mesh.n_vertices, 2))
+    of_vertex[mesh.triangles] = uv
+    assert np.allclose(of_vertex[mesh.triangles], uv)
 
 
-def test_layout_axes() -> None:
+def test_axes_of_plane_coordinates() -> None:
     triangle = np.array([[0, 1, 2]])
     upright = plane_coordinates(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), triangle)
     assert upright[0].tolist() == [[0, 0], [1, 0], [0, 1]]

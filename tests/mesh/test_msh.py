@@ -1,4 +1,4 @@
-"""The .msh reader: both formats, ASCII and binary, on files that gmsh wrote and on hand-made ones."""
+"""The .msh reader: both formats, ASCII and binary, with files of gmsh and handwritten ones."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_groups_and_node_order(
     mesh = mesh_of(file)
     assert mesh.notes == []
     assert rest_areas(mesh).sum() == pytest.approx(2.0)
-    assert np.allclose(mesh.positions, coordinates.reshape(-1, 3))  # this writer keeps the order of its nodes
+    assert np.allclose(mesh.positions, coordinates.reshape(-1, 3))  # gmsh writes its order of nodes
     assert len(tags) == mesh.n_vertices
     groups = mesh.groups
     assert sorted(groups) == ["7", "both", "east", "ends", "far corners"]
@@ -95,7 +95,7 @@ def test_quads_and_second_order(
 
 
 @pytest.mark.parametrize(("version", "binary"), FORMATS)
-def test_cut_short_anywhere(
+def test_truncated_files_are_refused(
     tmp_path: Path, two_squares: Callable[..., None], version: float, binary: int
 ) -> None:
     whole, part = tmp_path / "whole.msh", tmp_path / "part.msh"
@@ -130,7 +130,7 @@ def test_shuffled_tags_keep_file_order_and_loose_nodes_are_dropped(tmp_path: Pat
     assert mesh.notes == ["shuffled.msh: 1 node that is in no triangle dropped (tag 99)"]
 
 
-def test_one_name_for_two_dimensions_is_told(tmp_path: Path) -> None:
+def test_one_name_for_two_dimensions_gives_a_note(tmp_path: Path) -> None:
     file = tmp_path / "clash.msh"
     file.write_text(ascii_2(NODES, "1 1 2 5 1 40 7;2 2 2 5 1 40 7 3;3 2 2 5 1 40 3 12"))
     mesh = mesh_of(file)
@@ -173,7 +173,7 @@ def test_refused(tmp_path: Path, text: str, message: str) -> None:
     assert caught.value.file == str(file)
 
 
-def test_names_hold_nothing_that_steers_a_terminal(tmp_path: Path) -> None:
+def test_control_characters_in_names_are_replaced(tmp_path: Path) -> None:
     file = tmp_path / "mesh.msh"
     file.write_bytes(
         b'$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n2 3 "a\0b\x1b[31m"\n$EndPhysicalNames\n'

@@ -154,7 +154,7 @@ def test_a_polygon_of_many_corners_is_refused(tmp_path: Path) -> None:
         obj_mesh(tmp_path, ring + f"f {' '.join(map(str, range(1, 258)))}\n")
 
 
-def test_names_hold_nothing_that_steers_a_terminal(tmp_path: Path) -> None:
+def test_control_characters_in_names_are_replaced(tmp_path: Path) -> None:
     mesh = obj_mesh(tmp_path, SQUARE + "g \x1b[31mred\n\x1bword 1\nf 1 2 3\nf 1 3 4\n")
     assert list(mesh.groups) == ["\N{REPLACEMENT CHARACTER}[31mred"]
     assert all(note.isprintable() for note in mesh.notes)

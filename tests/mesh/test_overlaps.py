@@ -1,4 +1,4 @@
-"""What of a sheet is in an obstacle, against points drawn within triangles and by hand."""
+"""Overlaps of sheets with obstacles, compared with points sampled in triangles and with handmade cases."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def counts(found: Overlaps) -> tuple[int, int, int]:
     return len(found.vertices), len(found.edges), len(found.triangles)
 
 
-def turned() -> np.ndarray:
+def rotation() -> np.ndarray:
     axes, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
     return np.asarray(axes * np.linalg.det(axes))
 
 
 def cloud(triangle: np.ndarray, n: int = 40) -> np.ndarray:
-    """Points of a triangle on a lattice, its edges and corners included."""
+    """Points of a triangle on a lattice, including its edges and corners."""
     i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     i, j = i[i + j <= n] / n, j[i + j <= n] / n
     return np.asarray(
@@ -34,33 +34,33 @@ def cloud(triangle: np.ndarray, n: int = 40) -> np.ndarray:
     )
 
 
-def from_axis(points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def axis_distance(points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     along = axis[-1] - axis[0]
     square = along @ along
-    share = np.clip((points - axis[0]) @ along / square, 0, 1) if square else np.zeros(len(points))
-    return np.asarray(np.linalg.norm(points - axis[0] - np.outer(share, along), axis=1))
+    s = np.clip((points - axis[0]) @ along / square, 0, 1) if square else np.zeros(len(points))
+    return np.asarray(np.linalg.norm(points - axis[0] - np.outer(s, along), axis=1))
 
 
 def compare(
     found: Overlaps, points: np.ndarray, triangles: np.ndarray, depth: Callable, slack: float = 0.1
 ) -> np.ndarray:
-    """Hold it against the greatest ``depth`` of points within each simplex, where that is not −slack to 0.
+    """Compare overlaps with the largest ``depth`` of points of each simplex; both are right from −slack to 0.
 
-    Returns for vertices, edges and triangles how many are in, and how many are not.
+    Returns (3, 2), for vertices, edges and triangles, the number that overlap and the number that do not.
     """
     edges = unique_edges(triangles)
     in_edges = (edges[:, None] == found.edges[None]).all(axis=2).any(axis=1)
-    judged = []
-    for corners, told in (
+    numbers = []
+    for corners, overlap in (
         (np.arange(len(points))[:, None].repeat(3, 1), np.isin(np.arange(len(points)), found.vertices)),
         (edges[:, [0, 1, 1]], in_edges),
         (triangles, np.isin(np.arange(len(triangles)), found.triangles)),
     ):
         deepest = np.array([depth(cloud(points[row])).max() for row in corners])
-        assert told[deepest > 1e-9].all()
-        assert not told[deepest < -slack].any()
-        judged.append([(deepest > 1e-9).sum(), (deepest < -slack).sum()])
-    return np.array(judged)
+        assert overlap[deepest > 1e-9].all()
+        assert not overlap[deepest < -slack].any()
+        numbers.append([(deepest > 1e-9).sum(), (deepest < -slack).sum()])
+    return np.array(numbers)
 
 
 def scattered(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,36 +71,36 @@ def scattered(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("axis", [[[0.1, 0.2, 0.3]], [[-1.0, 0, 0], [1, 0.5, 0.2]]])
 def test_balls_and_capsules_against_points_within_triangles(axis: list[list[float]]) -> None:
     ends = np.array(axis)
-    judged = np.zeros((2, 3, 2))
+    numbers = np.zeros((2, 3, 2))
     for seed in range(2):
         points, triangles = scattered(seed, 1.0)
         found = inside_ball(points, triangles, ends, 0.4)
-        judged[0] += compare(found, points, triangles, lambda x: 0.4 - from_axis(x, ends))
+        numbers[0] += compare(found, points, triangles, lambda x: 0.4 - axis_distance(x, ends))
         found = outside_ball(points, triangles, ends, 1.8)
-        judged[1] += compare(found, points, triangles, lambda x: from_axis(x, ends) - 1.8)
-    assert (judged > 1).all()
+        numbers[1] += compare(found, points, triangles, lambda x: axis_distance(x, ends) - 1.8)
+    assert (numbers > 1).all()
 
 
 def test_boxes_against_points_within_triangles() -> None:
-    size, shift, turn = np.array([1.5, 0.8, 1.0]), np.array([0.3, -0.2, 0.1]), turned()
+    size, shift, turn = np.array([1.5, 0.8, 1.0]), np.array([0.3, -0.2, 0.1]), rotation()
     corners = (CUBE - 0.5) * size @ turn.T + shift
     on_planes, normals = corners[[0, 0, 0, 7, 7, 7]], np.concatenate([turn.T, -turn.T])
 
     def depth(x: np.ndarray) -> np.ndarray:
         return np.asarray((size / 2 - np.abs((x - shift) @ turn)).min(axis=1))
 
-    judged = np.zeros((2, 3, 2))
+    numbers = np.zeros((2, 3, 2))
     for seed in range(4):
         points, triangles = scattered(seed, 1.0)
-        judged[0] += compare(inside_box(points, triangles, corners), points, triangles, depth)
+        numbers[0] += compare(inside_box(points, triangles, corners), points, triangles, depth)
         points *= 0.25
         found = behind_planes(points, triangles, on_planes, normals)
-        judged[1] += compare(found, points, triangles, lambda x: -depth(x))
-    assert (judged > 1).all()
+        numbers[1] += compare(found, points, triangles, lambda x: -depth(x))
+    assert (numbers > 1).all()
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e3])
-@pytest.mark.parametrize("turn", [np.eye(3), turned()])
+@pytest.mark.parametrize("turn", [np.eye(3), rotation()])
 def test_spheres_that_touch_and_that_do_not(turn: np.ndarray, shift: float) -> None:
     triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]]) @ turn.T + shift
     over = np.array([[0.0, 0, 1]]) @ turn.T + shift
@@ -124,7 +124,7 @@ def test_a_rod_through_the_middle_of_a_triangle() -> None:
     assert counts(inside_ball(triangle, ONE, lying, 0.5 + 1e-9)) == (0, 2, 1)
 
 
-@pytest.mark.parametrize("turn", [np.eye(3), turned()])
+@pytest.mark.parametrize("turn", [np.eye(3), rotation()])
 def test_sheets_on_and_in_a_box(turn: np.ndarray) -> None:
     box = CUBE @ turn.T + 3.0
 

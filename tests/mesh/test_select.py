@@ -1,4 +1,4 @@
-"""Selection by group, number and box."""
+"""Selection of vertices and triangles by group, number and box."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_group_nodes_and_box() -> None:
     assert select_vertices(mesh, Selector(box=box), key="h").tolist() == [1, 2, 4, 5]
 
 
-def test_box_acts_after_the_transform_and_holds_its_faces() -> None:
+def test_box_selects_by_transformed_positions_and_includes_its_faces() -> None:
     turned = Transform(rotate=turn((0, 0, 1), 30.0), translate=(0.1, 0.2, 0.3))
     mesh = grid_mesh(transform=turned, nx=3, ny=3)
     x, y, z = mesh.positions[0]

@@ -36,7 +36,7 @@ def test_euler_formula(pattern: str) -> None:
     assert 3 * mesh.n_triangles == 2 * interior + boundary
 
 
-def test_boundary_edges_run_with_their_triangle_and_close() -> None:
+def test_boundary_edges_have_the_direction_of_their_triangle_and_close() -> None:
     mesh = grid_mesh(nx=3, ny=2)
     edges, triangle, opposite = boundary_edges(mesh.triangles)
     assert sorted(edges[:, 0]) == sorted(edges[:, 1])

@@ -1,4 +1,4 @@
-"""The JSON Schema accepts every scene that the loader accepts, and refuses what it can of the others."""
+"""The JSON Schema accepts each scene that the loader accepts, and refuses others where it can."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BEYOND_SCHEMA = (
     "must be a finite number, not nan",
     "must be a direction, not a zero vector",  # of components below 1e-150
 )
-"""What compares two keys or looks beyond the file; JSON Schema takes 2.0 and 1e+160 for whole numbers."""
+"""Messages on what JSON Schema cannot express: comparisons of keys, other files; 2.0 is an integer to it."""
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +47,14 @@ def validator() -> Any:
 
 
 def with_text_keys(value: Any) -> bool:
-    """Whether a value could stand in JSON."""
+    """Whether a value has text keys only, as in JSON."""
     if isinstance(value, dict):
         return all(isinstance(key, str) and with_text_keys(entry) for key, entry in value.items())
     return all(map(with_text_keys, value)) if isinstance(value, list) else True
 
 
 def judgement(validator: Any, data: Any) -> str:
-    """``accepted``, ``refused``, ``beyond`` the schema, or in which way schema and loader differ."""
+    """``accepted``, ``refused``, ``beyond`` the schema, or a text on how schema and loader differ."""
     valid = validator.is_valid(data)
     try:
         Scene.model_validate(data)
@@ -161,7 +161,7 @@ def test_further_mistakes_are_refused(part: str, validator: Any) -> None:
 def test_schema_and_loader_agree_on_drawn_scenes(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     hypothesis = pytest.importorskip("hypothesis")
     with suppress(ImportError):
-        # it draws numbers and words from all modules that were imported before, too
+        # it also draws constants of all imported modules
         from hypothesis.internal.conjecture import providers
 
         fixed = providers.GLOBAL_CONSTANTS

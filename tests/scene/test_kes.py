@@ -1,4 +1,4 @@
-"""Friction within the fabric and numbers of KES reports, from the scene to the constants of a shell."""
+"""Internal friction and numbers of KES reports, from the scene to the constants of a shell."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_warp_and_weft() -> None:
     assert midedge.friction_moment == pytest.approx((0.03 * 9.80665e-3, 0.01 * 9.80665e-3))
 
 
-def test_it_is_scaled_as_what_it_acts_beside() -> None:
+def test_friction_is_scaled_as_bending_and_membrane() -> None:
     shell = shell_of(
         **(NUMBERS | {"membrane": NUMBERS["membrane"] | {"c33": 1.0}}),  # type: ignore[operator]
         bending=1e-5,
@@ -63,7 +63,7 @@ def test_it_is_scaled_as_what_it_acts_beside() -> None:
 @pytest.mark.parametrize(
     ("moment", "model"), [(0, "hinge"), ([0, 0], "hinge"), (1e-4, "midedge"), ([0, 1], "midedge")]
 )
-def test_friction_bends_by_directors(moment: Any, model: str) -> None:
+def test_friction_in_bending_means_midedge(moment: Any, model: str) -> None:
     membrane = NUMBERS["membrane"] | {"c33": 1.0}  # type: ignore[operator]
     scene = scene_of(
         SCENE | {"material": NUMBERS | {"membrane": membrane, "bending": 1e-5, "friction_moment": moment}}
@@ -72,7 +72,7 @@ def test_friction_bends_by_directors(moment: Any, model: str) -> None:
     assert scene_of(parse_yaml(dump_scene(scene), file=None)).material == scene.material
 
 
-def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
+def test_a_dumped_scene_is_the_same_scene(tmp_path: Any) -> None:
     scene = scene_of(SCENE | {"material": NUMBERS | {"kes": REPORT}})
     path = tmp_path / "scene.yaml"
     path.write_text(dump_scene(scene), encoding="utf-8")
@@ -82,7 +82,7 @@ def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
+    ("keys", "message"),
     [
         ({"bending": 1e-5, "kes": REPORT}, "kes has B"),
         ({"friction_moment": 1e-4, "kes": REPORT}, "kes has 2HB"),
@@ -107,6 +107,6 @@ def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
         ({"membrane": None, **SHEET, "kes": {"G": 0.1}}, "has G, which young, poisson and thickness give"),
     ],
 )
-def test_what_contradicts_is_refused(keys: dict[str, Any], words: str) -> None:
-    with pytest.raises(InputError, match=words):
+def test_contradictions_are_refused(keys: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         shell_of(**(NUMBERS | keys))

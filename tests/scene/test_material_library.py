@@ -1,4 +1,4 @@
-"""Library conventions against numbers worked out by hand from the published tables."""
+"""Conventions of the material library, compared with numbers computed by hand from the published tables."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_indefinite_cloth_is_projected() -> None:
     assert "projected" in note
 
 
-def test_projection_leaves_definite_tables_alone() -> None:
+def test_positive_definite_tables_are_not_projected() -> None:
     table = ClothTable(0.1, 3.0, -1.0, 2.0, 1.0, (4.0, 8.0, 12.0))
     material, notes = shell_of_table(table, "x")
     assert (material.c11, material.c12, material.c22, material.c33) == (6.0, -2.0, 4.0, 1.0)
@@ -104,7 +104,7 @@ def test_engineering_density_is_areal() -> None:
     assert shell(cloth="steel-sheet-500um").density == pytest.approx(7850 * 0.5e-3, rel=1e-14)
 
 
-def test_explicit_numbers_stand() -> None:
+def test_explicit_numbers_are_unchanged() -> None:
     membrane = {"c11": 120, "c22": 110, "c12": -40, "c33": 30}
     sheet = shell(density=0.2, membrane=membrane)
     assert (sheet.c11, sheet.c22, sheet.c12, sheet.c33) == (120.0, 110.0, -40.0, 30.0)
@@ -114,19 +114,19 @@ def test_explicit_numbers_stand() -> None:
 
 
 @pytest.mark.parametrize(
-    "way",
+    "keys",
     [
         {"cloth": "gray-interlock"},
         {"cloth": "pet-film-100um"},
         {"young": 1e6, "poisson": 0.3, "thickness": 1e-3, "density": 1},
         {"density": 1, "membrane": {"c11": 3, "c22": 2, "c12": 1, "c33": 1}, "bending": [1, 2, 3]},
     ],
-    ids=lambda way: next(iter(way)),
+    ids=lambda keys: next(iter(keys)),
 )
-def test_factors_act_on_every_way(way: dict[str, object]) -> None:
-    plain = shell(**way)
+def test_factors_apply_to_each_alternative(keys: dict[str, object]) -> None:
+    plain = shell(**keys)
     scaled = shell(
-        **way, density_scale=3, stretching_scale=5, bending_scale=7, thicken=2,
+        **keys, density_scale=3, stretching_scale=5, bending_scale=7, thicken=2,
         damping=0.03, warp_degrees=30, rest_curvature=[1, 2, 3],
     )  # fmt: skip
     assert scaled.density == pytest.approx(plain.density * 3 * 2, rel=1e-14)

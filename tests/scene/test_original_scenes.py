@@ -48,7 +48,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write(folder: Path, **changes: Any) -> Path:
-    """A minimal scene with ``changes``; a change to None leaves the key out."""
+    """Write a minimal scene with ``changes``; None removes a key."""
     scene: dict[str, Any] = {
         "frame_time": 0.04,
         "frame_steps": 8,
@@ -202,13 +202,13 @@ BAD = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("changes", "key", "words"), BAD, ids=[case[1] for case in BAD])
-def test_mistakes(folder: Path, changes: dict[str, Any], key: str, words: str) -> None:
+@pytest.mark.parametrize(("changes", "key", "message"), BAD, ids=[case[1] for case in BAD])
+def test_mistakes(folder: Path, changes: dict[str, Any], key: str, message: str) -> None:
     path = write(folder, **changes)
     with pytest.raises(InputError) as caught:
         load_scene(path)
     assert caught.value.key == key
-    assert words in caught.value.message
+    assert message in caught.value.message
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
 
@@ -227,13 +227,13 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(("text", "words"), BROKEN, ids=[case[0][:20] for case in BROKEN])
-def test_broken_json(tmp_path: Path, text: str, words: str) -> None:
+@pytest.mark.parametrize(("text", "message"), BROKEN, ids=[case[0][:20] for case in BROKEN])
+def test_broken_json(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "conf.json"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
         load_scene(path)
-    assert words in str(caught.value)
+    assert message in str(caught.value)
 
 
 BAD_TABLES = [
@@ -246,19 +246,19 @@ BAD_TABLES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("table", "key", "words"), BAD_TABLES, ids=[str(case[1]) for case in BAD_TABLES])
-def test_bad_material_files(folder: Path, table: object, key: str | None, words: str) -> None:
+@pytest.mark.parametrize(("table", "key", "message"), BAD_TABLES, ids=[str(case[1]) for case in BAD_TABLES])
+def test_bad_material_files(folder: Path, table: object, key: str | None, message: str) -> None:
     (folder / "mine.json").write_text(json.dumps(table))
     cloth = {"mesh": "meshes/square.obj", "materials": [{"data": "mine.json"}]}
     with pytest.raises(InputError) as caught:
         load_scene(write(folder, cloths=[cloth]))
     assert caught.value.file == str(folder / "mine.json")
     assert caught.value.key == key
-    assert words in caught.value.message
+    assert message in caught.value.message
 
 
 @pytest.mark.parametrize(
-    ("given", "understood"),
+    ("given", "expected"),
     [
         ([0, 72, 144, 216, 288, 360], [0, 72, 144, 216, 288, 360]),
         ([0, 450, 0], [0, 90, 0]),
@@ -267,8 +267,10 @@ def test_bad_material_files(folder: Path, table: object, key: str | None, words:
         ([90, 180, 270, 0], [90, 180, 270, 360]),
     ],
 )
-def test_motions_go_the_shortest_way(given: list[float], understood: list[float], folder: Path) -> None:
+def test_rotations_between_keyframes_are_at_most_180_degrees(
+    given: list[float], expected: list[float], folder: Path
+) -> None:
     points = [{"time": i, "transform": {"rotate": [angle, 0, 0, 1]}} for i, angle in enumerate(given)]
     scene = load_scene(write(folder, motions=[points]))
     found = [k.rotate.degrees if k.rotate is not None else 0.0 for k in scene.motions["motion0"]]
-    assert found == understood
+    assert found == expected

@@ -130,7 +130,7 @@ def test_dump_holds_defaults_and_no_internals(small: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["a: b", "- x", "2024-01-01", "yes", "1e5", "~", "'\"", "ß\n#", "\u2028x", " "]
 )
-def test_dump_quotes_what_yaml_would_mistake(small: Path, tmp_path: Path, text: str) -> None:
+def test_dump_quotes_text_that_is_no_plain_text_in_yaml(small: Path, tmp_path: Path, text: str) -> None:
     scene = Scene.model_validate(
         {**load_scene(small).model_dump(by_alias=True, exclude_none=True), "title": text}
     )
@@ -178,7 +178,7 @@ def found(holds: Callable[[Scene], bool], scene: Scene) -> bool:
         return False
 
 
-def test_later_override_wins_and_anchors_are_apart(small: Path) -> None:
+def test_the_last_override_counts_and_anchors_are_independent(small: Path) -> None:
     assert load_scene(small, ["time.end=2", "time.end=3"]).time.end == 3.0
     small.write_text(SMALL.replace("[{group: left}, {group: right, from: 0.5}]", "[&h {group: left}, *h]"))
     scene = load_scene(small, ["handles[0].until=2"])
@@ -201,12 +201,12 @@ BAD_OVERRIDES = [
 ]
 
 
-@pytest.mark.parametrize(("text", "key", "words"), BAD_OVERRIDES, ids=[case[0] for case in BAD_OVERRIDES])
-def test_bad_overrides(small: Path, text: str, key: str, words: str) -> None:
+@pytest.mark.parametrize(("text", "key", "message"), BAD_OVERRIDES, ids=[case[0] for case in BAD_OVERRIDES])
+def test_bad_overrides(small: Path, text: str, key: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         load_scene(small, [text])
     assert caught.value.key == key
-    assert words in caught.value.message
+    assert message in caught.value.message
 
 
 def test_mesh_given_on_the_command_line(

@@ -1,4 +1,4 @@
-"""Every mistake in a scene is one InputError that names the file, the key and what is allowed."""
+"""Each mistake in a scene is one InputError, which names the file, the key and what is allowed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BASE = {"mesh": GRID, "material": "material: {cloth: paper}", "time": "time: {en
 
 
 def scene_text(part: str) -> str:
-    """A scene that is right but for ``part``, which replaces the block of the same key."""
+    """A valid scene in which ``part`` replaces the block of the same key."""
     first = part.split(":", 1)[0]
     return "\n".join([text for key, text in BASE.items() if key != first] + [part]) + "\n"
 
@@ -27,7 +27,7 @@ SHEET = "density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, "
 PLANE = "plane: {point: [0, 0, 0], normal: [0, 0, 1]}"
 BALL = "{ball: {sphere: {center: [0, 0, 0], radius: 1}}}"
 
-# (block, key in the message, words in the message)
+# (block, key in the message, message in the message)
 CASES = [
     # unknown keys, at every depth, with the nearest
     ("gravitty: [0, 0, -9.81]", "gravitty", "did you mean 'gravity'"),
@@ -244,15 +244,15 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("part", "key", "words"), CASES, ids=[case[0][:50] for case in CASES])
-def test_message_names_file_key_and_remedy(tmp_path: Path, part: str, key: str, words: str) -> None:
+@pytest.mark.parametrize(("part", "key", "message"), CASES, ids=[case[0][:50] for case in CASES])
+def test_message_names_file_key_and_remedy(tmp_path: Path, part: str, key: str, message: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(scene_text(part))
     with pytest.raises(InputError) as caught:
         load_scene(path)
     error = caught.value
     assert error.key == key
-    assert words in error.message
+    assert message in error.message
     assert error.file == str(path)
     assert "\n" not in str(error)
     assert len(str(error)) < 600
@@ -296,15 +296,15 @@ UNREADABLE = [
 ]
 
 
-@pytest.mark.parametrize(("content", "words"), UNREADABLE, ids=[repr(case[0][:20]) for case in UNREADABLE])
+@pytest.mark.parametrize(("content", "message"), UNREADABLE, ids=[repr(case[0][:20]) for case in UNREADABLE])
 @pytest.mark.parametrize("overrides", [[], ["time.end=1"]], ids=["plain", "set"])
-def test_unreadable_files(tmp_path: Path, content: bytes, words: str, overrides: list[str]) -> None:
+def test_unreadable_files(tmp_path: Path, content: bytes, message: str, overrides: list[str]) -> None:
     path = tmp_path / "bad.yaml"
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         load_scene(path, overrides)
-    if not overrides or "a block" not in words:  # an override needs a block first
-        assert words in caught.value.message
+    if not overrides or "a block" not in message:  # an override needs a block first
+        assert message in caught.value.message
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
 
@@ -339,14 +339,14 @@ def test_merged_keys_and_anchors_of_a_usual_size_are_read(tmp_path: Path) -> Non
     assert scene.handles[1].stiffness == 10
 
 
-def test_an_anchor_set_anew_is_no_warning(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_redefined_anchors_give_no_warning(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     path = tmp_path / "good.yaml"
     path.write_text(scene_text("handles: [{nodes: &n [0]}, {nodes: &n [1]}, {nodes: *n}]"))
     assert load_scene(path).handles[2].nodes == [1]
     assert len(recwarn) == 0
 
 
-def test_a_file_beyond_any_scene(tmp_path: Path) -> None:
+def test_a_huge_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     with path.open("wb") as file:
         file.truncate(10**12)  # a hole: no bytes on disk
