@@ -140,7 +140,7 @@ def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None
         sheet.uv = sheet.uv.copy()
         sheet.uv[turned] = sheet.uv[turned][:, [0, 2, 1]]
     sheet.notes.append(
-        f"{int(turned.sum())} of {len(turned)} triangles turned over so that all are oriented alike"
+        f"{int(turned.sum())} of {len(turned)} triangles reversed for a consistent orientation"
     )
 
 

@@ -107,10 +107,8 @@ def enter_sandbox(readable: Iterable[str | os.PathLike[str]] | None) -> list[str
 
 def describe_sandbox(layers: Sequence[str], *, trusted: bool = False) -> str:
     """Text for the user on how gmsh is sandboxed."""
-    first = (
-        "scripts are trusted, whatever they say" if trusted else "scripts are read by a list of statements"
-    )
-    second = f"{' and '.join(layers)} in gmsh's process" if layers else "none by the kernel here"
+    first = "scripts are not checked" if trusted else "scripts are checked against a list of statements"
+    second = f"{' and '.join(layers)} in gmsh's process" if layers else "the kernel permits no sandbox"
     return f"{first}; {second}"
 
 

@@ -277,7 +277,7 @@ def refuse_crossings(
             pairs = mutual_crossings(positions, triangles, obstacle.points, obstacle.triangles)
             if len(pairs):
                 listed = (f"{a} and {b} {around(a)}" for a, b in pairs[:MAX_LISTED].tolist())
-                count = _counted(len(pairs), "pair", "of a triangle of the sheet and one of it", "cross")
+                count = _counted(len(pairs), "pair", "of triangles of sheet and obstacle", "cross")
                 refuse(key, count, listed, remedy)
             continue
         inside = find_overlaps(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles

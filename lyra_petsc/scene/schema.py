@@ -468,8 +468,8 @@ class Material(Block):
         Rule(
             when(given(law={"const": "measured"}), given(cloth={"enum": measured_names()})),
             lambda m: (
-                f"measured is for cloths that were: {', '.join(measured_names())}"
-                f"{'' if m.cloth is None else f'; {m.cloth} was not, leave law out'}"
+                f"measured is for measured cloths: {', '.join(measured_names())}"
+                f"{'' if m.cloth is None else f'; {m.cloth} is none of them, leave law out'}"
             ),
             "law",
         ),
@@ -1331,7 +1331,7 @@ SMALLEST_STEP = 2.0**-52
 
 def _too_small(step: float, end: float) -> str:
     return (
-        f"is too small, {step:g}: times near {end:g} s are not told apart below {end * SMALLEST_STEP:.2g} s; "
+        f"is too small, {step:g}: near {end:g} s 64-bit numbers do not resolve {end * SMALLEST_STEP:.2g} s; "
         "take a longer one or an earlier time.end"
     )
 
@@ -1402,7 +1402,7 @@ class Scene(Block):
         Rule(
             when(given("obstacles"), given("contact")),
             # a function, as the braces in a template would mean a key
-            lambda _: "are met only with contact; add the line 'contact: {friction: 0.3}'",
+            lambda _: "have no effect without contact; add the line 'contact: {friction: 0.3}'",
             "obstacles",
         ),
     )

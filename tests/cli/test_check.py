@@ -94,10 +94,10 @@ def test_a_mesh_script_of_others_is_read_by_a_list_of_statements_unless_trusted(
     (tmp_path / "x.msh").write_text('a = GetEnv("HOME");\n')
     trusted = lyra(["check", "scene.yaml", "--trust-mesh"], tmp_path)
     assert trusted.code == 0, trusted.err
-    assert "scripts are trusted, whatever they say;" in trusted.out
+    assert "scripts are not checked;" in trusted.out
     (tmp_path / "m.geo").write_text(SQUARE)
     plain = lyra(["check", "scene.yaml"], tmp_path)
-    assert "scripts are read by a list of statements;" in plain.out
+    assert "scripts are checked against a list of statements;" in plain.out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.geo", "scene.yaml", "x.msh"]
 
 

@@ -24,7 +24,7 @@ def test_names_the_versions_in_use(comm):
     assert "float64 scalars" in text
     assert lines["numpy"].strip() == np.__version__
     assert lines["numba"].strip() == numba.__version__
-    assert "gmsh's sandbox  scripts are read by a list of statements; " in text
+    assert "gmsh's sandbox  scripts are checked against a list of statements; " in text
 
 
 @pytest.mark.parallel(2)

@@ -70,7 +70,7 @@ def test_inconsistent_triangles_are_turned_over(tmp_path: Path) -> None:
     mesh = obj_mesh(tmp_path, text + "f 1/1 2/2 3/3\nf 1/1 4/4 3/3\nf 2/2 5/5 3/3\n")
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 2]]
     assert mesh.triangle_uv[1].tolist() == [[0, 0], [1, 1], [0, 1]]
-    assert mesh.notes == ["mesh.obj: 1 of 3 triangles turned over so that all are oriented alike"]
+    assert mesh.notes == ["mesh.obj: 1 of 3 triangles reversed for a consistent orientation"]
 
 
 def test_random_orientations_are_repaired_piece_by_piece(tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_surfaces_that_face_each_other_are_oriented_alike(script: Path) -> None:
     mesh = mesh_of(script)
     x = mesh.positions[mesh.triangles]
     assert len(np.unique(np.sign(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])[:, 2]))) == 1
-    assert any("turned over" in note for note in mesh.notes)
+    assert any("reversed" in note for note in mesh.notes)
 
 
 @pytest.mark.parametrize(

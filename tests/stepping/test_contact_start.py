@@ -74,7 +74,7 @@ def test_a_mesh_that_crosses(comm: MPI.Comm, shared_tmp: Path) -> None:
         obj_file(shared_tmp / "blade.obj", [(0.3, 0.1, -1), (0.3, 0.1, 1), (0.3, 0.3, 0)], [(0, 1, 2)])
     comm.Barrier()
     text = refusal(comm, obstacle(mesh={"file": str(shared_tmp / "blade.obj")}))
-    assert "2 pairs of a triangle of the sheet and one of it cross (counted from 0, the first: " in text
+    assert "2 pairs of triangles of sheet and obstacle cross (counted from 0, the first: " in text
 
 
 def test_sheets_that_cross(comm: MPI.Comm) -> None:

@@ -158,7 +158,7 @@ def test_curves_are_met_at_their_points() -> None:
 
 
 def test_strains_that_may_be_percent_are_noted() -> None:
-    for strain, told in ((1.0, []), (5.0, ["strains up to 5; were they in percent"])):
+    for strain, told in ((1.0, []), (5.0, ["strains up to 5; if they are percent"])):
         law = CURVES | {"shear": [[0.1, 2.0], [strain, 20.0]]}
         notes = resolve_material(validated(Material, {"density": 0.2, "law": law}, file=None))[1]
         assert [words in note for words, note in zip(told, notes, strict=True)] == [True] * len(told)
@@ -185,7 +185,7 @@ def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
         ("0,0\n0.02,5\n0.01,7\n", "line 3: strain 0.01 is not more than 0.02"),
         ("0,0\n0.02,5\n\n0.03,5\n", "line 4: force 5 is not more than 5"),
         ("0,0\n0.02,-5\n", "line 2: force -5 is not more than 0"),
-        ("0,1\n0.02,5\n", "line 1: no strain has no force"),
+        ("0,1\n0.02,5\n", "line 1: the force at zero strain must be 0"),
         ("-0.1,-3\n0.02,5\n", "line 1: strain -0.1 is negative"),
         ("0,0\n", "no point but the origin"),
         ("strain,force\n", "has 0 points"),
@@ -242,9 +242,9 @@ def test_forces_of_a_sheet_are_the_derivatives_of_its_energy(cloth: str, tmp_pat
 @pytest.mark.parametrize(
     ("material", "words"),
     [
-        ({"cloth": "paper", "law": "measured"}, "paper was not"),
-        ({"cloth": "aluminium", "law": "measured"}, "aluminium was not"),
-        (SHEET | {"poisson": 0.3, "law": "measured"}, "measured is for cloths that were: 11oz"),
+        ({"cloth": "paper", "law": "measured"}, "paper is none of them"),
+        ({"cloth": "aluminium", "law": "measured"}, "aluminium is none of them"),
+        (SHEET | {"poisson": 0.3, "law": "measured"}, "measured is for measured cloths: 11oz"),
         ({"cloth": "gray-interlock", "law": "neo-hookean"}, "is for isotropic sheets"),
         ({"density": 1.0, "law": CURVES | {"warp": [1.0, 2.0]}}, "law.warp: must be a file, or points"),
         (SHEET | {"poisson": 0.3, "law": CURVES}, "curves take the place of membrane"),

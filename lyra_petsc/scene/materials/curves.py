@@ -84,7 +84,7 @@ def checked_points(points: list[LocatedPoint], whole: str = "the curve") -> Poin
         raise InputError(f"{whole} has {count} points; give 1 to {MAX_POINTS} (beside that at no strain)")
     where, strain, force = points[0]
     if strain == 0.0 and force != 0.0:
-        raise InputError(f"{where}: no strain has no force; take {force:g} N/m from all forces")
+        raise InputError(f"{where}: the force at zero strain must be 0; subtract {force:g} N/m from all")
     if strain > 0.0:
         points = [("the origin", 0.0, 0.0), *points]
     elif strain < 0.0:

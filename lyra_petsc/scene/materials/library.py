@@ -233,11 +233,11 @@ def resolve_material(
         shell = replace(shell, c11=c11, c12=0.0, c22=c22, c33=c33, curves=curves)
         strain = max(points[-1][0] for points in curves)
         if strain > 1.0:
-            notes.append(f"{key}.law: strains up to {strain:g}; were they in percent, give fractions")
+            notes.append(f"{key}.law: strains up to {strain:g}; if they are percent, give fractions")
     shell = _scaled(_with_friction(shell, material), material)
     if max(shell.friction_moment) > 0.0 and not shell.bends_with(shell.model):
         raise InputError(
-            "friction acts beside a bending stiffness; give bending, too",
+            "friction needs a bending stiffness; give bending, too",
             file=file,
             key=f"{key}.friction_moment",
         )
