@@ -47,7 +47,7 @@ class Block(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:
+    def _check_keys(cls, data: Any) -> Any:
         if isinstance(data, cls):
             return data
         if not isinstance(data, dict):
@@ -68,7 +68,7 @@ class Block(BaseModel):
         return data
 
     @model_validator(mode="after")
-    def _rules_hold(self) -> Self:
+    def _check_rules(self) -> Self:
         for rule in self.rules:
             if not holds(rule.condition, self):
                 template = rule.message

@@ -54,7 +54,7 @@ _BOUNDS = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
 _NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]}
 
 
-def _each_once(value: Any) -> tuple[str, ...]:
+def _unique_axes(value: Any) -> tuple[str, ...]:
     chosen = axes(value)
     if len(set(chosen)) < len(chosen):
         raise problem(f"must hold each of x, y, z once, not {shown(value)}")
@@ -62,7 +62,7 @@ def _each_once(value: Any) -> tuple[str, ...]:
 
 
 _Axes = Annotated[
-    tuple[Direction, ...], BeforeValidator(_each_once), JsonSchema(ANY_AXES | {"uniqueItems": True})
+    tuple[Direction, ...], BeforeValidator(_unique_axes), JsonSchema(ANY_AXES | {"uniqueItems": True})
 ]
 
 
@@ -81,7 +81,7 @@ class Parameter(Block):
     bounds: Annotated[tuple[float, float], BeforeValidator(_bounds), JsonSchema(_BOUNDS)]
 
     @model_validator(mode="after")
-    def _inside(self) -> Self:
+    def _check_start(self) -> Self:
         low, high = self.bounds
         if not low <= self.start <= high:
             raise problem(f"must lie within the bounds {low:g} to {high:g}, not {self.start:g}", "start")
@@ -118,7 +118,7 @@ class DrapeCoefficient(Block):
     support: NonNegative
 
     @model_validator(mode="after")
-    def _hangs_over(self) -> Self:
+    def _check_support(self) -> Self:
         if not self.support < self.radius:
             raise problem(f"must be less than radius = {self.radius:g}, not {self.support:g}", "support")
         return self

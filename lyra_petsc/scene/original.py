@@ -78,12 +78,12 @@ class Placement(Block):
     rotate: Annotated[tuple[float, float, float, float], BeforeValidator(_rotation)] = (0.0, 0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _has_axis(self) -> Self:
+    def _check_axis(self) -> Self:
         if self.rotate[0] != 0.0 and not any(self.rotate[1:]):
             raise problem("needs an axis: [degrees, x, y, z]", "rotate")
         return self
 
-    def in_our_keys(self) -> dict[str, Any]:
+    def to_our_keys(self) -> dict[str, Any]:
         """As our ``transform``, or as the keys of a keyframe other than time and velocity."""
         block: dict[str, Any] = {"scale": self.scale, "translate": list(self.translate)}
         degrees, *axis = self.rotate
@@ -110,7 +110,7 @@ class OriginalCloth(Block):
     texture: Text = ""
 
     @model_validator(mode="after")
-    def _one_material(self) -> Self:
+    def _check_materials(self) -> Self:
         if len(self.materials) != 1:
             raise problem(f"must hold one material, not {len(self.materials)}", "materials")
         if self.transform.scale <= 0:
@@ -129,7 +129,7 @@ class OriginalHandle(Block):
     fade_time: NonNegative = 0.0
 
     @model_validator(mode="after")
-    def _on_nodes(self) -> Self:
+    def _check_selection(self) -> Self:
         if self.type != "node":
             raise problem(f"only handles of type 'node' are read, not {self.type!r}", "type")
         if self.label == -1 and not self.nodes:
@@ -143,7 +143,7 @@ class OriginalKeyframe(Block):
     velocity: Placement | None = None
 
     @model_validator(mode="after")
-    def _translation_only(self) -> Self:
+    def _check_velocity(self) -> Self:
         moving = self.velocity
         if moving is not None and (moving.scale not in (0.0, 1.0) or moving.rotate[0] != 0.0):
             raise problem("may hold translate only", "velocity")
@@ -177,7 +177,7 @@ class OriginalScene(Block):
         return {"frame_steps": 1 if "frame_time" in data else DEFAULT_FRAME_STEPS, **data}
 
     @model_validator(mode="after")
-    def _numbers_exist(self) -> Self:
+    def _check_references(self) -> Self:
         if not self.cloths:
             raise problem("must hold at least one cloth", "cloths")
         for i, handle in enumerate(self.handles):
@@ -341,7 +341,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
             )
         name = {"name": f"cloth{i}"} if several else {}
         group = {"group": f"cloth{i}"} if several else {}
-        ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.in_our_keys(), **name})
+        ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.to_our_keys(), **name})
         ours["material"].append({**_material(cloth.materials[0], i, path), **group})
     ours["motions"] = {
         f"motion{i}": _shortest_rotations([_keyframe(keyframe) for keyframe in keyframes])
@@ -373,7 +373,7 @@ def _material(material: OriginalMaterial, i: int, path: Path) -> dict[str, Any]:
 
 
 def _keyframe(keyframe: OriginalKeyframe) -> dict[str, Any]:
-    block = {"time": keyframe.time, **keyframe.transform.in_our_keys()}
+    block = {"time": keyframe.time, **keyframe.transform.to_our_keys()}
     if keyframe.velocity is not None:
         block["velocity"] = list(keyframe.velocity.translate)
     return block

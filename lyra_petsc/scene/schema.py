@@ -201,7 +201,7 @@ class MembraneStiffness(Block):
     c33: Positive
 
     @model_validator(mode="after")
-    def _positive_definite(self) -> Self:
+    def _check_positive_definite(self) -> Self:
         _check_coupling("c", self.c11, self.c12, self.c22, "N/m")
         return self
 
@@ -236,7 +236,7 @@ class PlateStiffness(Block):
     d33: Positive
 
     @model_validator(mode="after")
-    def _positive_definite(self) -> Self:
+    def _check_positive_definite(self) -> Self:
         _check_coupling("d", self.d11, self.d12, self.d22, "N·m")
         return self
 
@@ -305,7 +305,7 @@ class KesReport(Block):
     width_of_shear: Pair | None = Field(default=None, alias="2HG")
 
     @model_validator(mode="after")
-    def _of_a_fabric(self) -> Self:
+    def _check_ranges(self) -> Self:
         for name, stiffness, loop, width, farthest in (
             ("B", self.B, "2HB", self.width_of_bending, KES_CURVATURE),
             ("G", self.G, "2HG", self.width_of_shear, KES_ANGLE),
@@ -550,7 +550,7 @@ class Material(Block):
 
     @field_validator("cloth")
     @classmethod
-    def _in_a_library(cls, cloth: str | None) -> str | None:
+    def _check_cloth(cls, cloth: str | None) -> str | None:
         if cloth is not None and cloth not in material_names():
             raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, material_names())}")
         return cloth
@@ -618,7 +618,7 @@ class VertexChoice(Block):
 
     @field_validator("nodes")
     @classmethod
-    def _each_once(cls, nodes: list[int] | None) -> list[int] | None:
+    def _check_unique(cls, nodes: list[int] | None) -> list[int] | None:
         if nodes is not None and len(set(nodes)) != len(nodes):
             twice = Counter(nodes).most_common(1)[0][0]
             raise problem(f"lists vertex {twice} twice")
@@ -626,7 +626,7 @@ class VertexChoice(Block):
 
     @field_validator("box", mode="before")
     @classmethod
-    def _corners(cls, value: Any) -> Any:
+    def _check_box(cls, value: Any) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != 2:
             raise problem(f"must be two corners [[x, y, z], [x, y, z]], not {shown(value)}")
         low, high = vector(value[0]), vector(value[1])
@@ -641,7 +641,7 @@ class Selector(VertexChoice):
     rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
 
 
-def _ends_later(block: Any) -> Any:
+def _window_ends_later(block: Any) -> Any:
     if not block.start < block.until:
         raise problem(f"must be later than from = {block.start:g}, not {block.until:g}", "until")
     return block
@@ -724,11 +724,11 @@ class Handle(Selector):
 
     @field_validator("axes", mode="before")
     @classmethod
-    def _axes(cls, value: Any) -> Any:
+    def _sort_axes(cls, value: Any) -> Any:
         chosen = axes(value)
         return tuple(axis for axis in AXES if axis in chosen)
 
-    _in_order = model_validator(mode="after")(_ends_later)
+    _check_window = model_validator(mode="after")(_window_ends_later)
 
 
 class Keyframe(Block):
@@ -776,7 +776,7 @@ class Friction(Block):
     kinetic: NonNegative
 
     @model_validator(mode="after")
-    def _kinetic_at_most_static(self) -> Self:
+    def _check_coefficients(self) -> Self:
         if self.kinetic > self.static:
             raise problem(f"must be at most static = {self.static:g}, not {self.kinetic:g}", "kinetic")
         return self
@@ -862,7 +862,7 @@ class Capsule(Block):
     radius: Positive
 
     @model_validator(mode="after")
-    def _has_an_axis(self) -> Self:
+    def _check_axis(self) -> Self:
         if self.start == self.to:
             raise problem("must be another point than from; for a ball give sphere", "to")
         return self
@@ -881,7 +881,7 @@ class Cuboid(Block):
     max: Vector
 
     @model_validator(mode="after")
-    def _has_a_volume(self) -> Self:
+    def _check_corners(self) -> Self:
         for axis, low, high in zip(AXES, self.min, self.max, strict=True):
             if low >= high:
                 raise problem(f"must be above min in {axis}: {high:g} is not above {low:g}", "max")
@@ -1006,7 +1006,7 @@ class AppliedLoad(VertexChoice):
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
-    _in_order = model_validator(mode="after")(_ends_later)
+    _check_window = model_validator(mode="after")(_window_ends_later)
 
 
 class Initial(Block):
@@ -1203,7 +1203,7 @@ class Output(Block):
 
     @field_validator("fields", mode="before")
     @classmethod
-    def _known_fields(cls, value: Any) -> Any:
+    def _check_fields(cls, value: Any) -> Any:
         if not isinstance(value, (list, tuple)):
             raise problem(f"must be a list, not {shown(value)}; known: {', '.join(FIELDS)}")
         for name in value:
@@ -1289,7 +1289,7 @@ class Camera(Block):
     frame: Share | None = None
 
     @model_validator(mode="after")
-    def _has_directions(self) -> Self:
+    def _check_directions(self) -> Self:
         if self.position is not None and self.position == self.target:
             raise problem("is where the camera stands; it must look at another point", "target")
         view = self.line_of_sight
@@ -1487,7 +1487,7 @@ class Scene(Block):
     __hash__ = None  # type: ignore[assignment]
 
     @model_validator(mode="after")
-    def _time_advances(self) -> Self:
+    def _check_step_sizes(self) -> Self:
         smallest = self.time.end * SMALLEST_STEP
         if self.time.step != "auto" and self.time.step < smallest:
             raise problem(_too_small(self.time.step, self.time.end), "time", "step")
@@ -1496,7 +1496,7 @@ class Scene(Block):
         return self
 
     @model_validator(mode="after")
-    def _names_agree(self) -> Self:
+    def _check_references(self) -> Self:
         for name, keyframes in self.motions.items():
             _check_keyframes(keyframes, "motions", name)
         for i, handle in enumerate(self.handles):
