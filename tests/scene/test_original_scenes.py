@@ -181,7 +181,7 @@ BAD = [
     ({"cloths": [{**ONE, "materials": [{"data": "materials/grey-interlock.json"}]}]},
      "cloths[0].materials[0].data", "did you mean 'gray-interlock'"),
     ({"cloths": [{**ONE, "materials": [{"data": "paper", "yield_curv": 1}]}]},
-     "cloths[0].materials[0].yield_curv", "plastic creases"),
+     "cloths[0].materials[0].yield_curv", "plasticity is not simulated"),
     ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0]}}]}, "cloths[0].transform.rotate", "[degrees,"),
     ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0, 0]}}]}, "cloths[0].transform.rotate", "axis"),
     ({"cloths": [{**ONE, "mesh": "meshes/textured.obj", "transform": {"scale": 2}}]},
