@@ -100,9 +100,7 @@ def _bends_by(model: str) -> Need:
 
 
 def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    return any(shell.bends_with("hinge") for shell in shells) and any(
-        handle.clamp for handle in scene.handles
-    )
+    return any(s.bends_with("hinge") for s in shells) and any(handle.clamp for handle in scene.handles)
 
 
 def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
