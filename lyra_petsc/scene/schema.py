@@ -1331,7 +1331,7 @@ SMALLEST_STEP = 2.0**-52
 
 def _too_small(step: float, end: float) -> str:
     return (
-        f"is too small, {step:g}: near {end:g} s 64-bit numbers do not resolve {end * SMALLEST_STEP:.2g} s; "
+        f"is too small, {step:g}: times near {end:g} s are resolved to {end * SMALLEST_STEP:.2g} s only; "
         "take a longer one or an earlier time.end"
     )
 
