@@ -1,17 +1,18 @@
 """Derivatives of a simulation with respect to numbers of its scene, by the tangent equations.
 
-Every integrator solves G(V; z_n, p) = 0 for the velocities V of a stage, with what a step begins with, z_n:
-positions, velocities and the integrator's memory. Its end z_{n+1} is linear in V and z_n. Hence::
+Every integrator solves G(V; z_n, p) = 0 for the velocities V of a stage, where z_n is the state at the start
+of the step: positions, velocities and the integrator's memory. The end z_{n+1} is linear in V and z_n::
 
     ∂G/∂V V' = −(∂G/∂z z_n' + ∂G/∂p)        z_{n+1}' = ∂z_{n+1}/∂V V' + ∂z_{n+1}/∂z_n z_n'
 
-∂G/∂V is the step's exact Jacobian, which stands with its preconditioner (in ``semi-implicit`` the regularised
-one, by which V is found). The directional derivatives of G are differences of four *neighbours*: the same
-discretised scene at p ± δ and p ± 2 δ, whose states are z_n ± δ z_n' and z_n ± 2 δ z_n'. They are exact for
-polynomials of degree four in (z, p): for a St. Venant-Kirchhoff membrane whose numbers enter linearly, but
-for round-off. What a step freezes (damping at x_n, normals of the wind, loads), accelerations at its start
-and histories are so differentiated without a line of their own. What is left of the linear solve, and what
-the Jacobian lacks (the stiffness of pressure in statics), goes by generalised conjugate residuals around it.
+∂G/∂V is the exact Jacobian of the step, which is assembled with its preconditioner (for ``semi-implicit`` the
+regularised one, by which V is found). Directional derivatives of G are finite differences of four
+*neighbours*: the same discretised scene at p ± δ, p ± 2 δ, with states z_n ± δ z_n', z_n ± 2 δ z_n'.
+Except for round-off they are exact for polynomials of degree four in (z, p), as for a St. Venant-Kirchhoff
+membrane whose numbers enter linearly. They also differentiate all that a step freezes (damping at x_n,
+normals of the wind, loads), accelerations at its start and histories, without code for each. Generalised
+conjugate residuals around the linear solve correct its error and terms that the Jacobian lacks (the stiffness
+of pressure in statics).
 
 Sources: Michaleris, Tortorelli & Vidal, Int. J. Numer. Meth. Engng 37 (1994) 2471-2499 (tangent operators of
 transient problems); Eisenstat, Elman & Schultz, SIAM J. Numer. Anal. 20 (1983) 345-357 (GCR).
@@ -46,23 +47,21 @@ from lyra_petsc.terms.term import Term
 
 CENTRAL = {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
 FORWARD = {0: -25.0 / 12.0, 1: 4.0, 2: -3.0, 3: 4.0 / 3.0, 4: -0.25}
-"""Offsets in δ and weights of a first derivative, exact up to degree four; where a number may not be less,
-those of the neighbours at and above it.
-"""
+"""Offsets over δ and weights of a first derivative, exact up to degree four. The one-sided difference is for
+numbers at the bound of their range."""
 
-RELATIVE, RELATIVE_STATIC = 1e-4, 6e-4
-"""δ over the size of the number. Small where damping may switch the sign of an eigenvalue between neighbours;
-equilibria have no damping, but feel the round-off of forces more.
-"""
+DELTA, DELTA_STATIC = 1e-4, 6e-4
+"""δ over the size of the number. It is small because damping may change the sign of an eigenvalue between
+neighbours. Equilibria have no damping, but are more sensitive to the round-off of forces."""
 
-MOST_CORRECTIONS = 60
-"""Linear solves for one derivative in one step."""
+MAX_CORRECTIONS = 60
+"""Largest number of linear solves for one derivative in one step."""
 
-LITTLE = 0.05
-"""Part of the largest possible round-off of forces that is not corrected."""
+ROUNDOFF_FRACTION = 0.05
+"""Residuals below this fraction of the largest possible round-off of forces are not corrected."""
 
-ENOUGH = 1e-5
-"""Residual over the right side that is taken for solved where corrections end."""
+ACCEPTED = 1e-5
+"""Residual over the right side that is accepted when corrections end."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Number:
         Its path, as ``Scene.changed`` takes it.
     value : float
     size : float
-        Of its usual changes, > 0: what δ is relative to.
+        Size of its usual changes, > 0, to which δ is relative.
     """
 
     key: str
@@ -85,7 +84,7 @@ class Number:
 
 @dataclass
 class Tangent:
-    """Derivatives of a state with respect to one number: positions, velocities (n_owned, 3), memory."""
+    """Derivatives of positions, velocities (n_owned, 3) and memory with respect to one number."""
 
     x: Array
     v: Array
@@ -94,7 +93,7 @@ class Tangent:
 
 @dataclass
 class Neighbour:
-    """The scene with one number changed, at a state beside the simulation's."""
+    """The scene with one number changed by ``offset`` δ, at a state near that of the simulation."""
 
     offset: float
     weight: float
@@ -104,13 +103,13 @@ class Neighbour:
 
     @property
     def system(self) -> StageEquations:
-        """Its equations."""
+        """The equations of its problem."""
         return self.problem.system
 
 
 @dataclass(frozen=True)
-class _Before:
-    """What a step began with."""
+class _StepStart:
+    """Time, state and memory at the start of a step."""
 
     time: float
     x: Array
@@ -122,7 +121,7 @@ class _Before:
 
 @dataclass(frozen=True)
 class _Equilibrium:
-    """Load factors of the equilibrium before and of this one, its positions (n_owned, 3) and frames."""
+    """Load factors of the last equilibrium and of this one, and its positions (n_owned, 3) and frames."""
 
     before: float
     factor: float
@@ -131,7 +130,7 @@ class _Equilibrium:
 
 
 class Sensitivities:
-    """Steps a simulation and, beside it, the derivatives of its state; every method is collective.
+    """Steps a simulation together with the derivatives of its state; every method is collective.
 
     Parameters
     ----------
@@ -139,16 +138,16 @@ class Sensitivities:
         Not yet stepped, of a scene without contact and without friction.
     numbers : sequence of Number
     mesh : Mesh or None
-        The scene's, on rank 0, where it is known.
+        The scene's mesh on rank 0, if it is known.
     tolerance : float
         Residual of each step's tangent equations over their right side.
     reactions : bool
-        Forces of handles are asked for.
+        Whether forces of handles are needed.
 
     Raises
     ------
     InputError
-        Where neighbours of a number are no scenes.
+        If a changed number makes no valid scene on any side.
     """
 
     def __init__(
@@ -166,30 +165,30 @@ class Sensitivities:
         self._iterates = not self._system.integrator.lagged_loads
         self._static = isinstance(self._system.integrator, Static)
         self._semi = self._system.integrator.lagged_loads and not self._static
-        relative = RELATIVE_STATIC if self._static else RELATIVE
-        self._steps = [relative * number.size for number in self.numbers]
+        relative = DELTA_STATIC if self._static else DELTA
+        self._deltas = [relative * number.size for number in self.numbers]
         self.tangents: list[Tangent] = []
         self._neighbours: list[list[Neighbour]] = []
         owner = self._owner()
-        for number, step in zip(self.numbers, self._steps, strict=True):
-            beside = [
+        for number, delta in zip(self.numbers, self._deltas, strict=True):
+            neighbours = [
                 Neighbour(offset, weight, build_problem(simulation.comm, scene, Phases(), mesh, owner))
-                for offset, weight, scene in _scenes(simulation.scene, number, step)
+                for offset, weight, scene in _scenes(simulation.scene, number, delta)
             ]
-            self._neighbours.append(beside)
-            self._begin(beside, step, reactions=reactions)
+            self._neighbours.append(neighbours)
+            self._begin(neighbours, delta, reactions=reactions)
         if self._system.points.n_edges_global and not self._static:
-            self._settle_edges()
+            self._solve_initial_edges()
 
     def destroy(self) -> None:
-        """Free what the neighbours hold."""
-        for beside in self._neighbours:
-            for neighbour in beside:
+        """Free the PETSc objects of the neighbours."""
+        for neighbours in self._neighbours:
+            for neighbour in neighbours:
                 neighbour.problem.discretisation.destroy()
         self._neighbours = []
 
     def _owner(self) -> NDArray[np.int64] | None:
-        """Rank of each vertex (V,), on rank 0: partitioners do not cut a mesh twice alike."""
+        """Rank of each vertex (V,), on rank 0: partitioners need not give the same result twice."""
         points = self._system.points
         pieces = points.comm.gather(points.mesh_vertices, root=0)
         if pieces is None:
@@ -201,17 +200,17 @@ class Sensitivities:
 
     # -- start -------------------------------------------------------------------------------------
 
-    def _begin(self, beside: list[Neighbour], step: float, *, reactions: bool) -> None:
-        """The derivatives at the start."""
+    def _begin(self, neighbours: list[Neighbour], delta: float, *, reactions: bool) -> None:
+        """Compute the derivatives at the start of the simulation."""
         n, points = self._system.points.n_owned, self._system.points
         tangent = Tangent(np.zeros((n, 3)), np.zeros((n, 3)))
-        for neighbour in beside:
-            tangent.x += (neighbour.weight / step) * neighbour.system.x[:n]
-            tangent.v += (neighbour.weight / step) * neighbour.system.v[:n]
+        for neighbour in neighbours:
+            tangent.x += (neighbour.weight / delta) * neighbour.system.x[:n]
+            tangent.v += (neighbour.weight / delta) * neighbour.system.v[:n]
         tangent.x[points.n_vertices :] = 0.0
-        _drop_rounding(tangent.x, self._system.x[:n], step)
-        _drop_rounding(tangent.v, self._system.v[:n], step)
-        for neighbour in beside:
+        _drop_roundoff(tangent.x, self._system.x[:n], delta)
+        _drop_roundoff(tangent.v, self._system.v[:n], delta)
+        for neighbour in neighbours:
             system = neighbour.system
             if self._static:
                 system.applied.factor = 0.0
@@ -222,36 +221,36 @@ class Sensitivities:
                 neighbour.ledger = Ledger(system)
         self.tangents.append(tangent)
 
-    def _settle_edges(self) -> None:
-        """The derivatives of the edges' unknowns at the start, where their moments balance."""
+    def _solve_initial_edges(self) -> None:
+        """Compute the derivatives of the edges' unknowns at the start, where moments are balanced."""
         system, n = self._system, self._system.points.n_owned
         start, vertices = system.x[:n].copy(), self._system.points.n_vertices
         frames = [term.frames for term in _edged(system)]
         system.initial_edge_moments()
         system.begin_edge_solve(start)
-        for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-            for each in beside:
-                way = each.offset * step
-                each.system.state.set(start + way * tangent.x, system.v[:n] + way * tangent.v)
+        for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+            for each in neighbours:
+                change = each.offset * delta
+                each.system.state.set(start + change * tangent.x, system.v[:n] + change * tangent.v)
                 for term, own in zip(_edged(each.system), frames, strict=True):
                     term.frames = own
                 each.system.initial_edge_moments()
-                each.system.begin_edge_solve(start + way * tangent.x)
+                each.system.begin_edge_solve(start + change * tangent.x)
                 self._use_frames(each.system, frames)
         still = np.zeros_like(start)
         with self._solver(still, set_up=True, keep=False) as solve:
-            for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-                for each, ahead in self._at_their_stages(solve, beside, step, still):
-                    each.system.end_edge_solve(ahead)
-                    self._to_frames(each.system)
-                change = _combined(beside, step, lambda each: each.system.x[:n])
-                tangent.x[vertices:] = change[vertices:]
+            for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+                for each, v in self._solve_stages(solve, neighbours, delta, still):
+                    each.system.end_edge_solve(v)
+                    self._change_frames(each.system)
+                rates = _difference(neighbours, delta, lambda each: each.system.x[:n])
+                tangent.x[vertices:] = rates[vertices:]
         system.end_edge_solve(still)
 
     # -- a step ------------------------------------------------------------------------------------
 
     def step(self) -> StepReport:
-        """One accepted step of the simulation and of all derivatives.
+        """Take one step of the simulation and of all derivatives.
 
         Raises
         ------
@@ -262,42 +261,44 @@ class Sensitivities:
         n = system.points.n_owned
         memory, numbers = system.integrator.memory()
         frames = [term.frames for term in _edged(system)]
-        before = _Before(
+        before = _StepStart(
             simulation.time, system.x[:n].copy(), system.v[:n].copy(), dict(memory), dict(numbers), frames
         )
         report = simulation.step()
         if self._static:
-            self._follow_equilibrium(before)
+            self._differentiate_equilibrium(before)
         else:
-            self._follow_motion(before, fresh=report.newton_iterations == 0)
+            self._differentiate_step(before, fresh=report.newton_iterations == 0)
         return report
 
-    def _follow_motion(self, before: _Before, *, fresh: bool) -> None:
+    def _differentiate_step(self, before: _StepStart, *, fresh: bool) -> None:
         system = self._system
         velocity, end = system.stage_velocity.copy(), self.simulation.time
         system.reopen(before.x)
         with self._solver(velocity, set_up=self._iterates, keep=not fresh) as solve:
-            for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-                for each in beside:
-                    self._put(each, before, tangent, step, end)
-                for each, ahead in self._at_their_stages(solve, beside, step, velocity):
-                    each.system.accept(ahead)
+            for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+                for each in neighbours:
+                    self._begin_step(each, before, tangent, delta, end)
+                for each, v in self._solve_stages(solve, neighbours, delta, velocity):
+                    each.system.accept(v)
         if system.solves_edges_at_end:
-            self._follow_edges(before)
-        for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-            for each in beside:
+            self._differentiate_edges(before)
+        for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+            for each in neighbours:
                 if each.ledger is not None:
-                    each.ledger.record(before.x + each.offset * step * tangent.x)
-            self._take(tangent, beside, step)
-            for each in beside:
+                    each.ledger.record(before.x + each.offset * delta * tangent.x)
+            self._update_tangent(tangent, neighbours, delta)
+            for each in neighbours:
                 each.system.set_references(end)
 
-    def _put(self, each: Neighbour, before: _Before, tangent: Tangent, step: float, end: float) -> None:
-        """Let a neighbour begin the step that the simulation has taken."""
-        system, way = each.system, each.offset * step
-        system.state.set(before.x + way * tangent.x, before.v + way * tangent.v)
+    def _begin_step(
+        self, each: Neighbour, before: _StepStart, tangent: Tangent, delta: float, end: float
+    ) -> None:
+        """Begin the step that the simulation has taken with a neighbour."""
+        system, change = each.system, each.offset * delta
+        system.state.set(before.x + change * tangent.x, before.v + change * tangent.v)
         memory = {
-            name: values + way * tangent.memory.get(name, 0.0) for name, values in before.memory.items()
+            name: values + change * tangent.memory.get(name, 0.0) for name, values in before.memory.items()
         }
         system.integrator.restore(memory, before.numbers)
         for term, frames in zip(_edged(system), before.frames, strict=True):
@@ -312,8 +313,9 @@ class Sensitivities:
             system.jacobian(start, 1.0, each.jacobian)
 
     def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
-        """Let directors be measured from a neighbour's own frames, or from those that the simulation, which
-        ``started`` with others, has turned to.
+        """Set the frames of a neighbour's directors.
+
+        They are its own, or those of the simulation if it has updated its frames since the ``started`` ones.
         """
         pairs = zip(_edged(system), _edged(self._system), started, strict=True)
         used = [(mine, self._system.frozen_in_step[theirs], start) for mine, theirs, start in pairs]
@@ -322,26 +324,28 @@ class Sensitivities:
             system.active.refreeze(found)
             system.forget_forces()
 
-    def _at_their_stages(
-        self, solve: Callable[[Array], Array], beside: list[Neighbour], step: float, velocity: Array
+    def _solve_stages(
+        self, solve: Callable[[Array], Array], neighbours: list[Neighbour], delta: float, velocity: Array
     ) -> list[tuple[Neighbour, Array]]:
-        """A number's neighbours with the velocities (n_owned, 3) of their stages; collective."""
-        change = _combined(beside, step, lambda each: each.system.prescribed.velocity)
+        """Solve for the velocities (n_owned, 3) of the stages of a number's neighbours."""
+        change = _difference(neighbours, delta, lambda each: each.system.prescribed.velocity)
         prescribed = np.zeros_like(velocity)
         self._system.prescribed.overwrite(prescribed, change)
-        of_stage = partial(self._change_of_stage, beside, step, velocity)
-        way = self._solved(solve, of_stage, prescribed, step)
-        found = []
-        for each in beside:
-            each.system.prescribe(ahead := velocity + each.offset * step * way)
-            found.append((each, ahead))
-        return found
+        derivative = partial(self._stage_derivative, neighbours, delta, velocity)
+        dv = self._solve_affine(solve, derivative, prescribed, delta)
+        stages = []
+        for each in neighbours:
+            each.system.prescribe(v := velocity + each.offset * delta * dv)
+            stages.append((each, v))
+        return stages
 
-    def _change_of_stage(self, beside: list[Neighbour], step: float, velocity: Array, way: Array) -> Array:
-        """Derivative (n_owned, 3) of G where the stage's velocities change by ``way``."""
+    def _stage_derivative(
+        self, neighbours: list[Neighbour], delta: float, velocity: Array, dv: Array
+    ) -> Array:
+        """Derivative (n_owned, 3) of G if the derivative of the stage's velocities is ``dv``."""
 
-        def equations(each: Neighbour) -> Array:
-            system, v = each.system, velocity + each.offset * step * way
+        def residual(each: Neighbour) -> Array:
+            system, v = each.system, velocity + each.offset * delta * dv
             system.prescribe(v)
             out = np.zeros_like(v)
             if each.jacobian is None:
@@ -352,64 +356,66 @@ class Sensitivities:
             system.residual(start, system.stage.sigma * (start - system.history), out)
             return out + _product(system, each.jacobian, v - start)
 
-        return self._free(_combined(beside, step, equations))
+        return self._free(_difference(neighbours, delta, residual))
 
     def _free(self, values: Array) -> Array:
         return np.where(self._system.prescribed.free, values, 0.0)
 
-    def _take(self, tangent: Tangent, beside: list[Neighbour], step: float) -> None:
-        """The derivatives of the state at which the neighbours have arrived."""
+    def _update_tangent(self, tangent: Tangent, neighbours: list[Neighbour], delta: float) -> None:
+        """Compute the derivatives of the state from the states of the neighbours."""
         n = self._system.points.n_owned
-        for each in beside:
-            self._to_frames(each.system)
-        tangent.x = _combined(beside, step, lambda each: each.system.x[:n])
-        tangent.v = _combined(beside, step, lambda each: each.system.v[:n])
-        names = beside[0].system.integrator.memory()[0].keys()
-        tangent.memory = {name: _combined(beside, step, partial(_remembered, name)) for name in names}
+        for each in neighbours:
+            self._change_frames(each.system)
+        tangent.x = _difference(neighbours, delta, lambda each: each.system.x[:n])
+        tangent.v = _difference(neighbours, delta, lambda each: each.system.v[:n])
+        names = neighbours[0].system.integrator.memory()[0].keys()
+        tangent.memory = {
+            name: _difference(neighbours, delta, partial(_memory_array, name)) for name in names
+        }
 
-    def _to_frames(self, system: StageEquations) -> None:
-        """Measure a neighbour's directors, past ones too, from the frames that the simulation's now have."""
+    def _change_frames(self, system: StageEquations) -> None:
+        """Express a neighbour's present and past directors in the present frames of the simulation."""
         change = np.zeros((system.points.n_owned, 3))
-        turns = False
-        for mine, theirs in zip(_edged(system), _edged(self._system), strict=True):
-            places, ends, length, _ = mine.of_edges
-            old: Frames = system.active.frozen[mine]
-            new = theirs.frames
+        changed = False
+        for term, reference in zip(_edged(system), _edged(self._system), strict=True):
+            places, ends, length, _ = term.of_edges
+            old: Frames = system.active.frozen[term]
+            new = reference.frames
             if old is new:
                 continue
             across = system.x[ends[:, 1]] - system.x[ends[:, 0]]
             tangent = across / np.linalg.norm(across, axis=1, keepdims=True)
-            one, other = carried(old, tangent), carried(new, tangent)
-            side = np.sum(np.cross(tangent, one) * other, axis=1)
-            turned = np.arctan2(side, np.sum(one * other, axis=1))
+            first, second = carried(old, tangent), carried(new, tangent)
+            sine = np.sum(np.cross(tangent, first) * second, axis=1)
+            angle = np.arctan2(sine, np.sum(first * second, axis=1))
             own = places < 3 * system.points.n_owned
-            change.reshape(-1)[places[own]] = -(length * turned)[own]
-            turns = True
-        if turns:
+            change.reshape(-1)[places[own]] = -(length * angle)[own]
+            changed = True
+        if changed:
             system.x[: system.points.n_owned] += change
             system.state.update_ghosts()
             system.integrator.shift_past_positions(change)
 
     # -- edges whose unknowns are in equilibrium at the end of the step -------------------------------
 
-    def _follow_edges(self, before: _Before) -> None:
-        """Let the neighbours' edges be in equilibrium at the end of the step, as the simulation's are."""
+    def _differentiate_edges(self, before: _StepStart) -> None:
+        """Solve for the edges' unknowns at the end of the step of all neighbours."""
         system, n = self._system, self._system.points.n_owned
         system.begin_edge_solve(before.x)
         rates = (system.x[:n] - before.x) / system.stage.c
-        for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-            for each in beside:
-                each.system.begin_edge_solve(before.x + each.offset * step * tangent.x)
+        for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+            for each in neighbours:
+                each.system.begin_edge_solve(before.x + each.offset * delta * tangent.x)
                 self._use_frames(each.system, before.frames)
         with self._solver(rates, set_up=True, keep=False) as solve:
-            for beside, step in zip(self._neighbours, self._steps, strict=True):
-                for each, ahead in self._at_their_stages(solve, beside, step, rates):
-                    each.system.end_edge_solve(ahead)
+            for neighbours, delta in zip(self._neighbours, self._deltas, strict=True):
+                for each, v in self._solve_stages(solve, neighbours, delta, rates):
+                    each.system.end_edge_solve(v)
         system.end_edge_solve(rates)
 
     # -- equilibria --------------------------------------------------------------------------------
 
-    def _follow_equilibrium(self, before: _Before) -> None:
+    def _differentiate_equilibrium(self, before: _StepStart) -> None:
         system, n = self._system, self._system.points.n_owned
         integrator = system.integrator
         assert isinstance(integrator, Static)
@@ -417,20 +423,21 @@ class Sensitivities:
             before.time, self.simulation.time, system.x[:n].copy(), [term.frames for term in _edged(system)]
         )
         pseudo = integrator.pseudo_dt
-        integrator.pseudo_dt = math.sqrt(MAX_GROWTH) * self._slowest()
+        integrator.pseudo_dt = math.sqrt(MAX_GROWTH) * self._fall_time()
         system.begin_step(now.before, now.factor)
         reach = system.stage.c
         with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:
-            for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-                self._change_of_force(now, beside, step, np.zeros_like(now.x))  # so that goals are known
+            for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
+                # sets the goals of handles
+                self._force_derivative(now, neighbours, delta, np.zeros_like(now.x))
                 prescribed = np.zeros_like(now.x)
-                change = _combined(beside, step, lambda each: each.system.prescribed.goal)
+                change = _difference(neighbours, delta, lambda each: each.system.prescribed.goal)
                 system.prescribed.overwrite(prescribed, change)
-                _drop_rounding(prescribed, now.x, step)
-                forces = partial(self._change_of_force, now, beside, step)
-                tangent.x = self._solved(lambda r: reach * solve(r), forces, prescribed, step)
-                self._change_of_force(now, beside, step, tangent.x)
-                for each in beside:
+                _drop_roundoff(prescribed, now.x, delta)
+                forces = partial(self._force_derivative, now, neighbours, delta)
+                tangent.x = self._solve_affine(lambda r: reach * solve(r), forces, prescribed, delta)
+                self._force_derivative(now, neighbours, delta, tangent.x)
+                for each in neighbours:
                     if each.ledger is not None:
                         each.system.evaluate_at_start()
                         each.ledger.record(now.x)
@@ -439,22 +446,24 @@ class Sensitivities:
         system.begin_step(now.before, now.factor)
         system.evaluate_at_start()
 
-    def _change_of_force(self, now: _Equilibrium, beside: list[Neighbour], step: float, way: Array) -> Array:
-        """Derivative (n_owned, 3) [N] of what is out of balance where positions change by ``way``."""
+    def _force_derivative(
+        self, now: _Equilibrium, neighbours: list[Neighbour], delta: float, dx: Array
+    ) -> Array:
+        """Derivative (n_owned, 3) [N] of the out-of-balance force if that of the positions is ``dx``."""
 
-        def against(each: Neighbour) -> Array:
+        def residual(each: Neighbour) -> Array:
             system = each.system
-            system.state.set(now.x + each.offset * step * way, np.zeros_like(now.x))
+            system.state.set(now.x + each.offset * delta * dx, np.zeros_like(now.x))
             for term, frames in zip(_edged(system), now.frames, strict=True):
                 term.frames = frames
             system.applied.factor = self._system.applied.factor
             system.begin_step(now.before, now.factor)
             return -system.out_of_balance()[0]
 
-        return self._free(_combined(beside, step, against))
+        return self._free(_difference(neighbours, delta, residual))
 
-    def _slowest(self) -> float:
-        """A time [s] in which sheets of this mass fall far."""
+    def _fall_time(self) -> float:
+        """Time [s] in which the loads move a sheet of this mass by its size."""
         system = self._system
         loads, mass = np.linalg.norm(system.applied.force), system.mass.sum()
         force, total = system.points.global_sum(float(loads) ** 2, float(mass))
@@ -464,7 +473,7 @@ class Sensitivities:
 
     @contextmanager
     def _solver(self, velocity: Array, *, set_up: bool, keep: bool) -> Iterator[Callable[[Array], Array]]:
-        """Approximate solutions by the Jacobian at the velocities of the simulation's stage."""
+        """A context that gives approximate solutions by the Jacobian at the velocities of the stage."""
         stepper, system = self.simulation.stepper, self._system
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
@@ -493,38 +502,38 @@ class Sensitivities:
     def _dot(self, a: Array, b: Array) -> float:
         return float(self._system.points.global_sum(float(np.vdot(a, b)))[0])
 
-    def _solved(
-        self, solve: Callable[[Array], Array], change: Callable[[Array], Array], start: Array, step: float
+    def _solve_affine(
+        self, solve: Callable[[Array], Array], function: Callable[[Array], Array], start: Array, delta: float
     ) -> Array:
-        """Where an affine function (n_owned, 3) of a way (n_owned, 3) vanishes, from ``start`` on.
+        """Solve an affine ``function`` (n_owned, 3) of an array (n_owned, 3) for zero, from ``start``.
 
-        Not beyond the round-off of forces over δ = ``step``, where corrections lead nowhere.
+        Corrections end at the round-off of forces over δ = ``delta``.
         """
-        way = start.copy()
-        residual = change(way)
+        solution = start.copy()
+        residual = function(solution)
         first = norm = math.sqrt(self._dot(residual, residual))
-        roundoff = self.simulation.roundoff / step
+        roundoff = self.simulation.roundoff / delta
         directions: list[tuple[Array, Array]] = []
-        for _ in range(MOST_CORRECTIONS):
-            if norm <= max(self._tolerance * first, LITTLE * roundoff):
-                return way
+        for _ in range(MAX_CORRECTIONS):
+            if norm <= max(self._tolerance * first, ROUNDOFF_FRACTION * roundoff):
+                return solution
             direction = solve(-residual)
-            image = change(way + direction) - residual
-            for earlier, its_image in directions:
-                part = self._dot(image, its_image)
-                direction, image = direction - part * earlier, image - part * its_image
+            image = function(solution + direction) - residual
+            for earlier, earlier_image in directions:
+                factor = self._dot(image, earlier_image)
+                direction, image = direction - factor * earlier, image - factor * earlier_image
             size = math.sqrt(self._dot(image, image))
             if not (math.isfinite(size) and size > 0.0):
                 break
             direction, image = direction / size, image / size
             directions.append((direction, image))
-            part = self._dot(image, residual)
-            way, residual, before = way - part * direction, residual - part * image, norm
+            factor = self._dot(image, residual)
+            solution, residual, before = solution - factor * direction, residual - factor * image, norm
             norm = math.sqrt(self._dot(residual, residual))
             if norm > 0.5 * before and norm <= roundoff:
-                return way
-        if norm <= max(ENOUGH * first, roundoff):
-            return way
+                return solution
+        if norm <= max(ACCEPTED * first, roundoff):
+            return solution
         raise SolverError(
             f"the tangent equations are not solved at {self.simulation.time:g}: their residual stays at "
             f"{norm / first:.2g} of their right side; the state is near a bifurcation, or not converged: "
@@ -535,41 +544,43 @@ class Sensitivities:
     # -- what comes out ----------------------------------------------------------------------------
 
     def derivatives(self, quantity: Callable[[Problem, Ledger | None], Array]) -> Array:
-        """Of a quantity (m,) of the present state with respect to the numbers, (m, n).
+        """Derivatives (m, n) of a quantity (m,) of the present state with respect to the n numbers.
 
         Parameters
         ----------
         quantity : callable
-            Gets a problem at its state, and its ledger where reactions were asked for; collective.
+            Takes a problem at its state, and its ledger if reactions are needed; collective.
         """
         n, columns = self._system.points.n_owned, []
-        for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
+        for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
 
-            def value(each: Neighbour, tangent: Tangent = tangent, step: float = step) -> Array:
-                way, system = each.offset * step, each.system
-                system.state.set(self._system.x[:n] + way * tangent.x, self._system.v[:n] + way * tangent.v)
+            def value(each: Neighbour, tangent: Tangent = tangent, delta: float = delta) -> Array:
+                change, system = each.offset * delta, each.system
+                system.state.set(
+                    self._system.x[:n] + change * tangent.x, self._system.v[:n] + change * tangent.v
+                )
                 return np.asarray(quantity(each.problem, each.ledger))
 
-            columns.append(_combined(beside, step, value))
+            columns.append(_difference(neighbours, delta, value))
         return np.stack(columns, axis=1)
 
 
-def _combined(beside: Sequence[Neighbour], step: float, of: Callable[[Neighbour], Array]) -> Array:
-    """The derivative of what each neighbour gives."""
+def _difference(neighbours: Sequence[Neighbour], delta: float, of: Callable[[Neighbour], Array]) -> Array:
+    """Finite difference of a quantity ``of`` each neighbour."""
     total: Array | float = 0.0
-    for each in beside:
-        total = total + (each.weight / step) * of(each)
+    for each in neighbours:
+        total = total + (each.weight / delta) * of(each)
     return np.asarray(total)
 
 
-def _remembered(name: str, each: Neighbour) -> Array:
-    """An array of the integrator's memory."""
+def _memory_array(name: str, each: Neighbour) -> Array:
+    """The array ``name`` of the integrator's memory."""
     return each.system.integrator.memory()[0][name]
 
 
-def _drop_rounding(values: Array, base: Array, step: float) -> None:
-    """Let derivatives of what does not depend on the number be 0, which differences leave at round-off."""
-    values[np.abs(values) * step <= 1e-14 * (1.0 + np.abs(base))] = 0.0
+def _drop_roundoff(values: Array, base: Array, delta: float) -> None:
+    """Set derivatives to 0 that are round-off only, of values that do not depend on the number."""
+    values[np.abs(values) * delta <= 1e-14 * (1.0 + np.abs(base))] = 0.0
 
 
 def _edged(system: StageEquations) -> list[MidEdge]:
@@ -585,18 +596,18 @@ def _product(system: StageEquations, values: Array, v: Array) -> Array:
     return rows.product(values, local)
 
 
-def _scenes(scene: Scene, number: Number, step: float) -> Iterator[tuple[float, float, Scene]]:
+def _scenes(scene: Scene, number: Number, delta: float) -> Iterator[tuple[float, float, Scene]]:
     """Offsets, weights and scenes of a number's neighbours.
 
     Raises
     ------
     InputError
-        If there are none on one side and the other.
+        If neither central nor one-sided differences give valid scenes.
     """
 
     def changed(weights: Mapping[int, float]) -> list[tuple[float, float, Scene]]:
         return [
-            (float(offset), weight, scene.changed({number.key: number.value + offset * step}))
+            (float(offset), weight, scene.changed({number.key: number.value + offset * delta}))
             for offset, weight in weights.items()
         ]
 
