@@ -107,9 +107,8 @@ class ContactModel:
         descends = bool(residual.dot(y) > 0.0)
         if not descends:
             first.copy(y)
-        equations.release_contact_springs(
-            dict(zip(self._springs, self._split(length), strict=True)) if descends else {}
-        )
+        lengths = zip(self._springs, self._split(length), strict=True)
+        equations.release_contact_springs(dict(lengths) if descends else {})
         for each in (first, z, remaining):
             each.destroy()
         return descends

@@ -127,9 +127,8 @@ class Convergence:
             if moved > self.max_displacement:
                 return int(Reason.DIVERGED_MAX_IT)
             self._estimate_remaining(moved)
-            self.mean_iterations += RECENT * (
-                linear_iterations - self._iterations_before - self.mean_iterations
-            )
+            spent = linear_iterations - self._iterations_before
+            self.mean_iterations += RECENT * (spent - self.mean_iterations)
         slow = iteration > 0 and residual > STALLED * before
         if slow and self._equations.discretisation.has_near_elements:
             self._floor = max(self._least_floor, contact_roundoff(self._equations))

@@ -330,9 +330,8 @@ class Equilibrium:
         if self._pressures is None:
             self._tangent, iterations = self._stepper.tangent(rate)
         else:
-            self._tangent, iterations = self._pressures.tangent(
-                rate, self._pressures.linearise_loads(before, factor)
-            )
+            loads = self._pressures.linearise_loads(before, factor)
+            self._tangent, iterations = self._pressures.tangent(rate, loads)
         if self._tangent is not None:
             self._tangent += moved / step
         return iterations
@@ -477,9 +476,8 @@ class Equilibrium:
         if moved > MAX_DISPLACEMENT * self._size:
             return f"no equilibrium within {moved:.1g} m of the start, as if nothing held the sheet"
         if solves - last_progress >= PATIENCE:
-            return (
-                f"no equilibrium: the last {solves - last_progress} of {solves} proximal steps came no nearer"
-            )
+            idle = solves - last_progress
+            return f"no equilibrium: the last {idle} of {solves} proximal steps came no nearer"
         return f"no equilibrium within {solves} proximal steps" if solves >= MAX_SOLVES else ""
 
     def _failed_solve(self, before: float, factor: float, history: list[Iteration], x: Array) -> FailedSolve:

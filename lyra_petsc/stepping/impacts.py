@@ -122,20 +122,17 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
     layout, n, dt, damping = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
     all_pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
-        handle_force = np.zeros(len(system.prescribed.indices))
-        return ContactImpulses(
-            damping, handle_force, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3))
-        )
+        reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)
+        return ContactImpulses(damping, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))
     # a pair is handled by the rank of one of its vertices, which knows all pairs with the same nearest points
     owned = [np.empty(len(pairs.points), dtype=bool) for pairs in all_pairs]
     for pairs, own in zip(all_pairs, owned, strict=True):
         dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
     sheets = _corrects_sheets(system)
-    inverse = _inverse_masses(
-        system, [(*pairs[:2], own) for pairs, own in zip(all_pairs, owned, strict=True)]
-    )
+    both = list(zip(all_pairs, owned, strict=True))
+    inverse = _inverse_masses(system, [(*pairs[:2], own) for pairs, own in both])
     work, impulse, pushes = 0.0, np.zeros_like(system.x), []
-    for pairs, own in zip(all_pairs, owned, strict=True):
+    for pairs, own in both:
         push = np.empty(len(own))
         given = *pairs[:4], pairs.pushed, own, dt, DAMPING
         dashpots.damp(system.v, inverse, *given, push, impulse)
@@ -146,9 +143,8 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
         force = (push[on] / dt)[:, None] * pairs.normal[on]
         pushes.append(_obstacle_forces(system, pairs.points[on], pairs.beta[on], pairs.obstacle[on], force))
     handle_force, heat = _apply_impulse(system, impulse, work)
-    return ContactImpulses(
-        damping, handle_force, work, heat, *(np.concatenate(part) for part in zip(*pushes, strict=True))
-    )
+    on_obstacles = (np.concatenate(part) for part in zip(*pushes, strict=True))
+    return ContactImpulses(damping, handle_force, work, heat, *on_obstacles)
 
 
 def correct_friction(system: StageEquations, term: Elastic, before: ContactImpulses) -> ContactImpulses:
@@ -187,13 +183,9 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     work, on = float(np.vdot(force, moved)), obstacle >= 0
     pushed = _obstacle_forces(system, points[on], beta[on], obstacle[on], force[on])
     handle_force, heat = _apply_impulse(system, impulse, work)
-    return ContactImpulses(
-        before.damping,
-        before.handle_force + handle_force,
-        before.work + work,
-        before.heat + heat,
-        *(np.concatenate(part) for part in zip(before[4:], pushed, strict=True)),
-    )
+    sums = before.handle_force + handle_force, before.work + work, before.heat + heat
+    on_obstacles = (np.concatenate(part) for part in zip(before[4:], pushed, strict=True))
+    return ContactImpulses(before.damping, *sums, *on_obstacles)
 
 
 def _corrects_sheets(system: StageEquations) -> bool:

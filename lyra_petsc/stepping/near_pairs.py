@@ -75,9 +75,8 @@ def worst_pair(system: StageEquations) -> NearPair | None:
         return nearest_pair(system, system.evaluated[0])
 
     def obstruction(term: Elastic) -> Array:
-        return 1.0 - term.collision_free_fractions(
-            refused.x, refused.displacement, system.active.frozen[term], refused.part
-        )
+        x, displacement, part = refused
+        return 1.0 - term.collision_free_fractions(x, displacement, system.active.frozen[term], part)
 
     return _worst(system, refused.x, obstruction)
 

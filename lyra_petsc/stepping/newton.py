@@ -185,17 +185,14 @@ class Newton:
             failed = self._lacks_descent(residual, y)
         if self._contact is not None and not failed:
             changed |= self._apply_contact_model(x, residual, y)
-        curved = (
-            self._arcs is not None
-            and self.globalisation.takes_full_steps
-            and self._apply_arcs(x, residual, y)
-        )
-        if self._equations.active.with_edges and self.globalisation.takes_full_steps and not curved:
+        full = self.globalisation.takes_full_steps
+        curved = self._arcs is not None and full and self._apply_arcs(x, residual, y)
+        if self._equations.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
         if self._equations.limits_steps and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
-        if self._corrects and self.globalisation.takes_full_steps:
+        if self._corrects and full:
             exact = self._linear.uses_operator and self._blend.value == 0.0
             changed |= self._apply_corrections(x, y, exact=exact)
         if self._last_iterate is not None:

@@ -107,6 +107,9 @@ class Neighbour:
         return self.problem.system
 
 
+Neighbours = list[Neighbour]
+
+
 @dataclass(frozen=True)
 class _StepStart:
     """Time, state and memory at the start of a step."""
@@ -200,7 +203,7 @@ class Sensitivities:
 
     # -- start -------------------------------------------------------------------------------------
 
-    def _begin(self, neighbours: list[Neighbour], delta: float, *, reactions: bool) -> None:
+    def _begin(self, neighbours: Neighbours, delta: float, *, reactions: bool) -> None:
         """Compute the derivatives at the start of the simulation."""
         n, points = self._system.points.n_owned, self._system.points
         tangent = Tangent(np.zeros((n, 3)), np.zeros((n, 3)))
@@ -325,7 +328,7 @@ class Sensitivities:
             system.forget_forces()
 
     def _solve_stages(
-        self, solve: Callable[[Array], Array], neighbours: list[Neighbour], delta: float, velocity: Array
+        self, solve: Callable[[Array], Array], neighbours: Neighbours, delta: float, velocity: Array
     ) -> list[tuple[Neighbour, Array]]:
         """Solve for the velocities (n_owned, 3) of the stages of a number's neighbours."""
         change = _difference(neighbours, delta, lambda each: each.system.prescribed.velocity)
@@ -339,9 +342,7 @@ class Sensitivities:
             stages.append((each, v))
         return stages
 
-    def _stage_derivative(
-        self, neighbours: list[Neighbour], delta: float, velocity: Array, dv: Array
-    ) -> Array:
+    def _stage_derivative(self, neighbours: Neighbours, delta: float, velocity: Array, dv: Array) -> Array:
         """Derivative (n_owned, 3) of G if the derivative of the stage's velocities is ``dv``."""
 
         def residual(each: Neighbour) -> Array:
@@ -361,7 +362,7 @@ class Sensitivities:
     def _free(self, values: Array) -> Array:
         return np.where(self._system.prescribed.free, values, 0.0)
 
-    def _update_tangent(self, tangent: Tangent, neighbours: list[Neighbour], delta: float) -> None:
+    def _update_tangent(self, tangent: Tangent, neighbours: Neighbours, delta: float) -> None:
         """Compute the derivatives of the state from the states of the neighbours."""
         n = self._system.points.n_owned
         for each in neighbours:
@@ -446,9 +447,7 @@ class Sensitivities:
         system.begin_step(now.before, now.factor)
         system.evaluate_at_start()
 
-    def _force_derivative(
-        self, now: _Equilibrium, neighbours: list[Neighbour], delta: float, dx: Array
-    ) -> Array:
+    def _force_derivative(self, now: _Equilibrium, neighbours: Neighbours, delta: float, dx: Array) -> Array:
         """Derivative (n_owned, 3) [N] of the out-of-balance force if that of the positions is ``dx``."""
 
         def residual(each: Neighbour) -> Array:
@@ -565,7 +564,7 @@ class Sensitivities:
         return np.stack(columns, axis=1)
 
 
-def _difference(neighbours: Sequence[Neighbour], delta: float, of: Callable[[Neighbour], Array]) -> Array:
+def _difference(neighbours: Neighbours, delta: float, of: Callable[[Neighbour], Array]) -> Array:
     """Finite difference of a quantity ``of`` each neighbour."""
     total: Array | float = 0.0
     for each in neighbours:

@@ -225,9 +225,8 @@ class StageEquations:
         self._update_stencils(self.x, displacement, stops)
         self._freeze(t0 + after)
         if self.active.pushing:  # obstacles may have come near
-            displacement = (
-                None if displacement is None else self._expected_displacement()
-            )  # with the ghosts that there are now
+            # again, with the ghosts of now
+            displacement = None if displacement is None else self._expected_displacement()
             self._update_stencils(self.x, displacement, stops)
         # the start of a step may differ from the time of an event by round-off
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
@@ -249,9 +248,8 @@ class StageEquations:
     def _expected_displacement(self) -> Array:
         """Displacements (n_local, 3) [m] of the step at constant velocities, of handles exactly."""
         displacement, n = self.dt * self.v, self.points.n_owned
-        self.prescribed.overwrite(
-            displacement[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.indices)
-        )
+        x = self.x[:n].take(self.prescribed.indices)
+        self.prescribed.overwrite(displacement[:n], self.prescribed.goal - x)
         self.points.update_ghosts(displacement)
         return displacement
 
@@ -599,15 +597,10 @@ class StageEquations:
         if not self.discretisation.has_near_elements:
             return None
         n, frozen, changed = len(increment), self.active.frozen, False
-        targets = {
-            term: term.target_distances(x, displacement, frozen[term]) for term in self.active.limiting
-        }
+        targets = {t: t.target_distances(x, displacement, frozen[t]) for t in self.active.limiting}
         for _ in range(MAX_SEPARATIONS):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
-            found = [
-                term.add_corrections(x, displacement, frozen[term], target, out, count)
-                for term, target in targets.items()
-            ]
+            found = [t.add_corrections(x, displacement, frozen[t], targets[t], out, count) for t in targets]
             if not self.points.comm.allreduce(any(found), MPI.LOR):
                 break
             change = np.divide(out[:n], count[:n], out=np.zeros((n, 3)), where=count[:n] > 0.0)
@@ -739,10 +732,8 @@ class StageEquations:
         # Newton's method has checked the displacement to the stage, a single linear solve has not
         x = self.evaluate_at(v)[0] if self.integrator.iterates else self.x
         displacement = end - x[:n]
-        if (
-            not self.discretisation.has_near_elements
-            and self.discretisation.searched_fraction(x, displacement) == 1.0
-        ):
+        discretisation = self.discretisation
+        if not discretisation.has_near_elements and discretisation.searched_fraction(x, displacement) == 1.0:
             return True
         v = v if self.integrator.iterates else self.stationary_velocity()
         return self._is_collision_free(v, displacement / self.stage.c, after=True)
@@ -756,9 +747,8 @@ class StageEquations:
 
         ``displacement`` and ``stops`` are as in `Discretisation.update_stencils`.
         """
-        if not self.discretisation.stencils_change or not self.discretisation.update_stencils(
-            x, displacement, stops
-        ):
+        discretisation = self.discretisation
+        if not discretisation.stencils_change or not discretisation.update_stencils(x, displacement, stops):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
