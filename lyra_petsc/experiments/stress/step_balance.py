@@ -1,24 +1,23 @@
-"""What a step did to energy and momenta, from its two states and the terms alone.
+"""Balances of energy and momentum of a time step, computed from its two states and the terms alone.
 
-For backward Euler the energy identity, with the masses M, the elastic energy E and x' − x = Δt v' =: Δx::
+Backward Euler satisfies an energy identity; with the masses M, the elastic energy E and x' − x = Δt v' = Δx::
 
     Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt v'ᵀ D v' + bracket + work
     bracket = ∫₀¹ ∇E(x + s Δx)·Δx ds − ∇E(x')·Δx
 
-The left side is made of energies and the right of forces, so that forces which are not the gradient of
-their energy break it as surely as a step that was not solved. The integral of the membrane is exact (its
-energy is a quartic along a line); that of the hinges is refined until it stands, and where hinges jump,
-which their model does beyond 180°, it is replaced by their energies' difference.
+The left side consists of energies and the right side of forces, so that forces which are not the gradient
+of their energy violate it, as does a step that was not solved. The integral is exact for the membrane (its
+energy is a quartic along a line). For hinges it is refined until it converges; where hinges jump, as their
+model does beyond 180°, it is replaced by the difference of their energies.
 
-Every step leaves a residual r on the free coordinates, of which the solver promises ‖r‖ ≤ force tolerance
-× forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may
-be off by no more than ‖r‖ ‖Δx‖ and the round-off of its own summands, and the balance of momentum by √V
-‖r‖ Δt: these are the tolerances, none is chosen.
+Every step leaves a residual r on the free coordinates. The solver promises ‖r‖ ≤ force tolerance × largest
+force, or the round-off floor; this is judged separately. Given r, the energy identity may be violated by
+‖r‖ ‖Δx‖ plus the round-off of its terms, and the balance of momentum by √V ‖r‖ Δt. These are the tolerances;
+none of them is chosen.
 
-The stage of any other integrator solves M v̇ + ∇E + D v = f, and that is judged as for backward Euler: by
-what is left on the free coordinates, and by what the forces within the sheet add up to. There is no
-identity for its energies; but along the way of a step the elastic forces must add up to the change of the
-elastic energy.
+The stage of any other integrator solves M v̇ + ∇E + D v = f. It is judged like backward Euler by the residual
+on the free coordinates and by the sum of the internal forces. There is no energy identity, but the work of
+the elastic forces along a step must equal the change of the elastic energy.
 """
 
 from __future__ import annotations
@@ -49,22 +48,22 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
 
-MOST_PANELS, NEAR_PANELS = 16, (64, 1024)
-"""Of the integral along the hinges' way, and fewest and most of that of contact, or one for half the gap.
-With fewer, two values may agree by chance, as pairs with one feature become pairs with another."""
+MAX_PANELS, CONTACT_PANELS = 16, (64, 1024)
+"""Most panels of the integral for hinges; fewest and most for contact, which has at least one per half gap.
+With fewer panels two values may agree by chance where a pair changes from one feature to another."""
 
-SAMPLES, WIDEST_TURN = 9, 1.0
-"""Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
-passes 180° changes its energy without a force, one whose triangle is turned over in its plane loses it and
-has it back within a short way."""
+TURN_SAMPLES, LARGEST_TURN = 9, 1.0
+"""Samples of a step, and the change of angle [rad] between two samples beyond which a hinge may have jumped.
+A hinge that passes 180° changes its energy without a force; one whose triangle is inverted in its plane loses
+its energy and regains it within a short displacement."""
 
 
 Terms = Mapping[Elastic, Any]
-"""Terms, and what each of them froze for the step."""
+"""Terms with their data that are frozen for the step."""
 
 
 def gradient(terms: Terms, x: Array) -> Array:
-    """Of the terms' energy at x (n_local, 3), [N]."""
+    """Gradient (n_local, 3) [N] of the energy of the terms at x (n_local, 3)."""
     out = np.zeros_like(x)
     for term, frozen in terms.items():
         term.add_gradient(x, frozen, out)
@@ -72,59 +71,59 @@ def gradient(terms: Terms, x: Array) -> Array:
 
 
 def energy(terms: Terms, x: Array) -> float:
-    """Of this rank's elements [J]."""
+    """Energy [J] of this rank's elements."""
     return sum(float(term.energies(x, frozen).sum()) for term, frozen in terms.items())
 
 
-def force_along(
-    comm: MPI.Comm, n: int, terms: Terms, turned: Terms, x0: Array, dx: Array, *, enough: float
+def work_of_forces(
+    comm: MPI.Comm, n: int, terms: Terms, start_frames: Terms, x0: Array, dx: Array, tolerance: float
 ) -> tuple[float, bool]:
-    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether some of it is from energies; collective.
+    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether energy differences replace a part of it; collective.
 
-    Exact for the membrane, whose energy is a quartic along a line; refined until it stands for the rest.
+    Exact for the membrane, whose energy is a quartic along a line; for other terms refined to convergence.
 
     Parameters
     ----------
     n : int
         Owned vertices of this rank.
-    terms : mapping of Elastic to what it froze for the step
-    turned : mapping of Elastic
-        Of those whose frames turned within the step, the frames in which it began.
+    terms : mapping of Elastic to its data frozen for the step
+    start_frames : mapping of Elastic
+        Frames at the start of the step of the terms whose frames turned within it.
     x0, dx : (n_local, 3)
-        Where the way begins, and the way [m].
-    enough : float
-        Error [J] that does not matter.
+        Positions at the start of the step and displacements [m].
+    tolerance : float
+        Error of the integral [J] that is accepted.
     """
-    smooth: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
-    near = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
-    bent = {term: frozen for term, frozen in terms.items() if term not in smooth and term not in near}
+    membrane: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
+    contact = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
+    hinges = {term: frozen for term, frozen in terms.items() if term not in membrane and term not in contact}
 
-    def refined(which: Terms, panels: int, most: int) -> float | None:
-        """The integral of these terms' forces, from so many panels on; None if it does not stand."""
-        before, fine = math.nan, panels >= most
+    def refined(part: Terms, panels: int, max_panels: int) -> float | None:
+        """The integral for some terms, starting with this many panels; None if it does not converge."""
+        before, fine = math.nan, panels >= max_panels
         while not fine:
-            now = _integral(comm, which, n, x0, dx, panels, 5)
-            if abs(now - before) <= max(enough, EPSILON * abs(now)):
+            now = _integral(comm, part, n, x0, dx, panels, 5)
+            if abs(now - before) <= max(tolerance, EPSILON * abs(now)):
                 return now
-            before, fine, panels = now, panels >= most, 2 * panels
+            before, fine, panels = now, panels >= max_panels, 2 * panels
         return None
 
-    value, followed = _integral(comm, smooth, n, x0, dx, 1, 2), True
-    widest = math.inf if turned else _widest_turn(bent, x0, dx)
-    follows = comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN
-    # a barrier is as wide as its gap; second derivatives leap where nearest points go from edge to triangle
-    farthest, skin = largest(comm, dx[:n]), min((term.skin for term in near), default=0.0)
-    fewest, most_near = NEAR_PANELS
-    panels = max(fewest, math.ceil(farthest / skin)) if skin > 0.0 else fewest
-    for which, known, first, most in ((bent, follows, 1, MOST_PANELS), (near, True, panels, most_near)):
-        if which:
-            found = refined(which, first, most) if known else None
-            if found is None:
-                then = {term: turned.get(term, frozen) for term, frozen in which.items()}
-                change = energy(which, x0 + dx) - energy(then, x0)
-                found, followed = float(comm.allreduce(change)), False
-            value += found
-    return value, not followed
+    value, by_energies = _integral(comm, membrane, n, x0, dx, 1, 2), False
+    turn = math.inf if start_frames else _largest_turn(hinges, x0, dx)
+    smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
+    # a barrier is as wide as its gap; second derivatives jump where the nearest feature changes
+    largest_dx, skin = largest(comm, dx[:n]), min((term.skin for term in contact), default=0.0)
+    panels, most = CONTACT_PANELS
+    panels = max(panels, math.ceil(largest_dx / skin)) if skin > 0.0 else panels
+    for part, refine, first, last in ((hinges, smooth, 1, MAX_PANELS), (contact, True, panels, most)):
+        if part:
+            integral = refined(part, first, last) if refine else None
+            if integral is None:
+                at_start = {term: start_frames.get(term, frozen) for term, frozen in part.items()}
+                change = energy(part, x0 + dx) - energy(at_start, x0)
+                integral, by_energies = float(comm.allreduce(change)), True
+            value += integral
+    return value, by_energies
 
 
 def _integral(comm: MPI.Comm, terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
@@ -138,45 +137,46 @@ def _integral(comm: MPI.Comm, terms: Terms, n: int, x0: Array, dx: Array, panels
     return float(comm.allreduce(value / panels))
 
 
-def _widest_turn(terms: Terms, x0: Array, dx: Array) -> float:
-    """Largest change [rad] of a hinge's angle between two of `SAMPLES` points of the way."""
-    widest = 0.0
+def _largest_turn(terms: Terms, x0: Array, dx: Array) -> float:
+    """Largest change [rad] of a hinge's angle between two of `TURN_SAMPLES` points of the displacement."""
+    turn = 0.0
     for term in terms:
         if isinstance(term, Bending):
             before = term.angles(x0)
-            for s in np.linspace(0.0, 1.0, SAMPLES)[1:]:
+            for s in np.linspace(0.0, 1.0, TURN_SAMPLES)[1:]:
                 now = term.angles(x0 + s * dx)
-                widest = max(widest, float(np.abs(now - before).max(initial=0.0)))
+                turn = max(turn, float(np.abs(now - before).max(initial=0.0)))
                 before = now
-    return widest
+    return turn
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepBalance:
-    """The balances of one step; J, N, kg m/s and kg m²/s, the same on every rank.
+    """The balances of one step in J, N, kg m/s and kg m²/s, the same on every rank.
 
     Attributes
     ----------
     change : float
-        Of kinetic + potential energy in the step.
+        Change of kinetic + potential energy in the step.
     numerical, viscous : float
         ½ ‖Δv‖²_M and Δt v'ᵀ D v'.
     bracket, work : float
+        See the module.
     defect, tolerance : float
-        Left minus right side of the energy identity, and what it may be.
+        Left minus right side of the energy identity, and its tolerance.
     residual, promised, floor : float
-        Norm of the forces left on free coordinates, what the solver promised, and its round-off.
+        Norm of the residual on free coordinates, the norm that the solver promised, and the round-off floor.
     driving : float
-        Norm of the largest of the other forces there, those within the sheet left out.
-    push : float
-        How far those forces moved the sheet [m]: largest change of a free coordinate beyond Δt v.
+        Norm on free coordinates of the largest kind of force, internal forces excluded.
+    displacement : float
+        Displacement by these forces [m]: largest change of a free coordinate beyond Δt v.
     momentum, momentum_tolerance : float
-        Largest component of Δ(Σ m v) − Δt Σ forces from outside.
-    spin, spin_tolerance : float
-        Of Σ (x' − centre) × (m Δv) − Δt Σ torques.
-    jumped : bool
-        Hinges turned too far to follow, or parts in contact went far over the gap; their part of the bracket
-        is from their energies.
+        Largest component of Δ(Σ m v) − Δt Σ external forces, and its tolerance.
+    angular, angular_tolerance : float
+        Largest component of Σ (x' − centre) × (m Δv) − Δt Σ torques, and its tolerance.
+    hinges_jumped : bool
+        Hinges turned too far, or contacts moved much farther than the gap, for their forces to be integrated;
+        their part of the bracket is computed from energies.
     """
 
     change: float
@@ -190,137 +190,140 @@ class StepBalance:
     promised: float
     floor: float
     driving: float
-    push: float
+    displacement: float
     momentum: float
     momentum_tolerance: float
-    spin: float = 0.0
-    spin_tolerance: float = 0.0
-    jumped: bool = False
+    angular: float = 0.0
+    angular_tolerance: float = 0.0
+    hinges_jumped: bool = False
 
     @property
-    def moved(self) -> float:
-        """Energy [J] that the step turned over."""
+    def energy_exchanged(self) -> float:
+        """Sum of the sizes of all terms of the energy identity [J]."""
         return abs(self.change) + self.numerical + abs(self.viscous) + abs(self.bracket) + abs(self.work)
 
 
 def largest(comm: MPI.Comm, values: Array) -> float:
-    """Largest size of all values on all ranks."""
+    """Largest absolute value on all ranks."""
     return float(comm.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX))
 
 
-def _in_space(term: Elastic) -> bool:
-    """Whether a term of the sheet's energy also pushes from outside: clamps and contact with obstacles."""
+def _acts_from_outside(term: Elastic) -> bool:
+    """Whether a term of the sheet's energy also exerts external forces: clamps, contact with obstacles."""
     return term.registration.moving or term.registration.neighbours
 
 
-class Accountant:
-    """Takes the balance of each step of a simulation by backward Euler; collective.
+class BalanceRecorder:
+    """Computes the balance of each step of backward Euler; collective.
 
     Parameters
     ----------
     simulation : SteppedScene
-        Before its first step; `look` must see every state from which a step starts.
+        Before its first step; `record_state` must be called before every step.
     """
 
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
         self._system = simulation.problem.system
-        pulls = [term for term in self._system.active.elastic if term.registration.role is Role.CONSTRAINT]
-        self._pulling, self._elastic = pulls, [t for t in self._system.active.elastic if t not in pulls]
-        self.look()
+        elastic = self._system.active.elastic
+        self._handle_terms = [term for term in elastic if term.registration.role is Role.CONSTRAINT]
+        self._sheet_terms = [term for term in elastic if term not in self._handle_terms]
+        self.record_state()
 
     @property
-    def _shell(self) -> Terms:
-        """The sheet's own terms, with targets where they stand now."""
-        return {term: self._system.active.frozen[term] for term in self._elastic}
+    def _sheet(self) -> Terms:
+        """The energies of the sheet, with the present targets of clamps."""
+        return {term: self._system.active.frozen[term] for term in self._sheet_terms}
 
     @property
     def _springs(self) -> Terms:
-        """The terms by which handles pull."""
-        return {term: self._system.active.frozen[term] for term in self._pulling}
+        """The springs of handles."""
+        return {term: self._system.active.frozen[term] for term in self._handle_terms}
 
-    def look(self) -> None:
-        """Note the state, and the energy with which its clamps end the step before."""
+    def record_state(self) -> None:
+        """Store the state and its energy, with the targets that clamps have at the end of the last step."""
         system = self._system
         self._x, self._v = system.x.copy(), system.v.copy()
-        self._energy = energy(self._shell, system.x)
-        self._frames: Terms = {term: term.frames for term in self._elastic if isinstance(term, MidEdge)}
+        self._energy = energy(self._sheet, system.x)
+        self._frames: Terms = {term: term.frames for term in self._sheet_terms if isinstance(term, MidEdge)}
 
     @property
     def _solved(self) -> Array:
-        """Velocities (n_local, 3) [m/s] that the step's equations led to, before dashpots of impacts."""
+        """Velocities (n_local, 3) [m/s] that solve the equations of the step, before impact damping."""
         return self._system.v if self._system.contact_impulses is None else self._system.evaluated[1]
 
-    def _fit(self) -> None:
-        """Give the positions in which the step began the ghosts that contact needs now; collective."""
+    def _update_start_ghosts(self) -> None:
+        """Extend the positions at the start of the step to the present ghosts of contact; collective."""
         layout = self._system.points
         self._x = resized(self._x, layout.n_owned, layout.n_local)
         layout.update_ghosts(self._x)
 
     @property
-    def _turned(self) -> Terms:
-        """Terms whose frames have turned since the step began, in those of its beginning."""
+    def _start_frames(self) -> Terms:
+        """Frames at the start of the step of the terms whose frames have turned since."""
         now = self._system.active.frozen
         return {term: frames for term, frames in self._frames.items() if now[term] is not frames}
 
     def balance(self, report: StepReport) -> StepBalance:
-        """The balance of the step just accepted, which started from the state looked at last."""
+        """The balance of the step just accepted, which started from the state recorded last."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
-        self._fit()
+        self._update_start_ghosts()
         x0, v0, x1, v1 = self._x, self._v, system.x, self._solved
         dx, dv = x1 - x0, v1[:n] - v0[:n]
         free = ~system.prescribed.mask[:n]
-        parts = self._parts(report, dv / dt)
+        parts = self._force_terms(report, dv / dt)
         reaction = self._simulation.ledger.reaction
-        if system.contact_impulses is not None:  # after the equations were solved
+        if system.contact_impulses is not None:  # impact damping acts after the equations are solved
             at = system.prescribed.indices
             reaction.put(at, reaction.take(at) - system.contact_impulses.handle_force)
-        weight = self._gravity(report)
-        moved = dx[:n]
+        weight = self._weight(report)
+        owned_dx = dx[:n]
         outside = -parts["loads"] + reaction
         for name in ("springs", "wind"):
             outside = outside - parts[name]
-        # planes of clamps and obstacles stand in space: their energy is stored, but they push from outside
-        planes = {term: frozen for term, frozen in self._shell.items() if _in_space(term)}
-        pushed = gradient(planes, x1)[:n]
-        slowed = self._damping(planes, v1)[:n]
-        energy_now, energy_then = energy(self._shell, x1), energy({**self._shell, **self._turned}, x0)
-        turned = energy_then - self._energy
+        # clamps and obstacles store energy, but exert external forces as they are fixed in space
+        external = {term: frozen for term, frozen in self._sheet.items() if _acts_from_outside(term)}
+        external_gradient = gradient(external, x1)[:n]
+        external_damping = self._damping(external, v1)[:n]
+        energy_now, energy_then = energy(self._sheet, x1), energy({**self._sheet, **self._start_frames}, x0)
+        target_work = energy_then - self._energy
         mass, size_of_g = system.mass[:, None], float(np.linalg.norm(self._simulation.scene.gravity or 0.0))
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
-         free_way, way, energy_noise, forces, powers, heights) = system.points.global_sum(
+         free_dx, all_dx, energy_noise, forces, powers, heights) = system.points.global_sum(
             0.5 * float(np.sum(mass * v0[:n] ** 2)),
             0.5 * float(np.sum(mass * v1[:n] ** 2)),
             energy_now - energy_then,
-            turned,
+            target_work,
             sum(load.potential(x0) for load in system.active.loads),
             sum(load.potential(x1) for load in system.active.loads),
             0.5 * float(np.sum(mass * dv**2)),
-            float(np.vdot(parts["damping"], moved)),
-            float(np.vdot(parts["internal"], moved)),
-            float(np.vdot(outside - weight, moved)),
-            float(np.sum(moved**2, where=free)),
-            float(np.sum(moved**2)),
+            float(np.vdot(parts["damping"], owned_dx)),
+            float(np.vdot(parts["internal"], owned_dx)),
+            float(np.vdot(outside - weight, owned_dx)),
+            float(np.sum(owned_dx**2, where=free)),
+            float(np.sum(owned_dx**2)),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
-            float(sum(np.abs(part * moved).sum() for part in parts.values())),
+            float(sum(np.abs(part * owned_dx).sum() for part in parts.values())),
             float(np.abs(mass * np.abs(system.x[:n])).sum()) * size_of_g,
         ).tolist()  # fmt: skip
         reach = largest(comm, x1)
-        left = self._left(parts, reach, dt)
-        solved = left["residual"] * np.sqrt(free_way) + left["floor"] * np.sqrt(way)
-        # positions are rounded, too: x' − x is Δt v' only to their last digit
+        left = self._residual_norms(parts, reach, dt)
+        solved = left["residual"] * np.sqrt(free_dx) + left["floor"] * np.sqrt(all_dx)
+        # positions are rounded: x' − x equals Δt v' only to the last digit of x
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
-        along, jumped = force_along(comm, n, self._shell, self._turned, x0, dx, enough=0.1 * tolerance)
+        along, hinges_jumped = work_of_forces(
+            comm, n, self._sheet, self._start_frames, x0, dx, 0.1 * tolerance
+        )
         bracket = along - inner
         change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
         work = outer + turn
         defect = change - (-numerical - viscous + bracket + work)
-        gap = mass * dv - dt * (outside - pushed - slowed)
+        defects = mass * dv - dt * (outside - external_gradient - external_damping)
         unsolved = left["residual"] + left["floor"]
-        damped = gap + dt * (parts["damping"] - slowed)
+        damped_defects = defects + dt * (parts["damping"] - external_damping)
         return StepBalance(
             change=change,
             numerical=numerical,
@@ -329,14 +332,14 @@ class Accountant:
             work=work,
             defect=defect,
             tolerance=tolerance,
-            jumped=jumped,
+            hinges_jumped=hinges_jumped,
             **left,
-            **self._momenta(gap, damped, dt, unsolved, forces, reach),
+            **self._momentum_defects(defects, damped_defects, dt, unsolved, forces, reach),
         )
 
-    def _left(self, parts: Mapping[str, Array], reach: float, dt: float) -> dict[str, float]:
-        """Norms [N] of what is left of the forces, of what the solver promised, its floor of round-off and
-        the driving forces, and how far they moved the sheet [m]; by the names of `StepBalance`."""
+    def _residual_norms(self, parts: Mapping[str, Array], reach: float, dt: float) -> dict[str, float]:
+        """Norms [N] of the residual, its promised bound, its round-off floor and the driving forces, and the
+        displacement [m] by these; keys are fields of `StepBalance`."""
         system, simulation = self._system, self._simulation
         free = ~system.prescribed.mask[: system.points.n_owned]
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
@@ -344,19 +347,19 @@ class Accountant:
         *each, residual = np.sqrt(squares).tolist()
         floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
         n = len(free)
-        way = system.x[:n] - self._x[:n] - dt * self._v[:n]
+        displacement = system.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
             "residual": residual,
             "promised": max(simulation.scene.solver.force_tolerance * max(each), floor),
             "floor": floor,
             "driving": max(norm for name, norm in zip(parts, each, strict=True) if name != "internal"),
-            "push": largest(system.points.comm, np.where(free, way, 0.0)),
+            "displacement": largest(system.points.comm, np.where(free, displacement, 0.0)),
         }
 
     # -- parts ---------------------------------------------------------------------------------------
 
-    def _parts(self, report: StepReport, rate: Array) -> dict[str, Array]:
-        """The summands of F, each (n_owned, 3) [N], evaluated anew; loads with their sign in F."""
+    def _force_terms(self, report: StepReport, rate: Array) -> dict[str, Array]:
+        """The terms of the residual F, each (n_owned, 3) [N], evaluated again; loads with their sign in F."""
         system = self._system
         n, x1, v1 = system.points.n_owned, system.x, self._solved
         force = np.zeros((system.points.n_local, 3))
@@ -368,15 +371,15 @@ class Accountant:
             term.add_gradient(v1, term.freeze(step), wind)
         return {
             "inertia": system.mass[:, None] * rate,
-            "internal": gradient(self._shell, x1)[:n],
+            "internal": gradient(self._sheet, x1)[:n],
             "springs": gradient(self._springs, x1)[:n],
-            "damping": self._damping(self._shell, v1)[:n],
+            "damping": self._damping(self._sheet, v1)[:n],
             "wind": wind[:n],
             "loads": -force[:n],
         }
 
     def _damping(self, terms: Terms, v: Array) -> Array:
-        """D v (n_owned, 3) [N], assembled anew with the stiffness of the start of the step."""
+        """D v (n_owned, 3) [N], assembled again with the stiffness at the start of the step."""
         system = self._system
         rows = system.discretisation.fixed
         values = rows.zeros()
@@ -387,8 +390,8 @@ class Accountant:
                 rows.add_stiffness(term, self._x, at_start, 1.0, gamma, values)
         return rows.product(values, v)
 
-    def _gravity(self, report: StepReport) -> Array:
-        """The weight (n_owned, 3) [N], whose work is in the potential."""
+    def _weight(self, report: StepReport) -> Array:
+        """Forces (n_owned, 3) [N] of loads whose work is included in the potential energy."""
         out = np.zeros((self._system.points.n_local, 3))
         for load in self._system.active.loads:
             if load.registration.energy:
@@ -396,27 +399,27 @@ class Accountant:
         return out[: self._system.points.n_owned]
 
     def _energy_roundoff(self, x: Array) -> float:
-        """Sum [J] over this rank's elements whose relative round-off their energies carry.
+        """Sum [J] over this rank's elements; times the machine epsilon it is the round-off of the energies.
 
-        An energy ½ k s² whose strain s is a difference of coordinates is uncertain by √(2 E S) ε, with S
-        the energy at which the strain is of order one.
+        An energy E = ½ k s² whose strain s is a difference of coordinates has the error √(2 E S) ε, where S
+        is the energy at a strain of order one.
         """
         reach = float(np.abs(x).max(initial=0.0))
         amount = 0.0
-        for term, frozen in self._shell.items():
+        for term, frozen in self._sheet.items():
             each = term.energies(x, frozen)
             scale = reach * term.force_scale(reach)[: term.n_owned]
             amount += float(np.sum(np.abs(each) + np.sqrt(2.0 * np.abs(each) * scale)))
             amount += EPSILON * float(np.sum(scale))
         return amount
 
-    def _momenta(
-        self, gap: Array, damped: Array, dt: float, left: float, forces: float, reach: float
+    def _momentum_defects(
+        self, defects: Array, damped: Array, dt: float, left: float, forces: float, reach: float
     ) -> dict[str, float]:
         """Defects of linear and angular momentum and their tolerances.
 
-        ``gap`` (n_owned, 3) is m Δv less Δt times the forces from outside, ``damped`` also less those of
-        damping: frozen with the start's geometry they add up to nothing, but turn the sheet.
+        ``defects`` (n_owned, 3) is m Δv − Δt × external forces; ``damped`` also subtracts damping forces:
+        frozen with the geometry at the start, their sum vanishes, but not their moment.
         """
         system, comm = self._system, self._system.points.comm
         n, count = system.points.n_owned, system.points.n_global
@@ -424,12 +427,12 @@ class Accountant:
         centre = comm.allreduce(np.append((mass * x).sum(axis=0), mass.sum()))
         arms = x - centre[:3] / centre[3]
         arms = arms[: system.points.n_vertices]
-        turned = np.cross(arms, damped[: len(arms)]).sum(axis=0)
-        for term, frozen in self._shell.items():
+        moment = np.cross(arms, damped[: len(arms)]).sum(axis=0)
+        for term, frozen in self._sheet.items():
             if isinstance(term, MidEdge):
                 own = np.flatnonzero(term.edge_indices < 3 * n)
-                turned += term.moment(damped.ravel()[term.edge_indices[own]], own, system.x, frozen)
-        sums = comm.allreduce(np.concatenate([gap[: len(arms)].sum(axis=0), turned]))
+                moment += term.moment(damped.ravel()[term.edge_indices[own]], own, system.x, frozen)
+        sums = comm.allreduce(np.concatenate([defects[: len(arms)].sum(axis=0), moment]))
         longest = float(comm.allreduce(float(np.square(arms).sum())))
         noise = EPSILON * forces * dt
         linear = dt * left * np.sqrt(count) + noise
@@ -442,90 +445,91 @@ class Accountant:
         }
 
 
-class StageAccountant(Accountant):
-    """Takes what balances of each step there are; collective. See `Accountant`."""
+class StageBalanceRecorder(BalanceRecorder):
+    """Computes the balances that hold for steps of other integrators; collective. See `BalanceRecorder`."""
 
     def balance(self, report: StepReport) -> StepBalance:
-        """The balance of the step just accepted: ``change`` is that of the elastic energy, ``bracket`` the
-        integral of the elastic forces, and nothing is known of ``numerical``, ``viscous`` and ``work``."""
+        """The balance of the step just accepted: ``change`` of the elastic energy, ``bracket`` the work of
+        the elastic forces; ``numerical``, ``viscous`` and ``work`` are not known."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
-        self._fit()
+        self._update_start_ghosts()
         x0, x1 = self._x, system.x
-        # targets that move stand where the step ends by now; damping is right in the frames of the step
+        # moving targets are at the end of the step by now; damping needs the frames of the step
         system.active.turn_targets(self._at(system.t0 + system.stage.offset))
         parts = dict(system.forces_at_stage())
         ended = self._at(system.t1)
         frozen = {term: term.freeze(ended) for term in system.active.elastic}
         system.active.frozen = system.active.frozen | frozen
         total = np.asarray(sum(parts.values()))
-        gap = total - self._simulation.ledger.reaction
-        if not any(_in_space(term) for term in self._shell):
-            # they push from outside, and cannot be told from the sheet's own forces here
-            gap = gap - parts["internal"] - parts.get("damping", 0.0)
-        change, noise, forces, way, *gaps = system.points.global_sum(
-            energy(self._shell, x1) - energy({**self._shell, **self._turned}, x0),
+        defects = total - self._simulation.ledger.reaction
+        if not any(_acts_from_outside(term) for term in self._sheet):
+            # external forces of such terms cannot be separated from internal ones here
+            defects = defects - parts["internal"] - parts.get("damping", 0.0)
+        change, noise, forces, all_dx, *sums = system.points.global_sum(
+            energy(self._sheet, x1) - energy({**self._sheet, **self._start_frames}, x0),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
             float(np.sum((x1 - x0)[:n] ** 2)),
-            *gap[: system.points.n_vertices].sum(axis=0),
+            *defects[: system.points.n_vertices].sum(axis=0),
         ).tolist()
         reach = largest(comm, x1)
-        left = self._left(parts, reach, dt)
+        left = self._residual_norms(parts, reach, dt)
         unsolved = (left["residual"] + left["floor"]) * math.sqrt(system.points.n_global)
-        tolerance = EPSILON * (noise + forces * reach) + left["floor"] * math.sqrt(way)
-        moved = x1 - x0
-        along, jumped = force_along(comm, n, self._shell, self._turned, x0, moved, enough=0.1 * tolerance)
+        tolerance = EPSILON * (noise + forces * reach) + left["floor"] * math.sqrt(all_dx)
+        along, hinges_jumped = work_of_forces(
+            comm, n, self._sheet, self._start_frames, x0, x1 - x0, 0.1 * tolerance
+        )
         return StepBalance(
             change=change,
             bracket=along,
             defect=change - along,
             tolerance=tolerance,
-            momentum=dt * max(map(abs, gaps)),
+            momentum=dt * max(map(abs, sums)),
             momentum_tolerance=dt * (unsolved + EPSILON * forces),
-            jumped=jumped,
+            hinges_jumped=hinges_jumped,
             **left,
         )
 
     def _at(self, time: float) -> UpcomingStep:
-        """The step, as terms see it at a time [s] of it."""
+        """The step as terms receive it, at a time [s] within it."""
         system = self._system
         return UpcomingStep(system.t0, system.t1, time, system.x, system.reference.at)
 
 
 @dataclass
-class Record:
-    """A case's steps, the same on every rank.
+class RunRecord:
+    """All steps of a case, the same on every rank.
 
     Attributes
     ----------
     planned : int
-        Steps at the nominal Δt.
+        Number of steps at the nominal Δt.
     nominal : float
-        That Δt [s].
+        Nominal Δt [s].
     end : float
-        Time [s] to reach.
+        End time [s].
     start_energy : float
-        Kinetic + potential at the start [J].
+        Kinetic + potential energy at the start [J].
     reports : list of StepReport
-        One for each accepted step.
+        One per accepted step.
     balances : list of StepBalance
-        One for each; empty for the semi-implicit method, which solves no step.
+        One per accepted step; empty for the semi-implicit method, which has no such balance.
     energies : list of float
-        Kinetic + potential after each [J].
+        Kinetic + potential energy after each step [J].
     observed : list
-        What the case observes, from the start on.
+        Results of the ``observe`` function of the case, at the start and after each step.
     notes : list of str
-        Of the simulation.
-    stopped : str
-        Why it did not reach its end; empty if it did.
+        Notes of the simulation.
+    stop_reason : str
+        Why the case did not reach its end; empty if it did.
     integrator : str
     balance : dict
-        The whole run's energy balance, as in summary.json; empty where nothing ran.
-    busy : list of float
-        CPU time of each step [s], of the rank that took most.
+        Energy balance of the whole run, as in summary.json; empty if nothing ran.
+    cpu_seconds : list of float
+        CPU time of each step [s], the maximum over ranks.
     last : (V, 3) array or None
-        Positions [m] after the last step, on rank 0; None if none were gathered, or they are freed.
+        Positions [m] after the last step, on rank 0; None if they were not gathered or have been freed.
     triangles : (F, 3) array or None
         On rank 0.
     """
@@ -539,16 +543,16 @@ class Record:
     energies: list[float] = field(default_factory=list)
     observed: list[Any] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    stopped: str = ""
+    stop_reason: str = ""
     integrator: str = "beuler"
     balance: dict[str, Any] = field(default_factory=dict)
-    busy: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
     last: StoredArray | None = None
     triangles: StoredArray | None = None
 
     @property
     def newton(self) -> list[int]:
-        """Newton iterations of each step, those of its rejected attempts included."""
+        """Newton iterations of each step, including its rejected attempts."""
         return [report.newton_iterations for report in self.reports]
 
     @property
@@ -558,7 +562,7 @@ class Record:
 
     @property
     def rejected(self) -> int:
-        """Attempts that failed, or were too inaccurate."""
+        """Number of attempts at steps that failed or were too inaccurate."""
         return sum(report.rejected for report in self.reports)
 
     @property
@@ -568,7 +572,7 @@ class Record:
 
     @property
     def stretches(self) -> tuple[float, float]:
-        """Smallest and largest principal stretch met; NaN without a step."""
+        """Smallest and largest principal stretch of all steps; NaN without a step."""
         if not self.reports:
             return math.nan, math.nan
         return (
@@ -578,13 +582,13 @@ class Record:
 
     @property
     def median_seconds(self) -> float:
-        """Median wall time of a step; NaN without any."""
+        """Median wall time of a step [s]; NaN without any."""
         return statistics.median(r.wall_seconds for r in self.reports) if self.reports else math.nan
 
     @property
-    def median_busy(self) -> float:
-        """Median CPU time of a step; NaN without any."""
-        return statistics.median(self.busy) if self.busy else math.nan
+    def median_cpu(self) -> float:
+        """Median CPU time of a step [s]; NaN without any."""
+        return statistics.median(self.cpu_seconds) if self.cpu_seconds else math.nan
 
     @property
     def median_newton(self) -> float:
@@ -592,193 +596,201 @@ class Record:
         return float(statistics.median(self.newton)) if self.reports else math.nan
 
     @property
-    def lost(self) -> float:
-        """Numerical dissipation over the largest energy at work; NaN without a step."""
+    def dissipation(self) -> float:
+        """Numerical dissipation over the largest energy exchanged; NaN without a step."""
         return float(self.balance.get("numerical_dissipation", math.nan)) if self.reports else math.nan
 
     @property
     def times(self) -> list[float]:
-        """Times [s] at which steps ended."""
+        """Times [s] at the ends of steps."""
         return [report.time for report in self.reports]
 
 
-RESOLVED = 0.1
-"""Part of the forces that move a sheet, or of how far they do, below which the rest is negligible."""
+NEGLIGIBLE = 0.1
+"""Part of the driving forces below which a residual is negligible; the same for the displacements by both."""
 
-LITTLE_LOST = 0.05
-"""Numerical dissipation over the largest energy at work up to which a motion may be called right."""
+SMALL_DISSIPATION = 0.05
+"""Numerical dissipation over the largest energy exchanged up to which a motion is called right."""
 
-MUCH_LOST = 0.5
-"""Beyond which one is wrong whose steps nothing else speaks for."""
+MAX_DISSIPATION = 0.5
+"""The same ratio beyond which a run fails if its steps have no other balance (semi-implicit)."""
 
-MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
-"""Newton iterations a step of a stiff sheet may take, in the median and at worst."""
+MAX_NEWTON_MEDIAN, MAX_NEWTON = 10, 30
+"""Allowed Newton iterations per step of a stiff sheet, median and maximum."""
 
-MOST_TIME = 5.0
-"""Wall time of a step of a stiff sheet over that of the base scene, medians."""
+MAX_TIME_RATIO = 5.0
+"""Allowed median time per step of a stiff sheet over that of the base scene."""
 
 
-def converged(record: Record) -> Verdict:
-    """Every step was solved, and the end reached."""
-    if record.stopped:
-        return Verdict(False, f"{len(record.reports)} steps, then: {record.stopped}")
-    words = f"all {len(record.reports)} steps"
+def judge_convergence(record: RunRecord) -> Verdict:
+    """Whether every step was solved and the end was reached."""
+    if record.stop_reason:
+        return Verdict(False, f"{len(record.reports)} steps, then: {record.stop_reason}")
+    message = f"all {len(record.reports)} steps"
     if record.rejected:
         smallest = short(record.smallest_step)
-        words += (
+        message += (
             f", {record.rejected} attempts rejected, smallest Δt {smallest} s of {short(record.nominal)} s"
         )
-    return Verdict(bool(record.reports), words)
+    return Verdict(bool(record.reports), message)
 
 
-def solved(record: Record) -> Verdict:
-    """The forces left, computed anew, are as small as the solver promised in every step."""
-    number, worst = _worst(record, lambda b: over(b.residual, b.promised + b.floor))
+def judge_equations(record: RunRecord) -> Verdict:
+    """Whether the residual, computed again, is as small as the solver promised in every step."""
+    number, worst = _worst_step(record, lambda b: ratio_to(b.residual, b.promised + b.floor))
     at_floor = sum(balance.promised <= balance.floor for balance in record.balances)
-    words = (
+    message = (
         f"worst in step {number}: {short(worst.residual)} N left on the free vertices, "
         f"{short(worst.promised)} N promised"
     )
     if at_floor:
-        words += f"; in {at_floor} steps that is the floor of round-off"
-    return Verdict(worst.residual <= worst.promised + worst.floor, words)
+        message += f"; in {at_floor} steps that is the floor of round-off"
+    return Verdict(worst.residual <= worst.promised + worst.floor, message)
 
 
-def resolved(record: Record) -> Verdict:
-    """The forces left are far below those that move the sheet, or what they still move is.
+def judge_resolution(record: RunRecord) -> Verdict:
+    """Whether the residual is far below the driving forces, or the displacement that it causes is small.
 
-    At the floor of round-off stiff forces may be left that are as large as the weight, and move nothing.
+    At the round-off floor the residual of stiff forces may be as large as the weight without any effect.
     """
     steps = zip(record.balances, record.reports, strict=True)
-    by_force = [over(balance.residual, RESOLVED * balance.driving) for balance in record.balances]
-    by_way = [over(report.left, RESOLVED * balance.push) for balance, report in steps]
-    number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_way[i]))
+    by_force = [ratio_to(balance.residual, NEGLIGIBLE * balance.driving) for balance in record.balances]
+    by_displacement = [ratio_to(report.left, NEGLIGIBLE * balance.displacement) for balance, report in steps]
+    number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_displacement[i]))
     worst, last = record.balances[number], record.reports[number].left
-    words = (
+    message = (
         f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
     )
     if worst.promised <= worst.floor:
-        words += "; round-off at this stiffness allows no better"
-    if by_way[number] < by_force[number]:
-        words += f"; they still move it by {short(last)} m, and the step's forces by {short(worst.push)} m"
-    return Verdict(min(by_force[number], by_way[number]) <= 1.0, words)
-
-
-def identity(record: Record) -> Verdict:
-    """The energy identity of backward Euler holds in every step to what its residual allows.
-
-    Of other integrators: the elastic forces along each step add up to the change of their energy.
-    """
-    number, worst = _worst(record, lambda b: over(abs(b.defect), b.tolerance))
-    words = (
-        f"worst in step {number}: off by {short(abs(worst.defect))} J, tolerance {short(worst.tolerance)} J, "
-        f"{short(worst.moved)} J turned over"
-    )
-    jumped = sum(balance.jumped for balance in record.balances)
-    if jumped:
-        words += (
-            f"; in {jumped} steps hinges turned too far or jumped, or contact came from too far, and count "
-            "by their energies"
+        message += "; round-off at this stiffness allows no better"
+    if by_displacement[number] < by_force[number]:
+        message += (
+            f"; they still move it by {short(last)} m, and the step's forces by {short(worst.displacement)} m"
         )
-    return Verdict(abs(worst.defect) <= worst.tolerance, words)
+    return Verdict(min(by_force[number], by_displacement[number]) <= 1.0, message)
 
 
-def no_gain(record: Record) -> Verdict:
-    """Where the bracket of the identity is not positive, no more energy than the work put in."""
+def judge_energy(record: RunRecord) -> Verdict:
+    """Whether the energy identity of backward Euler holds in every step within its tolerance.
+
+    For other integrators: whether the work of elastic forces equals the change of their energy.
+    """
+    number, worst = _worst_step(record, lambda b: ratio_to(abs(b.defect), b.tolerance))
+    message = (
+        f"worst in step {number}: off by {short(abs(worst.defect))} J, tolerance {short(worst.tolerance)} J, "
+        f"{short(worst.energy_exchanged)} J turned over"
+    )
+    hinges_jumped = sum(balance.hinges_jumped for balance in record.balances)
+    if hinges_jumped:
+        message += (
+            f"; in {hinges_jumped} steps hinges turned too far or jumped, or contact came from too far, and "
+            "count by their energies"
+        )
+    return Verdict(abs(worst.defect) <= worst.tolerance, message)
+
+
+def judge_gain(record: RunRecord) -> Verdict:
+    """Whether the energy grows by no more than the work where the bracket of the identity is not positive."""
     steps = [
         (number, balance)
         for number, balance in enumerate(record.balances, 1)
         if not balance.bracket > balance.tolerance
     ]
-    fed = len(record.balances) - len(steps)
-    more = f"; in {fed} steps buckling could feed energy in" if fed else ""
+    with_gain = len(record.balances) - len(steps)
+    about_gain = f"; in {with_gain} steps buckling could feed energy in" if with_gain else ""
     if not steps:
-        return Verdict(True, f"not to be judged{more}")
-    number, worst = max(steps, key=lambda step: over(_gain(step[1]), step[1].tolerance))
+        return Verdict(True, f"not to be judged{about_gain}")
+    number, worst = max(steps, key=lambda step: ratio_to(_gain(step[1]), step[1].tolerance))
     gain = _gain(worst)
     if gain > worst.tolerance:
-        words = f"step {number} gained {short(gain)} J beyond the work, tolerance {short(worst.tolerance)} J"
-        return Verdict(False, words + more)
+        message = (
+            f"step {number} gained {short(gain)} J beyond the work, tolerance {short(worst.tolerance)} J"
+        )
+        return Verdict(False, message + about_gain)
     negative = [n for n, b in enumerate(record.balances, 1) if -b.viscous > b.tolerance]
     if negative:
-        return Verdict(False, f"damping fed energy into step {negative[0]}{more}")
-    return Verdict(True, f"none in the {len(steps)} steps where the elastic energy is convex{more}")
+        return Verdict(False, f"damping fed energy into step {negative[0]}{about_gain}")
+    return Verdict(True, f"none in the {len(steps)} steps where the elastic energy is convex{about_gain}")
 
 
-def whole(record: Record) -> Verdict:
-    """The run as a whole makes no energy, and where its steps are not solved, does not lose most of it."""
-    gained, lost = (float(record.balance[f"numerical_{what}"]) for what in ("gain", "dissipation"))
-    net = gained - lost
-    words = (
-        f"{100.0 * lost:.2g} % of the largest energy at work lost to the integrator, "
+def judge_run(record: RunRecord) -> Verdict:
+    """Whether the whole run gains no energy and, if semi-implicit, does not lose most of it."""
+    gained, dissipation = (float(record.balance[f"numerical_{what}"]) for what in ("gain", "dissipation"))
+    net = gained - dissipation
+    message = (
+        f"{100.0 * dissipation:.2g} % of the largest energy at work lost to the integrator, "
         f"{100.0 * gained:.2g} % made by it"
     )
     if record.balance["repeated"]:
-        words += f", {record.balance['repeated']} attempts repeated for it"
-    good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or lost <= MUCH_LOST)
-    if good and lost > LITTLE_LOST:
-        words += "; solved, but a smaller Δt moves otherwise"
-    return Verdict(good, words)
+        message += f", {record.balance['repeated']} attempts repeated for it"
+    good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or dissipation <= MAX_DISSIPATION)
+    if good and dissipation > SMALL_DISSIPATION:
+        message += "; solved, but a smaller Δt moves otherwise"
+    return Verdict(good, message)
 
 
-def momentum(record: Record) -> Verdict:
-    """Momentum and angular momentum change by what acts from outside: inner forces add up to nothing."""
-    at, line = _worst(record, lambda b: over(b.momentum, b.momentum_tolerance))
-    turn_at, turn = _worst(record, lambda b: over(b.spin, b.spin_tolerance))
-    words = f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
-    if turn.spin_tolerance:
-        words += (
-            f"; angular in step {turn_at}: {short(turn.spin)} N m s, "
-            f"tolerance {short(turn.spin_tolerance)} N m s"
+def judge_momentum(record: RunRecord) -> Verdict:
+    """Whether linear and angular momentum change by external forces only: internal forces sum to zero."""
+    at, line = _worst_step(record, lambda b: ratio_to(b.momentum, b.momentum_tolerance))
+    turn_at, turn = _worst_step(record, lambda b: ratio_to(b.angular, b.angular_tolerance))
+    message = (
+        f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
+    )
+    if turn.angular_tolerance:
+        message += (
+            f"; angular in step {turn_at}: {short(turn.angular)} N m s, "
+            f"tolerance {short(turn.angular_tolerance)} N m s"
         )
-    good = line.momentum <= line.momentum_tolerance and turn.spin <= turn.spin_tolerance
-    return Verdict(good, words)
+    good = line.momentum <= line.momentum_tolerance and turn.angular <= turn.angular_tolerance
+    return Verdict(good, message)
 
 
-def softening(record: Record) -> Verdict:
-    """A triangle compressed beyond where the model softens was reported."""
+def judge_softening(record: RunRecord) -> Verdict:
+    """Whether a triangle that is compressed into the softening range of its model was reported."""
     smallest = record.stretches[0]
     if not smallest < SOFTENS_BELOW:
         return Verdict(True, f"no triangle below {SOFTENS_BELOW:.3f} of its length")
-    told = [note for note in record.notes if "St. Venant-Kirchhoff model softens" in note]
-    words = f"down to {short(smallest)} of its length, " + (
-        "which is said" if told else "and NOTHING was said"
+    notes = [note for note in record.notes if "St. Venant-Kirchhoff model softens" in note]
+    message = f"down to {short(smallest)} of its length, " + (
+        "which is said" if notes else "and NOTHING was said"
     )
-    return Verdict(bool(told), words)
+    return Verdict(bool(notes), message)
 
 
-def speed(record: Record, ratio: float, busy_ratio: float) -> Verdict:
-    """Few iterations, and a time like that of the base scene.
+def judge_speed(record: RunRecord, wall_ratio: float, cpu_ratio: float) -> Verdict:
+    """Whether steps take few iterations, and a time comparable to that of the base scene.
 
-    ``ratio`` of the medians of wall time, ``busy_ratio`` of CPU time: on a machine that others use, too,
-    the former says little of what a step costs, and one that is good enough suffices.
+    ``wall_ratio`` and ``cpu_ratio`` are ratios of median wall and CPU times; one of them suffices, as wall
+    times mean little on a machine with other load.
     """
     median, worst = record.median_newton, max(record.newton, default=0)
-    good = median <= MOST_NEWTON_MEDIAN and worst <= MOST_NEWTON and min(ratio, busy_ratio) <= MOST_TIME
-    words = (
-        f"Newton iterations {short(median)} in the median and {worst} at worst "
-        f"({MOST_NEWTON_MEDIAN} and {MOST_NEWTON} allowed), {short(ratio)} times the base's wall time, "
-        f"{short(busy_ratio)} times its CPU time ({MOST_TIME:g} allowed)"
+    good = (
+        median <= MAX_NEWTON_MEDIAN and worst <= MAX_NEWTON and min(wall_ratio, cpu_ratio) <= MAX_TIME_RATIO
     )
-    return Verdict(good and not record.stopped, words)
+    message = (
+        f"Newton iterations {short(median)} in the median and {worst} at worst "
+        f"({MAX_NEWTON_MEDIAN} and {MAX_NEWTON} allowed), {short(wall_ratio)} times the base's wall time, "
+        f"{short(cpu_ratio)} times its CPU time ({MAX_TIME_RATIO:g} allowed)"
+    )
+    return Verdict(good and not record.stop_reason, message)
 
 
-def of_physics(record: Record) -> dict[str, Verdict]:
-    """All verdicts that need no knowledge of the case, by name."""
-    verdicts = {"converged": converged(record)}
+def judge_physics(record: RunRecord) -> dict[str, Verdict]:
+    """All verdicts that apply to any case, by name."""
+    verdicts = {"converged": judge_convergence(record)}
     if record.balances:
         verdicts |= {
-            "equations": solved(record),
-            "resolved": resolved(record),
-            "energy": identity(record),
-            "momentum": momentum(record),
+            "equations": judge_equations(record),
+            "resolved": judge_resolution(record),
+            "energy": judge_energy(record),
+            "momentum": judge_momentum(record),
         }
         if record.integrator == "beuler":
-            verdicts["no gain"] = no_gain(record)
+            verdicts["no gain"] = judge_gain(record)
     if record.reports:
-        verdicts["softening"] = softening(record)
+        verdicts["softening"] = judge_softening(record)
         if record.balance:
-            verdicts["whole run"] = whole(record)
+            verdicts["whole run"] = judge_run(record)
     return verdicts
 
 
@@ -786,14 +798,14 @@ def _gain(balance: StepBalance) -> float:
     return balance.change - balance.work
 
 
-def over(amount: float, tolerance: float) -> float:
-    """How many times the tolerance; what is no number is worst."""
+def ratio_to(amount: float, tolerance: float) -> float:
+    """The amount over its tolerance; infinite if one of them is NaN."""
     if math.isnan(amount) or math.isnan(tolerance):
         return math.inf
     return amount / tolerance if tolerance > 0.0 else math.copysign(math.inf, amount) if amount else 0.0
 
 
-def _worst(record: Record, measure: Callable[[StepBalance], float]) -> tuple[int, StepBalance]:
-    """Number, from 1, and balance of the step for which ``measure`` is largest."""
+def _worst_step(record: RunRecord, measure: Callable[[StepBalance], float]) -> tuple[int, StepBalance]:
+    """Number, counted from 1, and balance of the step with the largest ``measure``."""
     number = max(range(len(record.balances)), key=lambda i: measure(record.balances[i]))
     return number + 1, record.balances[number]

@@ -1,4 +1,4 @@
-"""Runs the cases of ``stress``, takes the balance of every step, judges, and reports."""
+"""Runs the cases of ``stress``, computes the balance of every step, judges the cases and reports them."""
 
 from __future__ import annotations
 
@@ -18,31 +18,30 @@ from lyra_petsc.experiments.bench import Trial, failure_message
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
-    LITTLE_LOST,
-    Accountant,
-    Record,
-    StageAccountant,
-    of_physics,
-    over,
-    speed,
+    SMALL_DISSIPATION,
+    BalanceRecorder,
+    RunRecord,
+    StageBalanceRecorder,
+    judge_physics,
+    judge_speed,
+    ratio_to,
 )
 from lyra_petsc.experiments.stress.stress_scenes import (
     NotApplicable,
     Scope,
     Setting,
     StressCase,
-    as_it_is,
+    base_scene,
 )
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
 from lyra_petsc.show.report.plots import Series, over_time, surface
 
-LONGEST = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
-"""Wall seconds [s], but for those in which kernels are compiled, after which a case is ended between two
-steps."""
+TIME_LIMIT = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
+"""Wall time [s], without the compilation of kernels, after which a case is stopped between two steps."""
 
 BASE_STEPS = 20
-"""Steps of the base scene that are timed: as many as most cases take, since later ones cost more."""
+"""Timed steps of the base scene: as many as most cases take, since later steps cost more."""
 
 
 @dataclass
@@ -52,9 +51,9 @@ class SavedOutcome:
     verdicts: dict[str, Verdict]
     seconds: float
     left_out: str
-    record: Record
-    ratio: float
-    busy_ratio: float
+    record: RunRecord
+    wall_ratio: float
+    cpu_ratio: float
 
 
 @dataclass
@@ -64,22 +63,22 @@ class StressOutcome(Outcome[StressCase]):
     Attributes
     ----------
     record : Record
-    ratio : float
+    wall_ratio : float
         Median wall time of a step over that of the base scene, measured before and after the case.
-    busy_ratio : float
-        The same of CPU time.
+    cpu_ratio : float
+        The same ratio of CPU times.
     """
 
-    record: Record = field(default_factory=Record)
-    ratio: float = math.nan
-    busy_ratio: float = math.nan
+    record: RunRecord = field(default_factory=RunRecord)
+    wall_ratio: float = math.nan
+    cpu_ratio: float = math.nan
 
     @property
     def verdict(self) -> str:
-        """In a word; ``solved`` instead of ``right`` where the integrator dissipates much of the energy."""
+        """``FAILED``, ``right``, or ``solved`` if the integrator dissipates much of the energy."""
         if not self.passed:
             return "FAILED"
-        return "right" if self.record.lost <= LITTLE_LOST else "solved"
+        return "right" if self.record.dissipation <= SMALL_DISSIPATION else "solved"
 
     def saved(self) -> SavedOutcome:
         """All but the case, which cannot be stored in a file."""
@@ -87,7 +86,7 @@ class StressOutcome(Outcome[StressCase]):
 
 
 class BaseClock:
-    """Wall time of a step of the base scene, measured again and again; collective.
+    """Repeated measurements of the time per step of the base scene; collective.
 
     Parameters
     ----------
@@ -99,7 +98,7 @@ class BaseClock:
     Attributes
     ----------
     latest : (2,) array
-        What was measured last [s].
+        Median wall and CPU time [s] of the last measurement.
     size : float
         Diagonal of the base scene's bounding box [m].
     """
@@ -107,16 +106,16 @@ class BaseClock:
     def __init__(self, comm: MPI.Comm, setting: Setting, watch: Watch | None = None) -> None:
         self._comm, self._setting, self._watch = comm, setting, watch
         self.size = math.nan
-        self.measure()  # kernels are compiled or loaded
+        self.measure()  # compiles or loads kernels
         self.latest = self.measure()
 
     def measure(self) -> Array:
-        """Median wall time and CPU time [s] of the base scene's first steps, (2,).
+        """Median wall time and CPU time [s] of the first steps of the base scene, (2,).
 
         Raises
         ------
         InputError, SolverError
-            If not even the base scene runs.
+            If the base scene does not run.
         """
         content = self._setting.content()
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
@@ -146,18 +145,18 @@ def run_case(
     case : StressCase
     setting : Setting
     clock : BaseClock, optional
-        What wall times are compared with; without, they are not.
+        Times of the base scene, which times per step are compared with if given.
     watch : callable, optional
         Called before every step on all ranks; may raise to end the work.
 
     Raises
     ------
     SolverError
-        What one rank alone met, so that the others cannot go on.
+        An error on one rank only, after which the ranks cannot continue together.
     """
     began, compiled = time.perf_counter(), COMPILATION.seconds
     before = clock.latest if clock is not None else None
-    outcome = StressOutcome(case, record=Record(case.steps))
+    outcome = StressOutcome(case, record=RunRecord(case.steps))
     with setting.bench(comm, watch) as bench:
         try:
             content = case.content(setting, bench)
@@ -169,26 +168,24 @@ def run_case(
         record.integrator = content["time"].get("integrator", "beuler")
         try:
             with bench.simulation(content) as trial:
-                _run(trial, case, record, began - compiled + LONGEST[setting.level])
+                _run_steps(trial, case, record, began - compiled + TIME_LIMIT[setting.level])
         except (InputError, SolverError) as error:
-            record.stopped = failure_message(comm, error)
-        outcome.verdicts = of_physics(record)
+            record.stop_reason = failure_message(comm, error)
+        outcome.verdicts = judge_physics(record)
         if clock is not None and before is not None:
-            wall, busy = 0.5 * (before + clock.measure())
-            ratios = record.median_seconds / wall, record.median_busy / busy
-            outcome.ratio, outcome.busy_ratio = comm.bcast(tuple(map(float, ratios)), root=0)
-            if case.swift:
-                outcome.verdicts["speed"] = speed(record, outcome.ratio, outcome.busy_ratio)
-        if case.judge is not None and not record.stopped:
+            wall, cpu_seconds = 0.5 * (before + clock.measure())
+            ratios = record.median_seconds / wall, record.median_cpu / cpu_seconds
+            outcome.wall_ratio, outcome.cpu_ratio = comm.bcast(tuple(map(float, ratios)), root=0)
+            if case.is_timed:
+                outcome.verdicts["speed"] = judge_speed(record, outcome.wall_ratio, outcome.cpu_ratio)
+        if case.judge is not None and not record.stop_reason:
             outcome.verdicts |= case.judge(setting, bench, record)
     outcome.seconds = comm.bcast(time.perf_counter() - began, root=0)
     return outcome
 
 
-def _run(trial: Trial, case: StressCase, record: Record, deadline: float) -> None:
-    """Step to the end, or until wall time [s] without that of compiling reaches the deadline, and note
-    everything.
-    """
+def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: float) -> None:
+    """Fill the record, step by step to the end or until wall time [s] without compilation is over."""
     simulation = trial.simulation
     comm = simulation.comm
     mesh = simulation.problem.mesh
@@ -199,97 +196,100 @@ def _run(trial: Trial, case: StressCase, record: Record, deadline: float) -> Non
     record.start_energy = _energy(trial)
     if case.observe is not None:
         record.observed.append(case.observe(trial))
-    accountant = None
-    if record.integrator != "semi-implicit":  # which promises no balance
-        kind = Accountant if record.integrator == "beuler" else StageAccountant
-        accountant = kind(simulation)
+    recorder = None
+    if record.integrator != "semi-implicit":  # it satisfies no such balance
+        kind = BalanceRecorder if record.integrator == "beuler" else StageBalanceRecorder
+        recorder = kind(simulation)
     try:
         while not simulation.finished:
             if comm.bcast(time.perf_counter() - COMPILATION.seconds > deadline, root=0):
-                record.stopped = (
+                record.stop_reason = (
                     f"given up at t = {simulation.time:g} s of {record.end:g} s: the case has had its time"
                 )
                 break
-            busy = time.process_time()
+            cpu_seconds = time.process_time()
             report = trial.step()
-            record.busy.append(comm.allreduce(time.process_time() - busy, op=MPI.MAX))
+            record.cpu_seconds.append(comm.allreduce(time.process_time() - cpu_seconds, op=MPI.MAX))
             record.reports.append(report)
             record.energies.append(_energy(trial))
-            if accountant is not None:
-                record.balances.append(accountant.balance(report))
-                accountant.look()
+            if recorder is not None:
+                record.balances.append(recorder.balance(report))
+                recorder.record_state()
             if case.observe is not None:
                 record.observed.append(case.observe(trial))
     except SolverError as error:
         if error.collective or comm.size == 1:
-            record.last = _drawn(trial)
+            record.last = _root_positions(trial)
         raise
     finally:
         record.notes = list(simulation.notes)
         record.balance = simulation.guard.content() if simulation.guard is not None else {}
-    # gathered to be drawn: once in a case, and freed by later cases
-    record.last = _drawn(trial)
+    # for the figures: gathered once per case, freed when worse cases follow
+    record.last = _root_positions(trial)
 
 
-def _drawn(trial: Trial) -> Array | None:
-    """Positions (V, 3) [m] on rank 0."""
+def _root_positions(trial: Trial) -> Array | None:
+    """Positions (V, 3) [m] on rank 0, None elsewhere."""
     x = trial.x
     return x if trial.simulation.comm.rank == 0 else None
 
 
 def _energy(trial: Trial) -> float:
-    """Kinetic + potential [J]."""
+    """Kinetic + potential energy [J]."""
     budget = trial.simulation.budget
     return budget.kinetic + budget.membrane + budget.bending + budget.potential
 
 
-def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: Watch) -> StressOutcome:
-    """The result of a case that is run in processes of its own.
+def launched(launcher: Launcher, case: StressCase, arguments: Sequence[str], watch: Watch) -> StressOutcome:
+    """Run a case in processes of its own.
 
     Parameters
     ----------
     launcher : Launcher
     case : StressCase
-    asked : sequence of str
-        Scene and options of ``stress`` that say what is run.
+    arguments : sequence of str
+        Scene and options of ``stress``.
     watch : callable
-        Called again and again; where it raises, the processes are ended.
+        Called repeatedly; if it raises, the processes are terminated.
 
     Raises
     ------
     InputError
-        If the launched program refuses what it was asked for.
+        If the launched program rejects its arguments.
     """
-    saved, message = launcher.run_case([*asked, "--only", case.name], watch, SavedOutcome)
+    saved, message = launcher.run_case([*arguments, "--only", case.name], watch, SavedOutcome)
     if saved is not None:
         return StressOutcome(case, **vars(saved))
-    record = Record(case.steps, stopped=message)
-    return StressOutcome(case, of_physics(record), record=record)
+    record = RunRecord(case.steps, stop_reason=message)
+    return StressOutcome(case, judge_physics(record), record=record)
 
 
-PICTURES = 6
-"""Of the worst cases."""
+MAX_FIGURES = 6
+"""Number of the worst cases whose figures the page shows."""
 
 HEADINGS = {
     "case": 28, "verdict": 7, "steps": 7, "rejected": 0, "least Δt": 8, "Newton": 8, "linear": 7,
     "energy off [J]": 8, "tolerance [J]": 8, "stretch": 13, "step": 8, "over base": 0, "CPU": 5,
 }  # fmt: skip
-"""Heads of the table's columns, and how wide each is at least."""
+"""Headings of the table and minimum widths of its columns."""
 
 
-def row_of(outcome: StressOutcome) -> dict[str, Any]:
-    """The line of a case in the CSV; energies in J, times in s, NaN where there is nothing to tell."""
+def csv_row(outcome: StressOutcome) -> dict[str, Any]:
+    """The row of a case in the CSV file; energies in J, times in s, NaN where a value is missing."""
     record = outcome.record
     balances = record.balances
-    worst = max(balances, key=lambda b: over(abs(b.defect), b.tolerance), default=None)
-    momenta = [(over(b.momentum, b.momentum_tolerance), over(b.spin, b.spin_tolerance)) for b in balances]
+    worst = max(balances, key=lambda b: ratio_to(abs(b.defect), b.tolerance), default=None)
+    momenta = [
+        (ratio_to(b.momentum, b.momentum_tolerance), ratio_to(b.angular, b.angular_tolerance))
+        for b in balances
+    ]
     nan = math.nan
     return {
         "case": outcome.case.name,
         "family": outcome.case.family,
         "passed": outcome.passed,
-        "converged": not record.stopped,
-        "why": record.stopped,
+        "converged": not record.stop_reason,
+        "why": record.stop_reason,
         "steps": len(record.reports),
         "steps_planned": record.planned,
         "dt": record.nominal,
@@ -298,26 +298,26 @@ def row_of(outcome: StressOutcome) -> dict[str, Any]:
         "newton_median": record.median_newton,
         "newton_worst": max(record.newton, default=0),
         "linear_iterations": record.linear,
-        "residual_over_promised": max((over(b.residual, b.promised) for b in balances), default=nan),
+        "residual_over_promised": max((ratio_to(b.residual, b.promised) for b in balances), default=nan),
         "energy_defect": abs(worst.defect) if worst else nan,
         "energy_tolerance": worst.tolerance if worst else nan,
-        "energy_turned_over": worst.moved if worst else nan,
+        "energy_turned_over": worst.energy_exchanged if worst else nan,
         "verdict": outcome.verdict,
-        "numerical_dissipation": record.lost,
+        "numerical_dissipation": record.dissipation,
         "momentum_defect_over_tolerance": max(map(max, momenta), default=nan),
         "smallest_stretch": record.stretches[0],
         "largest_stretch": record.stretches[1],
         "step_wall_seconds": record.median_seconds,
-        "step_over_base": outcome.ratio,
-        "step_over_base_cpu": outcome.busy_ratio,
+        "step_over_base": outcome.wall_ratio,
+        "step_over_base_cpu": outcome.cpu_ratio,
         "wall_seconds": outcome.seconds,
         "failures": "; ".join(f"{name}: {verdict.message}" for name, verdict in outcome.failures.items()),
     }
 
 
 def cells(outcome: StressOutcome) -> list[str]:
-    """A case's line of the table, by `HEADINGS`."""
-    row = row_of(outcome)
+    """The row of a case in the table with the columns `HEADINGS`."""
+    row = csv_row(outcome)
     return [
         outcome.case.name,
         outcome.verdict,
@@ -336,31 +336,31 @@ def cells(outcome: StressOutcome) -> list[str]:
 
 
 class Stress(View[StressOutcome]):
-    """A line for each case.
+    """One row per case.
 
     Parameters
     ----------
     setting : Setting
     count : int
-        Cases to be run in all.
+        Number of cases to be run.
     """
 
     verb = "stress"
     title = "Stress: stiff and extreme cases"
     pictures = "pictures"
-    columns = tuple(row_of(StressOutcome(StressCase("", "", as_it_is))))
+    columns = tuple(csv_row(StressOutcome(StressCase("", "", base_scene))))
 
     def __init__(self, setting: Setting, count: int) -> None:
         self._setting, self._count = setting, count
 
     def heading(self) -> str:
-        return _padded(list(HEADINGS))
+        return _aligned_cells(list(HEADINGS))
 
     def terminal_lines(self, outcome: StressOutcome) -> Iterable[Line]:
         if outcome.left_out:
             yield f"{outcome.case.name}: left out: {outcome.left_out}", "dim"
             return
-        yield _padded(cells(outcome)), "" if outcome.passed else "bold red"
+        yield _aligned_cells(cells(outcome)), "" if outcome.passed else "bold red"
         for name, verdict in outcome.failures.items():
             yield f"    {name}: {verdict.message}", "red"
 
@@ -374,16 +374,16 @@ class Stress(View[StressOutcome]):
         return table
 
     def case_ended(self, outcomes: Sequence[StressOutcome]) -> None:
-        """Free the shapes that the page will not show, since there are worse cases."""
-        for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
+        """Free the final shapes of cases that the page will not show, since there are worse ones."""
+        for outcome in sorted(outcomes, key=severity, reverse=True)[MAX_FIGURES:]:
             outcome.record.last = outcome.record.triangles = None
 
     def csv_rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
-        yield row_of(outcome)
+        yield csv_row(outcome)
 
     def case_content(self, outcome: StressOutcome) -> dict[str, Any]:
         record = outcome.record
-        return row_of(outcome) | {
+        return csv_row(outcome) | {
             "notes": record.notes,
             "newton_iterations": record.newton,
             "times": record.times,
@@ -395,7 +395,7 @@ class Stress(View[StressOutcome]):
         return {"complete": len(outcomes) == self._count, "left_out": left_out}
 
     def fill(self, report: Report, outcomes: Sequence[StressOutcome], summary: str, *, plots: bool) -> None:
-        run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=badness, reverse=True)
+        run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=severity, reverse=True)
         base = self._setting.base.get("title") or "without a title"
         report.paragraph(
             f"{summary} Base scene: {base}, Δt {seconds(self._setting.step)}. The worst cases stand first. "
@@ -416,7 +416,7 @@ class Stress(View[StressOutcome]):
             report.heading("What failed")
             report.bullets(failed)
         report.heading("The worst cases")
-        for outcome in run[:PICTURES]:
+        for outcome in run[:MAX_FIGURES]:
             report.paragraph(f"{outcome.case.name}: {outcome.case.title}.")
             report.bullets(outcome.record.notes)
             if plots:
@@ -436,20 +436,20 @@ class Stress(View[StressOutcome]):
             report.bullets(left_out)
 
 
-def badness(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
-    """Cases that failed first, then those with the most trouble."""
+def severity(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
+    """Sort key; larger is worse: failed, stopped early, rejected steps, largest number of iterations."""
     record = outcome.record
-    return not outcome.passed, bool(record.stopped), record.rejected, max(record.newton, default=0)
+    return not outcome.passed, bool(record.stop_reason), record.rejected, max(record.newton, default=0)
 
 
-def _padded(texts: Sequence[str]) -> str:
+def _aligned_cells(texts: Sequence[str]) -> str:
     widths = [max(len(name), least) for name, least in HEADINGS.items()]
     first, *others = zip(texts, widths, strict=True)
     return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
 
 
 def _figures(report: Report, outcome: StressOutcome) -> None:
-    """The last shape, and the energy over time beside the work done."""
+    """Add figures of the last shape, and of the energy over time with the work done."""
     case, record = outcome.case, outcome.record
     if record.last is not None and record.triangles is not None:
         when = f"t = {seconds(record.times[-1])}" if record.times else "the start"

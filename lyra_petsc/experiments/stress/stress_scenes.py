@@ -1,7 +1,6 @@
-"""A case of ``stress``: an extreme scene, made of the user's or of a hung square of cotton, and what it
-must keep.
+"""Cases of ``stress``: extreme variants of the user's scene or of a hanging square of cotton.
 
-Functions that change a scene work on the keys of a scene file, in place.
+Functions that change a scene modify the content of a scene file in place.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ from lyra_petsc.scene.schema import Material, Scene
 from lyra_petsc.scene.text import parse_yaml
 
 if TYPE_CHECKING:
-    from lyra_petsc.experiments.stress.step_balance import Record
+    from lyra_petsc.experiments.stress.step_balance import RunRecord
 
 Content = dict[str, Any]
 
 
 class Scope(IntEnum):
-    """How much is run: each includes those before."""
+    """How many cases are run; each level includes the ones before."""
 
     QUICK = 0
     USUAL = 1
@@ -47,19 +46,19 @@ QUICK, USUAL, FULL = Scope
 
 @dataclass(frozen=True)
 class Setting:
-    """What the cases of one ``stress`` start from.
+    """The base scene and options of one call of ``stress``.
 
     Attributes
     ----------
     base : dict
-        The scene whose changes the cases are, in the keys of a scene file.
+        The base scene, which cases modify, as the content of a scene file.
     given : bool
-        It is the user's; else the hanging sheet of `lyra_petsc.experiments.stress.stress_scenes`.
+        Whether the base scene is the user's; otherwise it is `hanging_sheet`.
     level : Scope
     size : float
-        Diagonal of the rest shape's bounding box [m].
+        Diagonal of the bounding box of the rest shape [m].
     trust_mesh : bool
-        Give gmsh the scene's scripts whatever they say.
+        Pass the scripts of the scene to gmsh unchecked.
     """
 
     base: Content
@@ -69,11 +68,11 @@ class Setting:
     trust_mesh: bool = False
 
     def content(self) -> Content:
-        """A copy of the base scene, to be changed."""
+        """A copy of the base scene that may be modified."""
         return copy.deepcopy(self.base)
 
     def bench(self, comm: MPI.Comm, watch: Callable[[], None] | None) -> Bench:
-        """Where its scenes run as a user's do."""
+        """A test bench on which scenes run with their own solver, as a user's do."""
         return Bench(comm, watch, direct=False, trust_mesh=self.trust_mesh)
 
     @property
@@ -83,40 +82,40 @@ class Setting:
 
 
 class NotApplicable(Exception):
-    """A case that makes no sense for the scene at hand; says why."""
+    """Raised by a case that does not apply to the base scene; the message says why."""
 
 
 Maker = Callable[[Setting, Bench], Content]
 Shaper = Callable[[Array, float], Array]
-Judge = Callable[[Setting, Bench, "Record"], Mapping[str, Verdict]]
+Judge = Callable[[Setting, Bench, "RunRecord"], Mapping[str, Verdict]]
 
 
 @dataclass(frozen=True)
 class StressCase(Case):
-    """One scene and what is claimed of it.
+    """One scene and the claims about its simulation.
 
     Attributes
     ----------
     scene : callable (setting, bench) → scene content
-        Raises `NotApplicable` where it makes no sense.
+        Raises `NotApplicable` if it does not apply to the base scene.
     steps : int
         Nominal number of steps.
     step : float or None
-        Δt [s]; None: the base scene's.
+        Δt [s]; None: that of the base scene.
     level : Scope
-        From which on it is run.
+        Lowest level at which the case is run.
     shape : callable (start positions (V, 3) [m], mean edge length [m]) → positions, optional
-        The shape to start from, where it differs from the scene's own.
-    own : bool
-        It brings its own scene and has nothing to do with the user's.
-    swift : bool
-        Its iterations and its wall time are judged, too.
+        The start shape, if it differs from that of the scene.
+    own_scene : bool
+        The case has a scene of its own, independent of the user's.
+    is_timed : bool
+        Iterations and time per step are judged as well.
     observe : callable (trial) → any, optional
-        Called on all ranks at the start and after every step; collected in the record.
+        Called on all ranks at the start and after every step; the record collects its results.
     judge : callable (setting, bench, record) → verdicts by name, optional
-        What is claimed beside the balances; collective.
+        Verdicts in addition to those on the balances; collective.
     family : str
-        Name of the family it belongs to.
+        Name of its family.
     """
 
     scene: Maker
@@ -124,15 +123,15 @@ class StressCase(Case):
     step: float | None = None
     level: Scope = Scope.USUAL
     shape: Shaper | None = None
-    own: bool = False
-    swift: bool = False
+    own_scene: bool = False
+    is_timed: bool = False
     observe: Callable[[Trial], Any] | None = None
     judge: Judge | None = None
     family: str = ""
 
     def content(self, setting: Setting, bench: Bench) -> Content:
-        """The scene, with its time block."""
-        if self.own and setting.given:
+        """The content of the scene, with the time step and end of the case."""
+        if self.own_scene and setting.given:
             raise NotApplicable("has a scene of its own")
         content = self.scene(setting, bench)
         step = self.step if self.step is not None else float(content["time"]["step"])
@@ -142,7 +141,7 @@ class StressCase(Case):
 
 @dataclass(frozen=True)
 class CaseFamily:
-    """Cases that belong together."""
+    """Related cases that are selected by one name."""
 
     name: str
     title: str
@@ -150,22 +149,22 @@ class CaseFamily:
 
 
 def family(name: str, title: str, *cases: StressCase) -> CaseFamily:
-    """The family of these cases."""
+    """Make a family of these cases."""
     return CaseFamily(name, title, tuple(replace(case, family=name) for case in cases))
 
 
 CELLS = {Scope.QUICK: 20, Scope.USUAL: 40, Scope.FULL: 40}
-"""Along a side."""
+"""Cells along a side of the sheet."""
 
 STEP = 0.005
-"""Δt [s], also of a given scene whose steps follow a tolerance."""
+"""Δt [s]; also replaces the adaptive steps of a given scene."""
 
 DENSITY, STIFFNESS, BENDING, DAMPING = 0.15, 120.0, 1e-5, 0.005
 """kg/m², N/m, N·m, s"""
 
 
-def sheet(cells: int) -> Content:
-    """The scene."""
+def hanging_sheet(cells: int) -> Content:
+    """The default base scene: a square metre of cotton hung by two corners."""
     return {
         "title": "A square of cotton hung by two corners",
         "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells, "pattern": "alternating"}},
@@ -189,15 +188,15 @@ def sheet(cells: int) -> Content:
 def setting_of(
     scene: Path | None, settings: Sequence[str], level: Scope, *, trust_mesh: bool = False
 ) -> Setting:
-    """What the cases start from. On one rank.
+    """Read or make the base scene. On one rank.
 
     Raises
     ------
     InputError
-        For a scene that cannot be used, or is not stepped through time.
+        For a scene that cannot be used, or a static one.
     """
     if scene is None:
-        data: dict[str, Any] = sheet(CELLS[level])
+        data: dict[str, Any] = hanging_sheet(CELLS[level])
         overridden = apply_overrides(data, settings)
         base = validated(Scene, data, file=None, overridden=overridden)
     else:
@@ -218,11 +217,11 @@ def setting_of(
 
 
 KEPT = ("group", "damping", "warp_degrees", "rest_curvature")
-"""Keys of a material that are no stiffness."""
+"""Keys of a material block that `anisotropic` keeps."""
 
 
-def changed(*changes: Callable[..., Content], **numbers: Any) -> Maker:
-    """The scene of a case that is the base scene with these changes; ``numbers`` are for the last of them."""
+def base_with(*changes: Callable[..., Content], **numbers: Any) -> Maker:
+    """The scene function of a case: the base scene with these changes; the last one receives ``numbers``."""
 
     def scene(setting: Setting, bench: Bench) -> Content:
         content = setting.content()
@@ -233,12 +232,12 @@ def changed(*changes: Callable[..., Content], **numbers: Any) -> Maker:
     return scene
 
 
-as_it_is = changed()
-"""The base scene."""
+base_scene = base_with()
+"""The base scene without changes."""
 
 
 def materials(content: Content) -> list[dict[str, Any]]:
-    """The material blocks."""
+    """The material blocks of a scene, which becomes a list if it was a single block."""
     blocks = content["material"]
     if isinstance(blocks, dict):
         blocks = content["material"] = [blocks]
@@ -248,7 +247,7 @@ def materials(content: Content) -> list[dict[str, Any]]:
 def scale(
     content: Content, *, stretching: float = 1.0, bending: float = 1.0, density: float = 1.0
 ) -> Content:
-    """Multiply stiffnesses and density of every material, also of library cloths."""
+    """Multiply the stiffnesses and the density of every material, including cloths of the library."""
     factors = {"stretching_scale": stretching, "bending_scale": bending, "density_scale": density}
     for block in materials(content):
         for key, factor in factors.items():
@@ -256,16 +255,16 @@ def scale(
     return content
 
 
-def damp(content: Content, seconds: float) -> Content:
-    """Give every material a damping γ [s]."""
+def set_damping(content: Content, seconds: float) -> Content:
+    """Set the damping γ [s] of every material."""
     for block in materials(content):
         block["damping"] = seconds
     return content
 
 
 def anisotropic(content: Content, ratio: float) -> Content:
-    """Let c11/c22 be ``ratio``, their geometric mean and the shear stiffness staying, c12 = 0."""
-    changed = []
+    """Set c11/c22 to ``ratio`` and c12 to 0; the geometric mean of c11 and c22, and c33, stay."""
+    base_with = []
     for block in materials(content):
         shell, _ = resolve_material(Material.model_validate(block))
         mean = (shell.c11 * shell.c22) ** 0.5
@@ -275,45 +274,45 @@ def anisotropic(content: Content, ratio: float) -> Content:
         if shell.model == "midedge":
             plate = dict(zip(("d11", "d12", "d22", "d33"), shell.plate, strict=True))
             bending = {"bending": plate, "bending_model": shell.model}
-        changed.append({"density": shell.density, "membrane": membrane, **bending, **kept})
-    content["material"] = changed
+        base_with.append({"density": shell.density, "membrane": membrane, **bending, **kept})
+    content["material"] = base_with
     return content
 
 
-def by_directors(content: Content) -> Content:
-    """Let all that bends bend by directors on its edges."""
+def use_directors(content: Content) -> Content:
+    """Select the bending model with directors on edges for every material."""
     for block in materials(content):
         block["bending_model"] = "midedge"
     return content
 
 
-def blow(content: Content, speed: float) -> Content:
-    """Wind of ``speed`` [m/s], oblique to all axes; density and drag stay where the scene has them."""
+def set_wind(content: Content, speed: float) -> Content:
+    """Set a wind of ``speed`` [m/s], oblique to all axes; the scene's air density and drag stay."""
     old = content.get("wind") or {}
     along = [0.36 * speed, 0.48 * speed, 0.8 * speed]
     content["wind"] = {"velocity": along, "density": old.get("density") or 1.2, "drag": old.get("drag", 0.0)}
     return content
 
 
-def weigh(content: Content, factor: float) -> Content:
-    """Multiply gravity."""
+def scale_gravity(content: Content, factor: float) -> Content:
+    """Multiply gravity by a factor."""
     if not any(content.get("gravity") or ()):
         raise NotApplicable("has no gravity to be multiplied")
     content["gravity"] = [factor * g for g in content["gravity"]]
     return content
 
 
-def release(content: Content) -> Content:
-    """Take all handles away."""
+def remove_handles(content: Content) -> Content:
+    """Remove all handles."""
     content["handles"] = []
     return content
 
 
-def move(content: Content, keyframes: list[dict[str, Any]]) -> Content:
-    """Move all handles alike, for ever, linearly between the keyframes."""
+def move_handles(content: Content, keyframes: list[dict[str, Any]]) -> Content:
+    """Give all handles the same motion without end, linear between the keyframes."""
     if not content.get("handles"):
         raise NotApplicable("needs a handle")
-    content["motions"] = {**(content.get("motions") or {}), "stress": keyframes}  # obstacles keep theirs
+    content["motions"] = {**(content.get("motions") or {}), "stress": keyframes}  # keep those of obstacles
     for handle in content["handles"]:
         handle |= {"motion": "stress", "interpolation": "linear", "from": 0.0}
         for key in ("until", "fade"):

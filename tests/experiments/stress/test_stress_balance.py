@@ -11,17 +11,17 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.experiments.stress.cases import selected
-from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_runner import StressOutcome, run_case
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
     StressCase,
-    as_it_is,
-    blow,
-    by_directors,
-    damp,
-    sheet,
+    base_scene,
+    hanging_sheet,
+    set_damping,
+    set_wind,
+    use_directors,
 )
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
@@ -32,8 +32,8 @@ CELLS = 8
 
 def run(comm: MPI.Comm, *, steps: int = 4, **changes: Any) -> StressOutcome:
     """A small hanging sheet in a breeze, or what ``changes`` make of it."""
-    content = blow(sheet(CELLS), 3.0) | changes
-    case = StressCase("try", "a try", as_it_is, steps=steps)
+    content = set_wind(hanging_sheet(CELLS), 3.0) | changes
+    case = StressCase("try", "a try", base_scene, steps=steps)
     return run_case(comm, case, Setting(content, False, Scope.QUICK))
 
 
@@ -66,8 +66,8 @@ def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
     outcome = run(comm, **changes)
     assert len(outcome.record.balances) == 4
     assert outcome.failures == {}
-    assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
-    assert not any(balance.jumped for balance in outcome.record.balances)
+    assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
+    assert not any(balance.hinges_jumped for balance in outcome.record.balances)
 
 
 @pytest.mark.parallel(2)
@@ -79,8 +79,8 @@ def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
 
 def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     [case] = selected(["pressed"], Scope.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(10), False, Scope.QUICK))
-    assert any(balance.jumped for balance in outcome.record.balances)
+    outcome = run_case(comm, case, Setting(hanging_sheet(10), False, Scope.QUICK))
+    assert any(balance.hinges_jumped for balance in outcome.record.balances)
     assert "jumped" in outcome.verdicts["energy"].message
     assert outcome.failures == {}
 
@@ -88,8 +88,8 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
 def test_a_balance_does_not_miss_a_narrow_barrier(comm: MPI.Comm) -> None:
     """Of steps thousands of gaps long."""
     [case] = selected(["contact-gap-1e-5-10ms"], Scope.USUAL)
-    outcome = run_case(comm, replace(case, steps=9), Setting(sheet(10), False, Scope.QUICK))
-    assert any(balance.jumped for balance in outcome.record.balances)
+    outcome = run_case(comm, replace(case, steps=9), Setting(hanging_sheet(10), False, Scope.QUICK))
+    assert any(balance.hinges_jumped for balance in outcome.record.balances)
     assert outcome.failures == {}
 
 
@@ -106,7 +106,7 @@ def test_every_balance_holds_where_triangles_collapse(
 
     monkeypatch.setattr(Bending, "energies", energies)
     [case] = selected(["wind-200"], Scope.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(CELLS), False, Scope.QUICK))
+    outcome = run_case(comm, case, Setting(hanging_sheet(CELLS), False, Scope.QUICK))
     assert comm.allreduce(min(left), op=MPI.MIN) < 0.1
     assert outcome.failures == {}
 
@@ -175,16 +175,16 @@ def test_negative_damping_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatc
         real(self, elements, *more)
 
     monkeypatch.setattr(Membrane, "__init__", init)
-    content = damp(sheet(CELLS), 1e-3)
-    case = StressCase("try", "a try", as_it_is, steps=4)
+    content = set_damping(hanging_sheet(CELLS), 1e-3)
+    case = StressCase("try", "a try", base_scene, steps=4)
     outcome = run_case(comm, case, Setting(content, False, Scope.QUICK))
     assert "no gain" in outcome.failures
 
 
 def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> StressOutcome:
-    content = blow(sheet(CELLS), 3.0) | changes
+    content = set_wind(hanging_sheet(CELLS), 3.0) | changes
     content["time"]["integrator"] = integrator
-    return run_case(comm, StressCase("a", "b", as_it_is, steps=4), Setting(content, True, Scope.QUICK))
+    return run_case(comm, StressCase("a", "b", base_scene, steps=4), Setting(content, True, Scope.QUICK))
 
 
 @pytest.mark.parallel(2)
@@ -194,7 +194,7 @@ def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: st
     assert outcome.failures == {}
     assert {"equations", "resolved", "energy", "momentum"} < set(outcome.verdicts)
     assert "no gain" not in outcome.verdicts
-    assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
+    assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
 
 
 @pytest.mark.parallel
@@ -203,9 +203,12 @@ def test_stages_with_directors_are_balanced(comm: MPI.Comm, integrator: str) -> 
     """Clamped, damped and turning fast: forces are in balance in the frames of the step."""
     turn = [{"time": 0.0}, {"time": 0.04, "rotate": {"axis": [1, 0, 0], "degrees": 120}}]
     handles = [{"group": "bottom", "clamp": True, "motion": "turn"}]
-    content = by_directors(blow(sheet(CELLS), 3.0)) | {"handles": handles, "motions": {"turn": turn}}
+    content = use_directors(set_wind(hanging_sheet(CELLS), 3.0)) | {
+        "handles": handles,
+        "motions": {"turn": turn},
+    }
     content["time"]["integrator"] = integrator
-    case = StressCase("a", "b", as_it_is, steps=4)
+    case = StressCase("a", "b", base_scene, steps=4)
     assert run_case(comm, case, Setting(content, True, Scope.QUICK)).failures == {}
 
 
@@ -232,4 +235,4 @@ def test_the_semi_implicit_method_promises_no_balance(comm: MPI.Comm) -> None:
 
 
 def test_an_empty_record_is_no_success() -> None:
-    assert not StressOutcome(StressCase("a", "b", as_it_is), record=Record(1, 1.0, 1.0)).passed
+    assert not StressOutcome(StressCase("a", "b", base_scene), record=RunRecord(1, 1.0, 1.0)).passed

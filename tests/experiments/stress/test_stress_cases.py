@@ -17,11 +17,11 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
     anisotropic,
-    blow,
-    move,
+    hanging_sheet,
+    move_handles,
     scale,
+    set_wind,
     setting_of,
-    sheet,
 )
 from lyra_petsc.scene.schema import Scene
 
@@ -127,19 +127,21 @@ def test_anisotropy_of_a_library_cloth(scene: Path) -> None:
 
 
 def test_wind_has_its_speed_and_keeps_the_scenes_air() -> None:
-    content = blow(sheet(4) | {"wind": {"velocity": [1, 0, 0], "density": 0.5, "drag": 0.1}}, 50.0)["wind"]
+    content = set_wind(
+        hanging_sheet(4) | {"wind": {"velocity": [1, 0, 0], "density": 0.5, "drag": 0.1}}, 50.0
+    )["wind"]
     assert math.hypot(*content["velocity"]) == pytest.approx(50.0)
     assert (content["density"], content["drag"]) == (0.5, 0.1)
 
 
 def test_handles_move_for_ever_and_a_sheet_without_cannot() -> None:
-    content = sheet(4)
+    content = hanging_sheet(4)
     content["handles"][0] |= {"until": 1.0, "fade": 0.1}
-    moved = move(content, [{"time": 0.0}])["handles"][0]
-    assert moved["motion"] == "stress"
-    assert not {"until", "fade"} & moved.keys()
+    moved_handle = move_handles(content, [{"time": 0.0}])["handles"][0]
+    assert moved_handle["motion"] == "stress"
+    assert not {"until", "fade"} & moved_handle.keys()
     with pytest.raises(NotApplicable):
-        move(sheet(4) | {"handles": []}, [{"time": 0.0}])
+        move_handles(hanging_sheet(4) | {"handles": []}, [{"time": 0.0}])
 
 
 # -- start shapes --------------------------------------------------------------------------------------
@@ -178,9 +180,9 @@ def test_a_fold_spares_an_odd_number_of_cells() -> None:
 
 def test_noise_has_its_size_and_is_always_the_same() -> None:
     x = flat()
-    shift = sheets._noisy(x, 0.025) - x
+    shift = sheets._with_noise(x, 0.025) - x
     assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
-    np.testing.assert_array_equal(sheets._noisy(x, 0.025), x + shift)
+    np.testing.assert_array_equal(sheets._with_noise(x, 0.025), x + shift)
 
 
 def test_a_mirrored_shell_keeps_its_rim() -> None:
@@ -192,15 +194,15 @@ def test_a_mirrored_shell_keeps_its_rim() -> None:
 
 
 def test_the_rigid_plates_time() -> None:
-    assert pytest.approx(0.4836, abs=5e-5) == limits.QUARTER
+    assert pytest.approx(0.4836, abs=5e-5) == limits.FALL_TIME
 
 
 def test_the_first_vertical_is_interpolated() -> None:
     angle = np.array([0.0, 0.4, 1.2, 1.7, 2.0])
-    places = [(math.cos(a), -math.sin(a)) for a in angle]
-    found = limits.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], places)
+    centres = [(math.cos(a), -math.sin(a)) for a in angle]
+    found = limits.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], centres)
     assert found == pytest.approx(0.2 + 0.1 * (math.pi / 2 - 1.2) / 0.5)
-    assert math.isnan(limits.first_vertical([0.0, 0.1, 0.2], places[:3]))
+    assert math.isnan(limits.first_vertical([0.0, 0.1, 0.2], centres[:3]))
 
 
 def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
@@ -208,14 +210,14 @@ def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
     x = np.column_stack([np.cumsum(np.cos(angle)), np.cumsum(np.sin(angle))])
     v = np.zeros_like(x)
     for _ in range(5):
-        aim = x + 0.05 * v + 0.05**2 * np.array([0.0, -limits.G])
-        before, (x, v) = x, limits.inextensible(x, v, 0.05, 1.0)
+        free_x = x + 0.05 * v + 0.05**2 * np.array([0.0, -limits.G])
+        before, (x, v) = x, limits.step_inextensible_chain(x, v, 0.05, 1.0)
     links = np.diff(x, axis=0)
     np.testing.assert_allclose(np.linalg.norm(links, axis=1), 1.0, rtol=1e-13)
     np.testing.assert_allclose(x[[0, -1]], before[[0, -1]])
     np.testing.assert_allclose(v, (x - before) / 0.05)
     # what pulls each inner joint away from where it would go acts along its two links
-    pull = (x - aim)[1:-1].ravel()
+    pull = (x - free_x)[1:-1].ravel()
     lines = np.zeros((pull.size, len(links)))
     for k, link in enumerate(links):
         for joint, sign in ((k, -1.0), (k + 1, 1.0)):
@@ -231,4 +233,4 @@ def test_the_base_sheet_is_of_the_size_that_is_promised() -> None:
     assert grid is not None
     assert (grid.nx + 1) * (grid.ny + 1) == 1681
     assert grid.pattern == "alternating"
-    assert Setting(sheet(4), False, Scope.QUICK).step == 0.005
+    assert Setting(hanging_sheet(4), False, Scope.QUICK).step == 0.005

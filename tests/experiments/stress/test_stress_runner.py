@@ -12,24 +12,24 @@ from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
 from lyra_petsc.experiments.stress import stress_runner
 from lyra_petsc.experiments.stress.cases import selected
 from lyra_petsc.experiments.stress.stress_runner import (
-    PICTURES,
+    MAX_FIGURES,
     BaseClock,
     SavedOutcome,
     Stress,
     StressOutcome,
-    row_of,
+    csv_row,
     run_case,
 )
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
     StressCase,
-    as_it_is,
+    base_scene,
+    hanging_sheet,
     setting_of,
-    sheet,
 )
 
-SMALL = Setting(sheet(6), False, Scope.QUICK)
+SMALL = Setting(hanging_sheet(6), False, Scope.QUICK)
 
 
 def run(comm: MPI.Comm, name: str) -> StressOutcome:
@@ -51,7 +51,7 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
 @pytest.mark.parallel(2)
 def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
     case = StressCase(
-        "a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x
+        "a", "b", base_scene, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x
     )
     record = run_case(comm, case, SMALL).record
     assert record.observed[0].min() == pytest.approx(record.observed[0][0, 0])
@@ -60,20 +60,22 @@ def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
 
 
 def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
-    outcomes = [run_case(comm, StressCase("a", "b", as_it_is, steps=1), SMALL) for _ in range(PICTURES + 2)]
-    outcomes[-1].record.stopped = "at once"
+    outcomes = [
+        run_case(comm, StressCase("a", "b", base_scene, steps=1), SMALL) for _ in range(MAX_FIGURES + 2)
+    ]
+    outcomes[-1].record.stop_reason = "at once"
     Stress(SMALL, len(outcomes)).case_ended(outcomes)
     assert outcomes[-1].record.last is not None
-    assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
+    assert sum(outcome.record.last is not None for outcome in outcomes) == MAX_FIGURES
 
 
 @pytest.mark.parallel(2)
 def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
-    content = sheet(6) | {"petsc": {"snes_max_it": 0}}
-    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
+    content = hanging_sheet(6) | {"petsc": {"snes_max_it": 0}}
+    outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert not outcome.passed
     assert "did not converge" in outcome.failures["converged"].message
-    row = row_of(outcome)
+    row = csv_row(outcome)
     assert (row["steps"], row["converged"]) == (0, False)
     # where it stood is kept to be drawn
     assert (outcome.record.last is not None) is (comm.rank == 0)
@@ -81,39 +83,39 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
 
 @pytest.mark.parallel(2)
 def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
-    content = sheet(6) | {"petsc": {"snes_atol": 1e9}}
-    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
+    content = hanging_sheet(6) | {"petsc": {"snes_atol": 1e9}}
+    outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].message
 
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("scale", [1e9, 1e16])
 def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
-    content = sheet(6)
+    content = hanging_sheet(6)
     content["material"]["stretching_scale"] = scale
-    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert outcome.passed
     assert min(report.newton_iterations for report in outcome.record.reports) > 1
 
 
 @pytest.mark.parallel(2)
 def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
-    content = sheet(6)
+    content = hanging_sheet(6)
     content["handles"] = [{"group": "nowhere"}]
-    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert "nowhere" in outcome.failures["converged"].message
 
 
 @pytest.mark.parallel(2)
 def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(stress_runner.LONGEST, Scope.QUICK, 0.0)
-    outcome = run_case(comm, StressCase("a", "b", as_it_is), SMALL)
+    monkeypatch.setitem(stress_runner.TIME_LIMIT, Scope.QUICK, 0.0)
+    outcome = run_case(comm, StressCase("a", "b", base_scene), SMALL)
     assert "has had its time" in outcome.failures["converged"].message
 
 
 def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> None:
     [case] = selected(["slivers"], Scope.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(4), True, Scope.QUICK))
+    outcome = run_case(comm, case, Setting(hanging_sheet(4), True, Scope.QUICK))
     assert outcome.left_out
     assert outcome.passed
     assert outcome.record.reports == []
@@ -124,10 +126,10 @@ def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
     clock = BaseClock(comm, SMALL)
     assert np.all(clock.latest > 0.0)
     assert clock.size == pytest.approx(np.sqrt(2.0))
-    outcome = run_case(comm, StressCase("same", "the base itself", as_it_is), SMALL, clock)
+    outcome = run_case(comm, StressCase("same", "the base itself", base_scene), SMALL, clock)
     # about 1 on a machine that does nothing else
-    assert 0.0 < outcome.ratio < 1e3
-    assert 0.0 < outcome.busy_ratio < 1e3
+    assert 0.0 < outcome.wall_ratio < 1e3
+    assert 0.0 < outcome.cpu_ratio < 1e3
 
 
 def test_an_outcome_goes_through_files(comm: MPI.Comm, tmp_path: Path) -> None:
@@ -135,7 +137,7 @@ def test_an_outcome_goes_through_files(comm: MPI.Comm, tmp_path: Path) -> None:
     save_record(tmp_path / OUTCOME_FILE, outcome.saved())
     back = StressOutcome(outcome.case, **vars(load_record(tmp_path / OUTCOME_FILE, SavedOutcome)))
     assert back.verdicts == outcome.verdicts
-    mine, theirs = row_of(outcome), row_of(back)
+    mine, theirs = csv_row(outcome), csv_row(back)
     assert tuple(mine) == tuple(theirs) == Stress.columns
     np.testing.assert_equal(list(theirs.values()), list(mine.values()))
     np.testing.assert_array_equal(back.record.last, outcome.record.last)

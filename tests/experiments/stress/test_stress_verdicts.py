@@ -7,32 +7,32 @@ from dataclasses import replace
 
 import pytest
 
-from lyra_petsc.experiments.stress.step_balance import Record, StepBalance, of_physics, speed
+from lyra_petsc.experiments.stress.step_balance import RunRecord, StepBalance, judge_physics, judge_speed
 from lyra_petsc.experiments.stress.stress_runner import StressOutcome
-from lyra_petsc.experiments.stress.stress_scenes import StressCase, as_it_is
+from lyra_petsc.experiments.stress.stress_scenes import StressCase, base_scene
 from lyra_petsc.stepping.simulation import StepReport
 
 GOOD = StepBalance(
     change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
-    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, push=1e-3, momentum=1e-8,
-    momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
+    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, displacement=1e-3, momentum=1e-8,
+    momentum_tolerance=1e-7, angular=1e-8, angular_tolerance=1e-7,
 )  # fmt: skip
 STEP = StepReport(1, 0.01, 0.01, 5, 100, 0, 1e-6, 0.1, 0.9, 1.1)
 NOTE = "step 1: triangle 3 …; below 0.577 the St. Venant-Kirchhoff model softens"
 
 
-def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: object) -> Record:
+def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: object) -> RunRecord:
     """Three steps, the middle one as given."""
-    good = Record(3, 0.01, 0.03, 1.0, [STEP, report, STEP], [GOOD, balance, GOOD])
+    good = RunRecord(3, 0.01, 0.03, 1.0, [STEP, report, STEP], [GOOD, balance, GOOD])
     return replace(good, **more)  # type: ignore[arg-type]
 
 
-def failures(found: Record) -> dict[str, str]:
-    return {name: verdict.message for name, verdict in of_physics(found).items() if not verdict.passed}
+def failures(found: RunRecord) -> dict[str, str]:
+    return {name: verdict.message for name, verdict in judge_physics(found).items() if not verdict.passed}
 
 
 def test_a_good_record_passes() -> None:
-    assert set(of_physics(record())) == {
+    assert set(judge_physics(record())) == {
         "converged",
         "equations",
         "resolved",
@@ -81,21 +81,21 @@ def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(left: float, 
 def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
     buckling = replace(GOOD, bracket=0.7, change=0.4)
     assert failures(record(buckling)) == {}
-    assert "buckling" in of_physics(record(buckling))["no gain"].message
+    assert "buckling" in judge_physics(record(buckling))["no gain"].message
 
 
 def test_round_off_as_the_promise_is_said() -> None:
-    words = of_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].message
+    words = judge_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].message
     assert "floor of round-off" in words
 
 
 def test_a_run_that_stopped_has_not_converged() -> None:
-    assert "step 4 failed" in failures(record(stopped="step 4 failed"))["converged"]
-    assert "converged" in failures(Record(3, 0.01, 0.03))
+    assert "step 4 failed" in failures(record(stop_reason="step 4 failed"))["converged"]
+    assert "converged" in failures(RunRecord(3, 0.01, 0.03))
 
 
 def test_rejected_steps_are_told_and_allowed() -> None:
-    verdict = of_physics(record(report=replace(STEP, rejected=2, dt=0.0025)))["converged"]
+    verdict = judge_physics(record(report=replace(STEP, rejected=2, dt=0.0025)))["converged"]
     assert verdict.passed
     assert "2 attempts rejected" in verdict.message
     assert "0.0025 s" in verdict.message
@@ -119,14 +119,14 @@ def test_softening_must_be_told() -> None:
     ],
 )
 def test_speed_is_judged_by_iterations_and_time(
-    newton: list[int], ratio: float, busy: float, good: bool
+    newton: list[int], wall_ratio: float, cpu_seconds: float, good: bool
 ) -> None:
     reports = [replace(STEP, newton_iterations=n) for n in newton]
-    assert speed(record(reports=reports), ratio, busy).passed is good
+    assert judge_speed(record(reports=reports), wall_ratio, cpu_seconds).passed is good
 
 
 def test_what_stopped_is_not_fast() -> None:
-    assert not speed(record(stopped="at once"), 1.0, 1.0).passed
+    assert not judge_speed(record(stop_reason="at once"), 1.0, 1.0).passed
 
 
 @pytest.mark.parametrize(
@@ -139,10 +139,12 @@ def test_what_stopped_is_not_fast() -> None:
         ("semi-implicit", 0.95, 0.0, False, "FAILED"),
     ],
 )
-def test_the_whole_run_is_judged(integrator: str, lost: float, gained: float, good: bool, word: str) -> None:
-    balance = {"numerical_dissipation": lost, "numerical_gain": gained, "repeated": 2}
+def test_the_whole_run_is_judged(
+    integrator: str, dissipation: float, gained: float, good: bool, word: str
+) -> None:
+    balance = {"numerical_dissipation": dissipation, "numerical_gain": gained, "repeated": 2}
     found = replace(record(integrator=integrator), balance=balance)
-    verdicts = of_physics(found)
+    verdicts = judge_physics(found)
     assert verdicts["whole run"].passed is good
     assert "2 attempts repeated" in verdicts["whole run"].message
-    assert StressOutcome(StressCase("a", "b", as_it_is), verdicts, record=found).verdict == word
+    assert StressOutcome(StressCase("a", "b", base_scene), verdicts, record=found).verdict == word

@@ -22,12 +22,12 @@ FAMILIES: Registry[CaseFamily] = Registry(
 
 
 def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
-    """The cases of a level, or those of the families and cases named, of whatever level.
+    """The cases of a level; with ``only``, the named cases of any level and the families' cases of the level.
 
     Raises
     ------
     InputError
-        For a name that is neither, with the nearest that is.
+        For an unknown name; the message suggests the nearest known one.
     """
     everything = [case for family in FAMILIES.all() for case in family.cases]
     if not only:
@@ -36,7 +36,6 @@ def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
     for name in only:
         if name not in known:
             raise InputError(f"unknown case or family, {nearest(name, known)}; --list names all", key=name)
-    # a family brings those of its cases that the level has; a case that is named is run at any level
     found = [
         case for case in everything if case.name in only or (case.family in only and case.level <= level)
     ]

@@ -1,6 +1,6 @@
-"""Sheets that meet obstacles and each other: thin and thick, fast, stiff, squeezed, in a ring, in a knot.
+"""Contact of sheets with obstacles and each other: thin, thick, fast, stiff, squeezed, in a ring, in a knot.
 
-Nothing may cross in any state, and a step takes at most `MOST` Newton iterations in the median.
+No triangles may cross in any state, and steps take at most `MAX_NEWTON` Newton iterations in the median.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle, resample_polyline
-from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
@@ -33,26 +33,26 @@ from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 
-MOST = 12
-"""Newton iterations of a step, in the median."""
+MAX_NEWTON = 12
+"""Allowed Newton iterations of a step, in the median."""
 
 CELLS, RADIUS = 12, 0.3
 """Cells along a side of the sheet, and radius of the ball [m]."""
 
 STEPS = 40
 PRESSURE, LAYERS, RAMP = 1e5, 10, 20
-"""Pa, and steps in which the pressure grows"""
+"""Pressure [Pa] on a number of layers, and number of steps in which it grows"""
 
 KNOT, CUT, TAIL, STRAND, WIDE, PULLED = 0.04, 0.2, 3.0, 0.01, 2, 0.25
-"""Size of the knot [m], angle from its cut [rad], tails over its size, edges [m] and how many are across, how
-far each end is pulled [m]"""
+"""Size of the knot [m], half the angle that is cut out of it [rad], length of its tails over its size, edge
+length [m], cells across, displacement of each end [m]"""
 
 MANY, MANY_LAYERS, MANY_CELLS = 100_000, 5, 107
-"""Contacts asked for, and the stack that has them: sheets and cells along a side"""
+"""Required number of contacts, and sheets and cells along a side of the stack that reaches it"""
 
 
 def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **more: Any) -> Content:
-    """A scene of the base scene's material, with nothing held."""
+    """A scene with the material of the base scene and without handles."""
     content = setting.content()
     return content | {"mesh": mesh, "handles": [], "contact": contact, "obstacles": obstacles} | more
 
@@ -60,7 +60,7 @@ def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **
 def _over_ball(
     setting: Setting, bench: Bench, contact: Content, stiffer: float = 1.0, speed: float = 0.0
 ) -> Content:
-    """A square metre over a ball, on which it falls."""
+    """A sheet of one square metre that falls on a ball."""
     ball = {"ball": {"sphere": {"center": [0.0, 0.0, 0.0], "radius": RADIUS}}}
     mesh = _square(RADIUS + (contact.get("thickness", 0.0) + 0.02))
     content = _scene(setting, mesh, contact, ball, initial={"velocity": [0.0, 0.0, -speed]})
@@ -68,29 +68,29 @@ def _over_ball(
 
 
 def _square(height: float, side: float = 1.0, cells: int = CELLS, y: float = -0.48) -> Content:
-    """A square [m] whose middle is nearly above the origin."""
-    place = [-0.5 * side, y * side, height]
-    return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": place}}
+    """The mesh of a square [m] whose centre is nearly above the origin."""
+    shift = [-0.5 * side, y * side, height]
+    return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": shift}}
 
 
 def _on_needles(setting: Setting, bench: Bench) -> Content:
-    """On a roof of long thin triangles, a thousand times as long as they are wide."""
+    """A sheet on a roof of triangles that are a thousand times as long as wide."""
     n = 1400
     x = np.linspace(-1.0, 1.0, n + 1)
     below = np.column_stack([x, np.full(n + 1, -1.0), np.full(n + 1, -1.0)])
     ridge = np.column_stack([x + 0.5 / n, np.zeros(n + 1), np.zeros(n + 1)])
-    beyond = below * [1.0, -1.0, 1.0]
+    opposite = below * [1.0, -1.0, 1.0]
     i = np.arange(n)
     sides = []
     for first in (0, 2 * (n + 1)):
         sides += [[first + i, first + i + 1, n + 1 + i], [first + i + 1, n + 2 + i, n + 1 + i]]
     triangles = np.concatenate([np.stack(side, axis=1) for side in sides])
-    roof = bench.mesh(np.concatenate([below, ridge, beyond]), triangles)
+    roof = bench.mesh(np.concatenate([below, ridge, opposite]), triangles)
     return _scene(setting, _square(0.02), {"gap": 0.01}, {"roof": {"mesh": roof}})
 
 
 def _through_ring(setting: Setting, bench: Bench) -> Content:
-    """Pulled by its middle through a ring of a fifth of its width."""
+    """A sheet that is pulled by its centre through a ring of 0.4 of its width."""
     n, radius, thick = 16, 0.1, 0.02
     angle = 2.0 * math.pi * np.arange(n + 1) / n
     corners = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(n + 1)]).tolist()
@@ -105,39 +105,39 @@ def _through_ring(setting: Setting, bench: Bench) -> Content:
 
 
 def _pressed(setting: Setting, bench: Bench) -> Content:
-    """Ten layers on a plane, on the uppermost of which a pressure acts."""
+    """Ten layers on a plane with a pressure on the top one."""
     meshes = []
     for layer in range(LAYERS):
-        place = [-0.05 + 0.002 * (layer % 3), 0.003 * (layer % 2), 0.005 + 0.006 * layer]
-        meshes.append(grid(0.1, 0.1, 3, 3) | {"name": f"layer{layer}", "transform": {"translate": place}})
+        shift = [-0.05 + 0.002 * (layer % 3), 0.003 * (layer % 2), 0.005 + 0.006 * layer]
+        meshes.append(grid(0.1, 0.1, 3, 3) | {"name": f"layer{layer}", "transform": {"translate": shift}})
     group = f"layer{LAYERS - 1}"
-    # in each step that much more
+    # each step adds an increment of the pressure
     loads = [
-        {"group": group, "traction": [0.0, 0.0, -more], "from": STEP * k}
-        for k, more in enumerate(np.diff(np.geomspace(1e-4, 1.0, RAMP + 1)) * PRESSURE)
+        {"group": group, "traction": [0.0, 0.0, -increment], "from": STEP * k}
+        for k, increment in enumerate(np.diff(np.geomspace(1e-4, 1.0, RAMP + 1)) * PRESSURE)
     ]
     return _scene(setting, meshes, {"gap": 0.004}, {"floor": FLOOR}, loads=loads)
 
 
 def _knot(setting: Setting, bench: Bench) -> Content:
-    """A strip in an overhand knot, a trefoil that is cut open where it is outermost, and is pulled."""
+    """A strip in an overhand knot, whose ends are pulled: a trefoil knot that is cut open at its outside."""
     t = np.linspace(CUT, 2.0 * math.pi - CUT, 2000) + math.pi / 3.0
-    bow = np.column_stack(
+    knot = np.column_stack(
         [np.sin(t) + 2.0 * np.sin(2.0 * t), np.cos(t) - 2.0 * np.cos(2.0 * t), -np.sin(3.0 * t)]
     )
-    # the ends turn outwards
+    # tails that bend outwards from the cut
     s = np.linspace(0.0, TAIL, 200)[1:, None]
-    out = np.array([math.sqrt(0.75), 0.5, 0.0])
-    apart = bow[0] - bow[-1]
-    apart /= np.linalg.norm(apart)
+    outwards = np.array([math.sqrt(0.75), 0.5, 0.0])
+    pull = knot[0] - knot[-1]
+    pull /= np.linalg.norm(pull)
     tails = []
-    for end, before in ((bow[0], bow[1]), (bow[-1], bow[-2])):
-        on = (end - before) / np.linalg.norm(end - before)
-        tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * on + s * out)
-    way = KNOT * np.concatenate([tails[0][::-1], bow, tails[1]])
-    length = float(np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))[-1])
+    for end, before in ((knot[0], knot[1]), (knot[-1], knot[-2])):
+        tangent = (end - before) / np.linalg.norm(end - before)
+        tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * tangent + s * outwards)
+    line = KNOT * np.concatenate([tails[0][::-1], knot, tails[1]])
+    length = float(np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))[-1])
     cells = round(length / STRAND)
-    middle = resample_polyline(way, cells + 1)
+    middle = resample_polyline(line, cells + 1)
     along = np.gradient(middle, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
@@ -146,10 +146,11 @@ def _knot(setting: Setting, bench: Bench) -> Content:
     side = np.arange(WIDE + 1.0) - 0.5 * WIDE
     start = (middle + STRAND * side[:, None, None] * across).reshape(-1, 3)
     row = (cells + 1) * np.arange(WIDE + 1)
-    handles = [{"nodes": row.tolist(), "motion": "back"}, {"nodes": (row + cells).tolist(), "motion": "on"}]
-    pulls = {"back": PULLED * apart, "on": -PULLED * apart}
+    ends = {"first": (row, PULLED * pull), "last": (row + cells, -PULLED * pull)}
+    handles = [{"nodes": nodes.tolist(), "motion": name} for name, (nodes, _) in ends.items()]
     motions = {
-        name: [{"time": 0.0}, {"time": 80 * STEP, "translate": pull.tolist()}] for name, pull in pulls.items()
+        name: [{"time": 0.0}, {"time": 80 * STEP, "translate": displacement.tolist()}]
+        for name, (_, displacement) in ends.items()
     }
     mesh = bench.mesh(start, faces, rest=flat[:, :2])
     contact = {"gap": 0.4 * STRAND, "friction": 0.3}
@@ -157,34 +158,36 @@ def _knot(setting: Setting, bench: Bench) -> Content:
 
 
 def _stack(setting: Setting, bench: Bench) -> Content:
-    """Sheets on each other on a plane, where each vertex but those of the lowest feels two others."""
+    """A stack of sheets on a plane, in which vertices are in contact with sheets above and below."""
     gap = 0.2 / MANY_CELLS
-    # none has its vertices over those of the one below
-    shifts = [[0.3 * gap * (layer % 3), 0.4 * gap * (layer % 2)] for layer in range(MANY_LAYERS)]
-    places = [[*shift, gap * (layer + 0.9)] for layer, shift in enumerate(shifts)]
+    # no sheet has its vertices above those of the sheet below
+    shifts = [
+        [0.3 * gap * (layer % 3), 0.4 * gap * (layer % 2), gap * (layer + 0.9)]
+        for layer in range(MANY_LAYERS)
+    ]
     meshes = [
-        grid(1.0, 1.0, MANY_CELLS, MANY_CELLS, "alternating") | {"transform": {"translate": place}}
-        for place in places
+        grid(1.0, 1.0, MANY_CELLS, MANY_CELLS, "alternating") | {"transform": {"translate": shift}}
+        for shift in shifts
     ]
     return _scene(setting, meshes, {"gap": gap, "friction": 0.3}, {"floor": FLOOR})
 
 
 def _contacts(trial: Trial) -> tuple[int, float]:
-    """Crossings, and how many contacts there are."""
+    """Numbers of crossings and of contacts."""
     return _crossings(trial), trial.simulation.ledger.columns()["contacts"]
 
 
-def _judged_many(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
-    crossed, contacts = zip(*record.observed, strict=True)
+def _judge_many(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+    crossings, contacts = zip(*record.observed, strict=True)
     most = max(contacts)
     return {
-        **_judged(setting, bench, replace(record, observed=list(crossed))),
+        **_judge(setting, bench, replace(record, observed=list(crossings))),
         "contacts": Verdict(most >= MANY, f"{most:.6g} contacts at most, asked for {MANY}"),
     }
 
 
 def _crossings(trial: Trial) -> int:
-    """Number of pairs of triangles that cross now, plus parts that lie inside obstacles."""
+    """Number of pairs of crossing triangles, plus overlaps with obstacles, in the present state."""
     simulation, x = trial.simulation, trial.x
     mesh = simulation.problem.mesh  # on rank 0
     term: Any = simulation.problem.terms["contact"]
@@ -201,16 +204,16 @@ def _crossings(trial: Trial) -> int:
     return on_root(simulation.comm, count)
 
 
-def _judged(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
-    crossed, usual = sum(record.observed), statistics.median(record.newton)
-    states = f"{crossed} crossings in {len(record.observed)} states"
+def _judge(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+    crossings, median = sum(record.observed), statistics.median(record.newton)
+    iterations = f"{median:g} Newton iterations in the median, at most {MAX_NEWTON}"
     return {
-        "crossings": Verdict(crossed == 0, states),
-        "iterations": Verdict(usual <= MOST, f"{usual:g} Newton iterations in the median, at most {MOST}"),
+        "crossings": Verdict(crossings == 0, f"{crossings} crossings in {len(record.observed)} states"),
+        "iterations": Verdict(median <= MAX_NEWTON, iterations),
     }
 
 
-_case = partial(StressCase, own=True, steps=STEPS, step=STEP, observe=_crossings, judge=_judged)
+_case = partial(StressCase, own_scene=True, steps=STEPS, step=STEP, observe=_crossings, judge=_judge)
 
 
 def _ball(
@@ -222,12 +225,12 @@ def _ball(
     contact: Content | None = None,
     **more: Any,
 ) -> StressCase:
-    """A case over the ball; ``contact`` is added to a gap of a centimetre, ``more`` as of `StressCase`."""
+    """A case with the ball; the gap is 1 cm unless ``contact`` has one, ``more`` as of `StressCase`."""
     scene = partial(_over_ball, contact={"gap": 0.01} | (contact or {}), stiffer=stiffer, speed=speed)
     return _case(f"contact-{name}", title, scene, **more)
 
 
-RUBS = {"friction": 0.5}
+RUBBING = {"friction": 0.5}
 
 contact = family(
     "contact",
@@ -249,12 +252,12 @@ contact = family(
     _ball("thrown-100", "thrown at the ball with 100 m/s", speed=100.0, steps=20),
     _case("contact-needles", "on a roof of triangles of aspect 1000", _on_needles),
     _case("contact-ring", "pulled through a narrow ring", _through_ring, steps=80),
-    _ball("friction", "friction 0.5", contact=RUBS, level=QUICK),
-    _ball("friction-thrown", "friction 0.5, thrown with 10 m/s", contact=RUBS, speed=10.0, steps=20),
+    _ball("friction", "friction 0.5", contact=RUBBING, level=QUICK),
+    _ball("friction-thrown", "friction 0.5, thrown with 10 m/s", contact=RUBBING, speed=10.0, steps=20),
     _case("contact-knot", "an overhand knot pulled tight", _knot, steps=80),
     _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
     _case(
         "contact-many", "a stack with 100,000 contacts", _stack, steps=4, level=FULL, observe=_contacts,
-        judge=_judged_many,
+        judge=_judge_many,
     ),
 )  # fmt: skip

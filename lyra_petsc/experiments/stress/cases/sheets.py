@@ -1,7 +1,7 @@
-"""The base scene, changed: stiffnesses, density, damping, Δt, wind and weight, one by one and all at once.
+"""Changes of the base scene: stiffnesses, density, damping, Δt, wind and weight, one by one and all at once.
 
-And sheets with bad elements, with shapes that no sheet starts from, with nothing held, with violent handles;
-and those that bend by directors on edges: stiff, at large steps, folded, twisted, crushed, crumpled.
+Also sheets with bad elements, extreme start shapes, without handles, with violent handles; and sheets that
+bend by directors on edges: stiff, at large steps, folded, twisted, crushed, crumpled.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_scenes import (
     CELLS,
     FULL,
@@ -29,37 +29,37 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     Setting,
     StressCase,
     anisotropic,
-    as_it_is,
-    blow,
-    by_directors,
-    changed,
-    damp,
+    base_scene,
+    base_with,
     family,
-    move,
-    release,
+    hanging_sheet,
+    move_handles,
+    remove_handles,
     scale,
-    sheet,
-    weigh,
+    scale_gravity,
+    set_damping,
+    set_wind,
+    use_directors,
 )
 from lyra_petsc.experiments.verification.verification_case import grid
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 
-def _times(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
-    """A case for each factor of a parameter of `scale`."""
+def _scaled_cases(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
+    """One case per factor on a parameter of `scale`."""
     for factor, level in levels.items():
-        scene = changed(scale, **{parameter: float(factor)})
+        scene = base_with(scale, **{parameter: float(factor)})
         yield StressCase(f"{what}-{factor}", f"{what} × {factor}", scene, level=level)
 
 
-# the goal: stiff sheets at steps of milliseconds and tens of milliseconds, solved in few iterations
+# a main goal of the program: stiff sheets at Δt of 5 to 40 ms, solved in few iterations
 stiff_steps = family(
     "stiff-steps",
     "membrane stiffness and Δt together, with bounds on iterations and wall time",
     *(
         StressCase(
             f"stiff-{factor}-{ms}ms", f"membrane × {factor}, Δt {ms} ms",
-            changed(scale, stretching=float(factor)), step=1e-3 * ms, level=QUICK, swift=True,
+            base_with(scale, stretching=float(factor)), step=1e-3 * ms, level=QUICK, is_timed=True,
         )
         for factor in ("1e3", "1e6")
         for ms in (5, 40)
@@ -69,20 +69,22 @@ stiff_steps = family(
 membrane = family(
     "membrane",
     "membrane stiffness × 1e-3 to 1e9",
-    *_times("membrane", "stretching", {"1e-3": QUICK, "1": USUAL, "1e3": USUAL, "1e6": USUAL, "1e9": QUICK}),
+    *_scaled_cases(
+        "membrane", "stretching", {"1e-3": QUICK, "1": USUAL, "1e3": USUAL, "1e6": USUAL, "1e9": QUICK}
+    ),
 )
 
 bending = family(
     "bending",
     "bending stiffness × 0 to 1e6",
-    *_times("bending", "bending", {"0": QUICK, "1": FULL, "1e3": USUAL, "1e6": QUICK}),
+    *_scaled_cases("bending", "bending", {"0": QUICK, "1": FULL, "1e3": USUAL, "1e6": QUICK}),
 )
 
 time_step = family(
     "time-step",
     "Δt from 1e-5 s to 1 s",
     *(
-        StressCase(f"step-{step}", f"Δt {step} s", as_it_is, steps=steps, step=float(step), level=level)
+        StressCase(f"step-{step}", f"Δt {step} s", base_scene, steps=steps, step=float(step), level=level)
         for step, steps, level in (
             ("1e-5", 30, QUICK),
             ("1e-4", 30, USUAL),
@@ -97,7 +99,7 @@ time_step = family(
 density = family(
     "density",
     "density × 1e-3 to 1e3",
-    *_times(
+    *_scaled_cases(
         "density",
         "density",
         {"1e-3": QUICK, "1e-2": FULL, "1e-1": FULL, "1e1": FULL, "1e2": FULL, "1e3": USUAL},
@@ -107,23 +109,23 @@ density = family(
 anisotropy = family(
     "anisotropy",
     "c11/c22 = 1e4, their mean staying",
-    StressCase("stiff-warp", "c11/c22 = 1e4", changed(anisotropic, ratio=1e4), level=QUICK),
-    StressCase("stiff-weft", "c11/c22 = 1e-4", changed(anisotropic, ratio=1e-4)),
+    StressCase("stiff-warp", "c11/c22 = 1e4", base_with(anisotropic, ratio=1e4), level=QUICK),
+    StressCase("stiff-weft", "c11/c22 = 1e-4", base_with(anisotropic, ratio=1e-4)),
 )
 
 damping = family(
     "damping",
     "γ 0 and 10 s",
-    StressCase("damping-0", "no damping", changed(damp, seconds=0.0)),
-    StressCase("damping-10s", "damping γ = 10 s", changed(damp, seconds=10.0), level=QUICK),
+    StressCase("damping-0", "no damping", base_with(set_damping, seconds=0.0)),
+    StressCase("damping-10s", "damping γ = 10 s", base_with(set_damping, seconds=10.0), level=QUICK),
 )
 
 
 def _product(setting: Setting, bench: Bench, **factors: float) -> Content:
-    """Without a scene of the user, of a coarser sheet."""
+    """The base scene with several factors; the default base scene with a coarser mesh."""
     content = setting.content()
     if not setting.given:
-        content |= {key: sheet(CELLS[QUICK])[key] for key in ("mesh", "handles")}
+        content |= {key: hanging_sheet(CELLS[QUICK])[key] for key in ("mesh", "handles")}
     return scale(content, **factors)
 
 
@@ -152,14 +154,14 @@ products = family(
 wind = family(
     "wind",
     "wind of 50 and 200 m/s",
-    StressCase("wind-50", "wind 50 m/s", changed(blow, speed=50.0)),
-    StressCase("wind-200", "wind 200 m/s", changed(blow, speed=200.0), level=QUICK),
+    StressCase("wind-50", "wind 50 m/s", base_with(set_wind, speed=50.0)),
+    StressCase("wind-200", "wind 200 m/s", base_with(set_wind, speed=200.0), level=QUICK),
 )
 
 gravity = family(
     "gravity",
     "gravity × 1000",
-    StressCase("gravity-1000", "gravity × 1000", changed(weigh, factor=1000.0), level=QUICK),
+    StressCase("gravity-1000", "gravity × 1000", base_with(scale_gravity, factor=1000.0), level=QUICK),
 )
 
 
@@ -168,15 +170,15 @@ NOISE = 0.3
 
 FOLDS = 12
 RISE = 0.15
-"""Of the dome, m."""
+"""Height of the dome [m]."""
 
 
-def _noisy(x: Array, spacing: float) -> Array:
+def _with_noise(x: Array, spacing: float) -> Array:
     return np.asarray(x + NOISE * spacing * np.random.default_rng(1).standard_normal(x.shape))
 
 
 def _crumpled(x: Array, spacing: float) -> Array:
-    """Folded repeatedly along random planes near the middle of the shape that previous folds have left."""
+    """Folded repeatedly along random planes near the middle of the present shape."""
     random = np.random.default_rng(2)
     y = x - x.mean(axis=0)
     for _ in range(FOLDS):
@@ -189,10 +191,10 @@ def _crumpled(x: Array, spacing: float) -> Array:
 
 
 def _folded(x: Array, spacing: float) -> Array:
-    """Flat on itself: what is beyond the vertex nearest to the middle of the longest side, mirrored there."""
+    """Folded flat: one half is mirrored at the vertex that is nearest to the middle of the longest side."""
     axis = int(np.argmax(np.ptp(x, axis=0)))
     middle = 0.5 * (x[:, axis].min() + x[:, axis].max())
-    # through a vertex: cells cut in their middle would lose all their area
+    # through a vertex: cells that are folded in their middle would lose all their area
     crease = x[np.argmin(np.abs(x[:, axis] - middle)), axis]
     y = x.copy()
     y[:, axis] = crease - np.abs(x[:, axis] - crease)
@@ -200,17 +202,17 @@ def _folded(x: Array, spacing: float) -> Array:
 
 
 def _mirrored(x: Array, spacing: float) -> Array:
-    """Turned inside out, where a curved shell is not at rest."""
+    """Mirrored at a horizontal plane, so that a curved shell is turned inside out."""
     y = x.copy()
     y[:, 2] = 2.0 * x[:, 2].min() - x[:, 2]
     return y
 
 
 def _dome(setting: Setting, bench: Bench) -> Content:
-    """A shell held at its rim; of a given scene its own sheet, without handles."""
+    """A dome held at its rim; for a given scene its own sheet without handles."""
     content = setting.content()
     if setting.given:
-        return release(content)
+        return remove_handles(content)
     n = CELLS[setting.level]
     vertices, triangles = rectangle(n, n, 1.0, 1.0)
     u, v = 2.0 * vertices[:, 0] - 1.0, 2.0 * vertices[:, 1] - 1.0
@@ -222,17 +224,21 @@ def _dome(setting: Setting, bench: Bench) -> Content:
 start = family(
     "start",
     "start shapes: noise, a crumpled ball, a flat fold, a shell turned inside out",
-    StressCase("noise", "random noise of 0.3 elements, no handle", changed(release), shape=_noisy),
-    StressCase("crumpled", "crumpled into a ball", changed(release), shape=_crumpled),
-    StressCase("folded", "folded flat, a crease of 180°", changed(release), shape=_folded, level=QUICK),
+    StressCase(
+        "noise", "random noise of 0.3 elements, no handle", base_with(remove_handles), shape=_with_noise
+    ),
+    StressCase("crumpled", "crumpled into a ball", base_with(remove_handles), shape=_crumpled),
+    StressCase(
+        "folded", "folded flat, a crease of 180°", base_with(remove_handles), shape=_folded, level=QUICK
+    ),
     StressCase("inside-out", "a shell turned inside out", _dome, shape=_mirrored),
 )
 
 SPIN = [3.0, 20.0, 1.0]
-"""rad/s"""
+"""Angular velocity [rad/s]"""
 
 
-def _spun(content: Content) -> Content:
+def _with_spin(content: Content) -> Content:
     content["initial"] = {**(content.get("initial") or {}), "angular_velocity": SPIN}
     return content
 
@@ -240,13 +246,13 @@ def _spun(content: Content) -> Content:
 free = family(
     "free",
     "no handle: falling, and tumbling",
-    StressCase("falling", "no handle, released at rest", changed(release), level=QUICK),
-    StressCase("tumbling", "no handle, thrown with 20 rad/s", changed(release, _spun)),
+    StressCase("falling", "no handle, released at rest", base_with(remove_handles), level=QUICK),
+    StressCase("tumbling", "no handle, thrown with 20 rad/s", base_with(remove_handles, _with_spin)),
 )
 
 
 ASPECT, RATIO = 1e3, 1e4
-"""Of a sliver's sides, and of the sizes of elements in one mesh."""
+"""Aspect ratio of slivers, and ratio of the largest to the smallest element of the graded mesh."""
 
 
 def _slivers(setting: Setting, bench: Bench) -> Content:
@@ -257,17 +263,17 @@ def _slivers(setting: Setting, bench: Bench) -> Content:
 
 
 def _graded(setting: Setting, bench: Bench) -> Content:
-    """A square held at two corners whose cells grow from one corner on."""
+    """A square held at two corners, with cells that grow from one corner on."""
     n = 24
     sizes = RATIO ** (np.arange(n) / (n - 1.0))
-    places = np.concatenate([[0.0], np.cumsum(sizes)]) / sizes.sum()
+    coordinates = np.concatenate([[0.0], np.cumsum(sizes)]) / sizes.sum()
     vertices, triangles = rectangle(n, n, float(n), float(n))
-    vertices[:, :2] = places[np.rint(vertices[:, :2]).astype(np.int64)]
+    vertices[:, :2] = coordinates[np.rint(vertices[:, :2]).astype(np.int64)]
     return setting.content() | {"mesh": bench.mesh(vertices, triangles), "handles": [{"nodes": [0, n]}]}
 
 
 def _one_triangle(setting: Setting, bench: Bench) -> Content:
-    """Hung by one corner, a thousand times as stiff."""
+    """A single triangle, hung by one corner and a thousand times as stiff as the base scene."""
     vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.9, 0.0]])
     content = scale(setting.content(), stretching=1e3)
     return content | {"mesh": bench.mesh(vertices, np.array([[0, 1, 2]])), "handles": [{"nodes": [0]}]}
@@ -276,26 +282,30 @@ def _one_triangle(setting: Setting, bench: Bench) -> Content:
 elements = family(
     "elements",
     "slivers, elements of very different sizes, a single one",
-    StressCase("slivers", "triangles with sides as 1 to 1000", _slivers, own=True, level=QUICK),
-    StressCase("graded", "elements whose sizes differ by 1e4", _graded, own=True),
-    StressCase("one-triangle", "a single stiff triangle", _one_triangle, steps=40, own=True, level=QUICK),
+    StressCase("slivers", "triangles with sides as 1 to 1000", _slivers, own_scene=True, level=QUICK),
+    StressCase("graded", "elements whose sizes differ by 1e4", _graded, own_scene=True),
+    StressCase(
+        "one-triangle", "a single stiff triangle", _one_triangle, steps=40, own_scene=True, level=QUICK
+    ),
 )
 
 
 JUMP = (0.15, 0.1, 0.2)
-"""Over the size of the sheet."""
+"""Displacement of handles over the size of the sheet."""
 
 TURNS = 10.0
-"""1/s"""
+"""Turns of handles per second"""
 
 SIDES = [{"group": "left"}, {"group": "right"}]
 STEPS = 40
 
 
-def _jump(setting: Setting, bench: Bench) -> Content:
+def _jumping(setting: Setting, bench: Bench) -> Content:
     far = [part * setting.size for part in JUMP]
     still = {"time": 2.0 * setting.step}
-    return move(setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}])
+    return move_handles(
+        setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}]
+    )
 
 
 def _turning(content: Content) -> Content:
@@ -304,42 +314,44 @@ def _turning(content: Content) -> Content:
         {"time": k / (4.0 * TURNS), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
         for k in range(quarters)
     ]
-    return move(content, turn)
+    return move_handles(content, turn)
 
 
-def _pull(setting: Setting, bench: Bench, to: float) -> Content:
-    """Scale the handles' places along x; without a scene of the user, both sides are held."""
+def _move_sides(setting: Setting, bench: Bench, to: float) -> Content:
+    """Scale the positions of handles along x; in the default base scene both sides are held."""
     content = setting.content()
     if not setting.given:
         content["handles"] = [dict(side) for side in SIDES]
     end = 0.75 * STEPS * setting.step
-    return move(content, [{"time": 0.0}, {"time": end, "scale": [to, 1.0, 1.0]}])
+    return move_handles(content, [{"time": 0.0}, {"time": end, "scale": [to, 1.0, 1.0]}])
 
 
 handles = family(
     "handles",
     "handles that jump, spin, squeeze and stretch",
-    StressCase("jump", "handles jump by a quarter of the sheet in one step", _jump, level=QUICK),
-    StressCase("spin", "handles turn ten times a second", changed(_turning), steps=STEPS),
-    StressCase("squeeze", "handles come together to a tenth", partial(_pull, to=0.1), steps=STEPS),
-    StressCase("stretch", "handles go apart threefold", partial(_pull, to=3.0), steps=STEPS, level=QUICK),
+    StressCase("jump", "handles jump by a quarter of the sheet in one step", _jumping, level=QUICK),
+    StressCase("spin", "handles turn ten times a second", base_with(_turning), steps=STEPS),
+    StressCase("squeeze", "handles come together to a tenth", partial(_move_sides, to=0.1), steps=STEPS),
+    StressCase(
+        "stretch", "handles go apart threefold", partial(_move_sides, to=3.0), steps=STEPS, level=QUICK
+    ),
 )
 
-# -- a membrane that cannot buckle, pressed beyond where its model softens -------------------------------
+# -- a membrane that cannot buckle, compressed into the softening range of its model ----------------------
 
-TO = 0.4
-"""Of the width, well below 1/√3."""
+COMPRESSION = 0.4
+"""Final width over the initial one; well below 1/√3."""
 
 
 def _pressed(setting: Setting, bench: Bench) -> Content:
     content = setting.content() | {"handles": [dict(side) for side in SIDES]}
-    move(content, [{"time": 0.0}, {"time": STEPS * setting.step, "scale": [TO, 1.0, 1.0]}])
-    # a plane that the sheet cannot leave
+    move_handles(content, [{"time": 0.0}, {"time": STEPS * setting.step, "scale": [COMPRESSION, 1.0, 1.0]}])
+    # the sheet cannot leave its plane
     content["handles"].append({"group": "sheet", "axes": ["z"]})
     return content
 
 
-def _reached(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
+def _judge_compression(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
     smallest = record.stretches[0]
     return {"compressed": Verdict(smallest < SOFTENS_BELOW, f"to {smallest:.3f} of its length")}
 
@@ -348,31 +360,31 @@ compression = family(
     "compression",
     "a membrane pressed in its plane beyond a stretch of 1/√3",
     StressCase(
-        "pressed", "pressed in its plane to 0.4 of its width", _pressed, steps=STEPS, own=True,
-        judge=_reached, level=QUICK,
+        "pressed", "pressed in its plane to 0.4 of its width", _pressed, steps=STEPS, own_scene=True,
+        judge=_judge_compression, level=QUICK,
     ),
 )  # fmt: skip
 
 
 CREASE = np.radians(179.0)
-"""Of a crease."""
+"""Angle of a crease [rad]"""
 
-PART, CRUMPLED = 0.02, 0.3
-"""Of the length of a crushed strip, and of a crumpled sheet's width, what is left."""
+CRUSHED, CRUMPLED = 0.02, 0.3
+"""Final length of a crushed strip and final width of a crumpled sheet, over the initial ones."""
 
 MANY, FEW, LONG = 80, 20, 0.02
-"""Numbers of steps, and Δt [s] of the few."""
+"""Numbers of steps of slow and fast cases, and Δt [s] of the fast ones."""
 
 
 def _creased(x: Array, spacing: float) -> Array:
-    """What is beyond a crease in the middle of x, turned about it until it nearly lies on the rest."""
+    """Folded along a crease in the middle of x until one half nearly lies on the other."""
     middle = 0.5 * (x[:, 0].min() + x[:, 0].max())
     crease = x[np.argmin(np.abs(x[:, 0] - middle)), 0]
     y = x.copy()
     beyond = y[:, 0] > crease
-    way, height = y[beyond, 0] - crease, y[beyond, 2].copy()
-    y[beyond, 0] = crease + np.cos(CREASE) * way - np.sin(CREASE) * height
-    y[beyond, 2] = np.sin(CREASE) * way + np.cos(CREASE) * height
+    offset, height = y[beyond, 0] - crease, y[beyond, 2].copy()
+    y[beyond, 0] = crease + np.cos(CREASE) * offset - np.sin(CREASE) * height
+    y[beyond, 2] = np.sin(CREASE) * offset + np.cos(CREASE) * height
     return y
 
 
@@ -381,39 +393,39 @@ def _stiffer(content: Content) -> Content:
 
 
 def _strip(content: Content, frames: list[dict[str, Any]], integrator: str = "beuler") -> Content:
-    """A strip of the sheet, clamped at both ends, one of which moves."""
+    """A strip, clamped at both ends, one of which moves."""
     content["mesh"] = grid(1.0, 0.3, 40, 12, "alternating") | {"transform": {"translate": [0.0, -0.15, 0.0]}}
     content["time"] = {**content["time"], "integrator": integrator}
     content["handles"] = [{"group": "right", "clamp": True}]
-    content = move(content, frames)
+    content = move_handles(content, frames)
     content["handles"].append({"group": "left", "clamp": True})
     return content
 
 
 def _drawn_together(content: Content) -> Content:
-    """The sheet, whose four sides come together."""
+    """Move the four sides of the sheet towards its centre."""
     content["handles"] = [{"group": side} for side in ("left", "right", "bottom", "top")]
-    return move(content, [{"time": 0.0}, {"time": MANY * STEP, "scale": [CRUMPLED, CRUMPLED, 1.0]}])
+    return move_handles(content, [{"time": 0.0}, {"time": MANY * STEP, "scale": [CRUMPLED, CRUMPLED, 1.0]}])
 
 
 def _twist(degrees: float, seconds: float, parts: int) -> list[dict[str, Any]]:
-    """Keyframes."""
+    """Keyframes of a rotation about x in equal parts."""
     turns = [{"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts} for k in range(parts + 1)]
     return [{"time": seconds * k / parts, "rotate": turn} for k, turn in enumerate(turns)]
 
 
-CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": MANY * STEP, "scale": [PART, 1.0, 1.0]}]
+CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": MANY * STEP, "scale": [CRUSHED, 1.0, 1.0]}]
 
 
 def _directors(
     name: str, title: str, *changes: Callable[..., Content], case: Any = (), **numbers: Any
 ) -> StressCase:
-    """A case of the sheet that bends by directors, changed; ``case`` as of `StressCase`."""
-    return StressCase(f"directors-{name}", title, changed(by_directors, *changes, **numbers), **dict(case))
+    """A case with directors on edges and further changes; ``case`` holds arguments of `StressCase`."""
+    return StressCase(f"directors-{name}", title, base_with(use_directors, *changes, **numbers), **dict(case))
 
 
-SLOW = {"steps": MANY, "own": True}
-FAST = {"steps": FEW, "step": LONG, "own": True}
+SLOW = {"steps": MANY, "own_scene": True}
+FAST = {"steps": FEW, "step": LONG, "own_scene": True}
 TWICE, THRICE = _twist(720.0, MANY * STEP, 16), _twist(1080.0, FEW * LONG, FEW)
 
 directors = family(
@@ -423,9 +435,9 @@ directors = family(
     _directors("1e6-5ms", "membrane × 1e6, Δt 5 ms", scale, stretching=1e6, case={"step": 0.005}),
     _directors("1e6-40ms", "membrane × 1e6, Δt 40 ms", scale, stretching=1e6, case={"step": 0.04}),
     _directors("bending-1e6", "bending × 1e6", scale, bending=1e6),
-    _directors("wind-200", "wind 200 m/s", blow, speed=200.0),
+    _directors("wind-200", "wind 200 m/s", set_wind, speed=200.0),
     _directors("spin", "handles turn ten times a second", _turning, case={"steps": FEW, "level": FULL}),
-    _directors("folded", "a crease of 179°, no handle", release, case={"shape": _creased}),
+    _directors("folded", "a crease of 179°, no handle", remove_handles, case={"shape": _creased}),
     _directors("twist", "a stiff strip twisted by 720°", _stiffer, _strip, frames=TWICE, case=SLOW),
     _directors("twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", _strip, frames=THRICE, case=FAST),
     _directors("twist-bdf2", "the same with bdf2", _strip, frames=THRICE, integrator="bdf2", case=FAST),
