@@ -18,10 +18,10 @@ from mpi4py import MPI
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.flat_plates import flat_mesh, held
-from lyra_petsc.experiments.verification.verification_case import data
+from lyra_petsc.experiments.verification.verification_case import load_data
 from lyra_petsc.show.report.plots import Series, work_precision
 
-PLATES = data("linear_plate")["deflection"]
+PLATES = load_data("linear_plate")["deflection"]
 """Reference deflections by edge conditions (C clamped, S supported, F free) and Poisson's ratio."""
 
 KINDS = ("alternating", "gmsh")

@@ -17,7 +17,7 @@ from lyra_petsc.experiments.results import Results
 from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
 from lyra_petsc.experiments.study.study_report import Study
-from lyra_petsc.experiments.study.study_runner import Work, choose_references
+from lyra_petsc.experiments.study.study_runner import StudyRunner, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import default_scene
@@ -62,10 +62,10 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **give
         with StudyProgress(comm, check, len(plan.combinations), plain=petsc_prints()) as progress:
             for note in [*plan.notes, *([directory.note] if directory.note else [])]:
                 progress.note(note)
-            view = Study(Work(comm, plan, chosen, folder, progress, launcher, lock))
+            view = Study(StudyRunner(comm, plan, chosen, folder, progress, launcher, lock))
             again = command(comm, "study", _arguments(plan))
             results = Results(comm, folder, view, ranks=view.ranks, command=again, force=True)
-            results.run(view.cases(), view.work.run)
+            results.run(view.cases(), view.runner.run)
     _close(comm, view, folder)
 
 
@@ -83,18 +83,18 @@ def _arguments(plan: Plan) -> list[str]:
 
 def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
     """Print the outcome; raises if the study failed as a whole."""
-    rows = view.work.rows
+    rows = view.runner.rows
     done = sum(row.passed for row in rows)
     if comm.rank == 0:
         for advice in view.advice.values():
             for one in advice:
-                print(one.words)
+                print(one.text)
         print(f"{done} of {len(rows)} combinations done, {len(rows) - done} failed")
         print(f"report       {folder / 'report.html'}", flush=True)
         warn_unused([])
     if not done:
         words = f"all {len(rows)} combinations failed; the first: {rows[0].result.problem}"
         raise SolverError(words, collective=True)
-    for lost in (known for known in view.work.known.values() if known.kind == "none"):
-        words = f"{lost.words} ({'; '.join(lost.notes)}); run times are in {folder / 'study.csv'}"
+    for lost in (known for known in view.runner.references.values() if known.kind == "none"):
+        words = f"{lost.description} ({'; '.join(lost.notes)}); run times are in {folder / 'study.csv'}"
         raise SolverError(words, collective=True)

@@ -215,9 +215,7 @@ class Bench:
 
         return {"file": on_root(self.comm, write)}
 
-    def mesh_with_groups(
-        self, vertices: Array, triangles: Ints, curves: Mapping[str, Ints]
-    ) -> dict[str, Any]:
+    def grouped_mesh(self, vertices: Array, triangles: Ints, curves: Mapping[str, Ints]) -> dict[str, Any]:
         """The mesh block of a scene for a surface with curve groups, name → edges (n, 2); collective."""
 
         def write() -> str:

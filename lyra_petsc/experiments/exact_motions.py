@@ -1,20 +1,20 @@
-"""Motions that are known exactly, by name: positions and energies at any time.
+"""Exact motions by name: positions and energies at any time.
 
-Sheets fall as a whole, freely, flat in still air or edge-on in it. With lumped masses (a third of each
-triangle's mass to each corner) and nodal wind forces (a third of each triangle's force to each corner),
-gravity and drag of a uniform flat sheet accelerate every vertex alike, on any mesh. The sheet stays
-undeformed, and the motion solves the spatially discrete equations exactly.
+A sheet falls as a rigid body, freely, level in still air or edge-on in still air. With lumped masses (a third
+of the mass of a triangle at each corner) and nodal wind forces (a third of the force at each corner), gravity
+and drag of a uniform flat sheet give all vertices the same acceleration on any mesh. The sheet stays
+undeformed, and the motion solves the equations discretised in space exactly.
 
-One equilateral triangle breathes, a large, nonlinear oscillation in closed form. With circumradius R,
-areal density ρ and c11 = c22, a start stretched by λ₀ in all directions stays equilateral; the strain is
-(λ² − 1)/2 in every direction, the energy A (c11 + c12)(λ² − 1)²/4, the kinetic energy ρ A R² λ'²/2 with
-lumped masses, hence (Duffing)::
+One equilateral triangle oscillates uniformly in its plane, with large amplitude and in closed form. With
+circumradius R, areal density ρ and c11 = c22, a triangle that starts with the stretch λ₀ in all directions
+stays equilateral; the strain is (λ² − 1)/2 in every direction, the energy A (c11 + c12)(λ² − 1)²/4, the
+kinetic energy ρ A R² λ'²/2 with lumped masses, hence (Duffing)::
 
     λ'' = −k (λ³ − λ),   k = (c11 + c12) / (ρ R²)
     λ = a dn(a √(k/2) t, m),   m = 2 − 2/a²,   a the largest stretch, 1 < a < √2
 
-(dn: Jacobi's elliptic function; DLMF 22.13.15). Released at its smallest stretch it starts half a period
-later.
+(dn: Jacobi's elliptic function; DLMF 22.13.15). A triangle that is released at its smallest stretch starts
+half a period later.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Energies:
 
 
 class ExactMotion(ABC):
-    """A motion that maps start positions affinely, so that means of vertices follow it too."""
+    """A motion that is an affine map of the start positions, so that it also maps means of vertices."""
 
     @abstractmethod
     def positions(self, start: Array, t: float) -> Array:
@@ -58,7 +58,7 @@ class ExactMotion(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Translation(ExactMotion):
-    """Every point moves alike, under uniform gravity.
+    """A translation under uniform gravity.
 
     Attributes
     ----------
@@ -86,11 +86,11 @@ class Translation(ExactMotion):
 
 
 SAME = 1e-9
-"""Relative difference up to which lengths and directions count as equal."""
+"""Relative difference within which lengths and directions count as equal."""
 
 
 class Body:
-    """A scene's mesh, materials and masses.
+    """Mesh, materials and masses of a scene, and properties that exact solutions assume.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Body:
     Raises
     ------
     InputError
-        Whatever in the meshes cannot be simulated.
+        For a mesh that cannot be simulated.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -108,28 +108,28 @@ class Body:
 
     @cached_property
     def mass(self) -> float:
-        """[kg]."""
+        """Total mass [kg]."""
         return float(self.rest.mass.sum())
 
     @property
     def gravity(self) -> Array:
-        """(3,) [m/s²]; zero where the scene has none."""
+        """Gravity (3,) [m/s²]; zero if the scene has none."""
         return np.asarray(self.scene.gravity or (0.0, 0.0, 0.0), dtype=np.float64)
 
     @property
     def start_velocity(self) -> Array:
-        """(3,) [m/s] of the translation at t = 0."""
+        """Velocity (3,) [m/s] of the translation at t = 0."""
         initial = self.scene.initial
         return np.asarray((0.0, 0.0, 0.0) if initial is None else initial.velocity, dtype=np.float64)
 
     @cached_property
     def potential(self) -> float:
-        """−Σ m g·x [J] at t = 0."""
+        """Potential energy −Σ m g·x [J] at t = 0."""
         return -float(self.rest.mass @ (self.mesh.positions @ self.gravity))
 
     @cached_property
     def stretch(self) -> Array:
-        """Start length over rest length of every triangle side, (F, 3)."""
+        """Start length over rest length of the sides of all triangles, (F, 3)."""
         corners, flat = self.mesh.positions[self.mesh.triangles], self.mesh.triangle_uv
         start = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         rest = np.linalg.norm(flat - np.roll(flat, -1, axis=1), axis=2)
@@ -144,19 +144,19 @@ class Body:
 
     @property
     def is_bent(self) -> bool:
-        """Whether some hinge starts away from its rest angle."""
+        """Whether some hinge does not start at its rest angle."""
         if not any(entry.name == "bending" for entry in active(self.scene, self.rest.shells)):
             return False
         from lyra_petsc.terms import bending
 
-        found = bending.elements(self.rest)
-        angles = bending.dihedral_angles(self.mesh.positions, found.stencil)
-        return bool(np.abs(angles - found.data["rest_angle"]).max(initial=0.0) > 1e-7)
+        hinges = bending.elements(self.rest)
+        angles = bending.dihedral_angles(self.mesh.positions, hinges.stencil)
+        return bool(np.abs(angles - hinges.data["rest_angle"]).max(initial=0.0) > 1e-7)
 
-    # -- assumptions that solutions share ----------------------------------------------------------------
+    # -- assumptions shared by solutions -----------------------------------------------------------------
 
     def forced(self) -> list[str]:
-        """What moves the sheet beside gravity, wind and its own velocity, in words."""
+        """Names of influences other than gravity, wind and initial velocity."""
         scene, initial = self.scene, self.scene.initial
         return _holding(
             {
@@ -169,7 +169,7 @@ class Body:
         )
 
     def strained(self) -> list[str]:
-        """Why the start shape is not free of stress, in words."""
+        """Reasons why the start shape is not free of stress."""
         stretched = np.abs(self.stretch - 1.0).max() > SAME
         bent = {"a start shape that is bent, or a rest curvature": self.is_bent}
         return _holding({"a start shape that is stretched": stretched} | bent)
@@ -189,16 +189,16 @@ class Solution:
     ----------
     name : str
     title : str
-        In words, for reports.
-    obstacles : callable
-        What of a scene contradicts its assumptions, in words; empty if it holds.
+        Description for reports.
+    violations : callable
+        Properties of a scene that contradict its assumptions; empty if it holds.
     motion : callable
-        The motion, for a scene without obstacles.
+        The motion, for a scene without violations.
     """
 
     name: str
     title: str
-    obstacles: Callable[[Body], list[str]]
+    violations: Callable[[Body], list[str]]
     motion: Callable[[Body], ExactMotion]
 
 
@@ -208,11 +208,11 @@ SOLUTIONS: dict[str, Solution] = {}
 Motion = Callable[[Body], ExactMotion]
 
 
-def _solution(name: str, title: str, obstacles: Callable[[Body], list[str]]) -> Callable[[Motion], Motion]:
-    """A decorator of the function that makes the motion."""
+def _solution(name: str, title: str, violations: Callable[[Body], list[str]]) -> Callable[[Motion], Motion]:
+    """Decorator that registers the function which makes the motion."""
 
     def add(motion: Motion) -> Motion:
-        SOLUTIONS[name] = Solution(name, title, obstacles, motion)
+        SOLUTIONS[name] = Solution(name, title, violations, motion)
         return motion
 
     return add
@@ -222,28 +222,28 @@ def _translation(body: Body, path: Callable[[float], tuple[Array, Array]]) -> Ex
     return Translation(body.mass, body.gravity, body.potential, path)
 
 
-def _holding(said: Mapping[str, object]) -> list[str]:
-    """The words that hold."""
-    return [words for words, holds in said.items() if holds]
+def _holding(conditions: Mapping[str, object]) -> list[str]:
+    """The names of the conditions that hold."""
+    return [name for name, holds in conditions.items() if holds]
 
 
-def free_fall_obstacles(body: Body) -> list[str]:
-    """What of a scene contradicts a free fall, in words."""
+def free_violations(body: Body) -> list[str]:
+    """Properties of a scene that contradict a free fall."""
     return [*body.forced(), *(["wind"] if body.has_wind else []), *body.strained()]
 
 
-@_solution("free-fall", "free fall, x = X + v t + g t²/2", free_fall_obstacles)
+@_solution("free-fall", "free fall, x = X + v t + g t²/2", free_violations)
 def free_fall(body: Body) -> ExactMotion:
-    """A sheet that falls or flies freely without deforming: x = X + v₀ t + g t²/2."""
-    return _translation(body, partial(_freely, body.start_velocity, body.gravity))
+    """A sheet that moves freely without deformation: x = X + v₀ t + g t²/2."""
+    return _translation(body, partial(_free_path, body.start_velocity, body.gravity))
 
 
-def _freely(start: Array, g: Array, t: float) -> tuple[Array, Array]:
+def _free_path(start: Array, g: Array, t: float) -> tuple[Array, Array]:
     return start * t + 0.5 * g * t * t, start + g * t
 
 
 def _in_still_air(body: Body, drag: str) -> list[str]:
-    """What contradicts a fall through still air; ``drag`` is the key of the wind that brakes it."""
+    """Violations of a fall through still air; ``drag`` is the key of the wind that causes its drag."""
     wind, densities = body.scene.wind, body.rest.per_triangle("density")
     air = {
         "no gravity": not body.gravity.any(),
@@ -257,58 +257,60 @@ def _in_still_air(body: Body, drag: str) -> list[str]:
 
 
 def _cosines(body: Body) -> Array:
-    """Between normals and gravity, (F,)."""
+    """Cosines of the angles between normals and gravity, (F,)."""
     g = body.gravity
     return np.asarray(body.normals @ (g / np.linalg.norm(g)))
 
 
-def flat_fall_obstacles(body: Body) -> list[str]:
-    """What of a scene contradicts a level sheet falling flat in still air, in words."""
+def level_violations(body: Body) -> list[str]:
+    """Properties of a scene that contradict a level sheet falling in still air."""
     level = not body.gravity.any() or np.abs(np.abs(_cosines(body)) - 1.0).max() <= SAME
     return _in_still_air(body, "density") + ([] if level else ["a sheet that is not flat and level"])
 
 
-@_solution("terminal-fall", "level sheet falling in still air, v = vt tanh(g t/vt)", flat_fall_obstacles)
+@_solution("terminal-fall", "level sheet falling in still air, v = vt tanh(g t/vt)", level_violations)
 def flat_fall(body: Body) -> ExactMotion:
     """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
 
     Drag grows with the square of the velocity.
     """
-    return _translation(body, partial(_flat, math.sqrt(_terminal(body, "density")), body.gravity))
+    return _translation(body, partial(_level_path, math.sqrt(_weight_to_drag(body, "density")), body.gravity))
 
 
-def _terminal(body: Body, drag: str) -> float:
-    """Weight of the sheet over the coefficient of its drag."""
+def _weight_to_drag(body: Body, drag: str) -> float:
+    """Weight per area of the sheet over its drag coefficient."""
     density = float(body.rest.per_triangle("density")[0])
     return density * float(np.linalg.norm(body.gravity)) / float(getattr(body.scene.wind, drag))
 
 
-def _flat(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
+def _level_path(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
     g = math.hypot(*gravity)
     a = g * t / terminal
-    # ln cosh a, without the overflow of cosh
+    # ln cosh a without overflow
     fallen = terminal**2 / g * (a + math.log1p(math.exp(-2.0 * a)) - math.log(2.0))
     return fallen / g * gravity, terminal * math.tanh(a) / g * gravity
 
 
-def edge_fall_obstacles(body: Body) -> list[str]:
-    """What of a scene contradicts an upright sheet falling edge-on in still air, in words."""
+def edge_violations(body: Body) -> list[str]:
+    """Properties of a scene that contradict an upright sheet falling edge-on in still air."""
     upright = not body.gravity.any() or np.abs(_cosines(body)).max() <= SAME
     return _in_still_air(body, "drag") + ([] if upright else ["a sheet that is not upright"])
 
 
 @_solution(
-    "edge-fall", "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))", edge_fall_obstacles
+    "edge-fall",
+    "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
+    edge_violations,
 )
 def edge_fall(body: Body) -> ExactMotion:
     """An upright flat sheet released at rest: v = vt (1 − exp(−g t / vt)), vt = ρ_sheet g / drag.
 
     Drag grows with the velocity.
     """
-    return _translation(body, partial(_edge_on, _terminal(body, "drag"), body.gravity))
+    return _translation(body, partial(_edge_path, _weight_to_drag(body, "drag"), body.gravity))
 
 
-def _edge_on(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
+def _edge_path(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
     g = math.hypot(*gravity)
     rate = g / terminal
     fallen = terminal * (t + math.expm1(-rate * t) / rate)
@@ -317,13 +319,13 @@ def _edge_on(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Breathing(ExactMotion):
-    """See the module.
+    """The oscillation of a triangle, see the module.
 
     Attributes
     ----------
     centre : (3,) [m]
     first, largest : float
-        Stretch at t = 0, and the largest ever.
+        Stretch at t = 0, and largest stretch.
     rate : float [1/s²]
         k.
     stiffness : float [J]
@@ -345,19 +347,19 @@ class _Breathing(ExactMotion):
         return self.largest * float(ellipj(self.largest * math.sqrt(0.5 * self.rate) * t + begin, m)[2])
 
     def positions(self, start: Array, t: float) -> Array:
-        """Scaled about the centre."""
+        """Start positions, scaled about the centre."""
         centre = np.asarray(self.centre)
         return np.asarray(centre + (start - centre) * (self.stretch(t) / self.first))
 
     def energies(self, t: float) -> Energies:
-        """Kinetic energy from the conserved sum."""
+        """Energies; the kinetic one from conservation."""
         whole = 0.25 * self.stiffness * (self.first**2 - 1.0) ** 2
         membrane = 0.25 * self.stiffness * (self.stretch(t) ** 2 - 1.0) ** 2
         return Energies(whole - membrane, membrane, 0.0)
 
 
-def breathing_obstacles(body: Body) -> list[str]:
-    """What of a scene contradicts a breathing triangle, in words."""
+def breathing_violations(body: Body) -> list[str]:
+    """Properties of a scene that contradict a breathing triangle."""
     if body.mesh.n_triangles != 1:
         return [f"{body.mesh.n_triangles} triangles instead of one"]
     shell = body.rest.shells[int(body.rest.shell_of[0])]
@@ -379,7 +381,9 @@ def breathing_obstacles(body: Body) -> list[str]:
 
 
 @_solution(
-    "breathing-triangle", "equilateral triangle oscillating in its plane, Jacobi's dn", breathing_obstacles
+    "breathing-triangle",
+    "equilateral triangle oscillating in its plane, Jacobi's dn",
+    breathing_violations,
 )
 def breathing(body: Body) -> ExactMotion:
     """The oscillation of the triangle."""
@@ -403,19 +407,21 @@ def exact_motion(name: str, body: Body) -> ExactMotion:
     Raises
     ------
     InputError
-        Unknown name, or a scene that violates an assumption; all that is violated is named.
+        Unknown name, or a scene that violates assumptions; the message names all of them.
     """
     key = f"--reference exact:{name}"
     if name not in SOLUTIONS:
         raise InputError(f"no exact solution of that name, {nearest(name, SOLUTIONS)}", key=key)
-    found = SOLUTIONS[name].obstacles(body)
-    if found:
+    violations = SOLUTIONS[name].violations(body)
+    if violations:
         raise InputError(
-            f"does not hold for this scene, which has {', '.join(found)}", file=body.scene.source, key=key
+            f"does not hold for this scene, which has {', '.join(violations)}",
+            file=body.scene.source,
+            key=key,
         )
     return SOLUTIONS[name].motion(body)
 
 
 def matching(body: Body) -> Solution | None:
     """The exact solution that holds for a scene, if one does."""
-    return next((solution for solution in SOLUTIONS.values() if not solution.obstacles(body)), None)
+    return next((solution for solution in SOLUTIONS.values() if not solution.violations(body)), None)

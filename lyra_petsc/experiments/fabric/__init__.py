@@ -1,4 +1,4 @@
 """Standard tests of textiles on a material.
 
-``specimens`` reads materials, ``textile_tests`` holds the tests, ``records`` their results and tables.
+``specimens`` reads materials, ``textile_tests`` runs the tests, ``fabric_report`` has their results and page.
 """

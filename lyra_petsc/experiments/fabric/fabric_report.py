@@ -1,4 +1,4 @@
-"""What came of a textile test: numbers in its own units, curves, a shadow; and the page that tells them."""
+"""Results of textile tests: numbers in the units of the tests, curves, a shadow; and their report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure
 
 @dataclass(frozen=True)
 class Number:
-    """A result; ``scatter`` is the standard deviation over the starts of a test, NaN where there is one."""
+    """A result; ``scatter`` is the standard deviation over several starts, NaN for a single one."""
 
     quantity: str
     value: float
@@ -37,18 +37,22 @@ class Curve:
 
 @dataclass
 class Record:
-    """What a test gave.
+    """The results of a test.
 
     Attributes
     ----------
     numbers : list of Number
     curves : list of Curve
     shadow : list of list of int
-        1 where it is dark, rows from below; empty without one.
+        Pixels of the shadow of a drape, 1 for dark, bottom row first; empty for other tests.
     extent : float
-        Half of its side [cm].
+        Half the side of the shadow [cm].
     stopped : str
-        Why it has no end; empty if it has.
+        Why the test was not completed; empty if it was.
+    verdicts : dict of name → Verdict
+        Comparison of numbers with constants of the material.
+    seconds : float
+        Wall time [s].
     """
 
     numbers: list[Number] = field(default_factory=list)
@@ -60,10 +64,10 @@ class Record:
     seconds: float = 0.0
 
     def claim(self, name: str, value: float, exact: float, bound: float) -> None:
-        """The verdict on a number that is known, by its relative error."""
+        """Add the verdict on a number whose exact value is known, by its relative error."""
         error = abs(value - exact) / abs(exact)
-        words = f"{short(value, 4)}, material {short(exact, 4)}: {100.0 * error:.2g} % off"
-        self.verdicts[name] = Verdict(error <= bound, f"{words}, {100.0 * bound:g} % allowed")
+        message = f"{short(value, 4)}, material {short(exact, 4)}: {100.0 * error:.2g} % off"
+        self.verdicts[name] = Verdict(error <= bound, f"{message}, {100.0 * bound:g} % allowed")
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class FabricCase(Case):
     ----------
     test : str
     degrees : float
-        Of the specimen's length to the warp.
+        Angle of the length of the specimen to the warp.
     """
 
     test: str
@@ -83,13 +87,13 @@ class FabricCase(Case):
 
 @dataclass
 class FabricOutcome(Outcome[FabricCase]):
-    """What came of a case."""
+    """The result of a case."""
 
     record: Record = field(default_factory=Record)
 
 
 def outcome_of(case: FabricCase, record: Record) -> FabricOutcome:
-    """With the verdicts on its record."""
+    """The outcome of a case with this record."""
     verdicts = {"measured": Verdict(not record.stopped, record.stopped or "to its end"), **record.verdicts}
     return FabricOutcome(case, verdicts, record.seconds, record=record)
 
@@ -105,7 +109,7 @@ class Fabric(View[FabricOutcome]):
     Parameters
     ----------
     material : str
-        In words.
+        Name for the title.
     """
 
     verb = "fabric"
@@ -171,7 +175,7 @@ class Fabric(View[FabricOutcome]):
 
 
 def pictures(outcome: FabricOutcome) -> list[Drawing]:
-    """The curves and the shadow of a test."""
+    """Figures of the curves and the shadow of a test."""
     record, name, found = outcome.record, outcome.case.name, []
     if record.curves:
         figure = empty_figure(0.8 * HEIGHT)
@@ -180,7 +184,7 @@ def pictures(outcome: FabricOutcome) -> list[Drawing]:
             axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.4, marker=".", ms=3)
         axes.grid(True, color="#dfe3e8", lw=0.8)
         if all(label.endswith("[cm]") for label in (record.curves[0].x_label, record.curves[0].y_label)):
-            axes.set_aspect("equal", adjustable="datalim")  # the shape of a strip
+            axes.set_aspect("equal", adjustable="datalim")  # a shape, not a diagram
         if len(record.curves) > 1:
             axes.legend(fontsize=8)
         found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))

@@ -1,4 +1,4 @@
-"""Materials to be tested, and specimens: scenes as in a file."""
+"""Materials to be tested, as blocks of a scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lyra_petsc.scene.schema import Material
 from lyra_petsc.scene.text import parse_yaml
 
 G = 9.80665
-"""m/s², to which weights in grams-force belong"""
+"""Standard gravity [m/s²], which defines the gram-force"""
 
 
 @dataclass(frozen=True)
@@ -26,30 +26,30 @@ class Fabric:
     Attributes
     ----------
     name : str
-        In words.
+        Name for reports.
     block : dict
-        As in a scene, bending by directors.
+        Material block of a scene, with directors on edges.
     """
 
     name: str
     block: dict[str, Any]
 
     def turned(self, degrees: float) -> dict[str, Any]:
-        """Its block for specimens whose length lies so to the warp, however that lies in the scene."""
+        """Material block for a specimen whose length is at this angle to the warp, not the scene's."""
         return self.block | {"warp_degrees": -degrees}
 
     def shell(self, degrees: float = 0.0) -> ShellMaterial:
-        """Its constants, those of directions 1 and 2 exchanged at 90°."""
+        """Constants of the material; directions 1 and 2 are exchanged at 90°."""
         shell = resolve_material(validated(Material, self.block, file=self.name))[0]
         return shell if degrees == 0.0 else _exchanged(shell)
 
     def rigidity(self, degrees: float) -> float:
-        """B [N·m] of a narrow strip along a direction."""
+        """Bending stiffness B [N·m] of a narrow strip along a direction."""
         d11, d12, d22, _ = self.shell(degrees).plate
         return d11 - d12**2 / d22 if d22 > 0.0 else 0.0
 
     def needs_bending(self, test: str) -> None:
-        """Refuse tests of what it has not.
+        """Refuse a test of bending if the material has no bending stiffness.
 
         Raises
         ------
@@ -75,7 +75,7 @@ def _exchanged(shell: ShellMaterial) -> ShellMaterial:
 
 
 def fabric_of(material: str, settings: Sequence[str] = ()) -> Fabric:
-    """A cloth of the library, with the law ``measured`` where it was, or the first material of a scene.
+    """A cloth of the library, with its measured law if it has one, or the first material of a scene.
 
     Raises
     ------

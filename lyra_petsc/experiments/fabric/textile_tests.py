@@ -1,10 +1,10 @@
-"""The standard tests of textiles: KES-F 1 and 2, ASTM D1388, heart loop, Cusick's drape test; how one is run.
+"""The standard tests of textiles: KES-F 1 and 2, ASTM D1388, heart loop, Cusick's drape test.
 
-Lengths in m, forces in N, until they are told.
+Lengths are in m and forces in N; results are converted to the units of the tests.
 
 KES-F: S. Kawabata, The standardization and analysis of hand evaluation, 2nd ed., Osaka 1980. Heart loop and
 bending length: F. T. Peirce, The "handle" of cloth as a measurable quantity, Journal of the Textile Institute
-21 (1930) T377-T416; ASTM D1388. Drape: BS 5058, of a whole cloth over several starts.
+21 (1930) T377-T416; ASTM D1388. Drape: BS 5058, of a whole cloth with several starts.
 """
 
 from __future__ import annotations
@@ -56,40 +56,40 @@ def _scene(mesh: dict[str, Any], material: dict[str, Any], **more: Any) -> dict[
 
 
 def _grid(width: float, height: float, nx: int, ny: int) -> dict[str, Any]:
-    """A specimen. One row of cells bends along lines of the mesh, where flat triangles do not lock."""
+    """Mesh of a specimen. One row of cells bends along mesh lines, where flat triangles do not lock."""
     return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": "alternating"}}
 
 
 def _shape(name: str, line: Array) -> Curve:
-    """The middle line (n, 2) [m] of a strip."""
+    """Curve of the middle line (n, 2) [m] of a strip."""
     return Curve(name, "x [cm]", "z [cm]", *(1e2 * line).T.tolist())
 
 
 def _path(values: Sequence[float]) -> dict[str, Any]:
-    """Keys of a scene whose load factor goes through equal steps, one for each value but the first."""
+    """Keys of a static scene with equal load steps, one for each value except the first."""
     share = 1.0 / (len(values) - 1)
     return {"time": {"analysis": "static", "step": share}, "petsc": {"ts_adapt_dt_max": share}}
 
 
 @contextmanager
-def _through(
+def _load_path_simulation(
     bench: Bench, content: dict[str, Any], values: Sequence[float]
 ) -> Iterator[Iterator[SteppedScene]]:
-    """The simulation of a scene at each of these values but the first, also where it takes shorter steps."""
+    """The simulation of a scene at each of these values except the first, even if it takes shorter steps."""
     factors = [k / (len(values) - 1) for k in range(1, len(values))]
     with bench.simulation(content | _path(values), land=factors[:-1]) as trial:
         yield trial.run_through(factors)
 
 
-def _to_and_fro(largest: float, steps: int, *, closed: bool) -> list[float]:
-    """From 0 to ``largest``, to its opposite, and back where the loop shall close."""
+def _cycle(largest: float, steps: int, *, closed: bool) -> list[float]:
+    """Path from 0 to ``largest`` to −``largest`` and, if ``closed``, back to ``largest``."""
     up = [largest * k / steps for k in range(steps + 1)]
     down = [largest * (1.0 - k / steps) for k in range(1, 2 * steps + 1)]
     return up + down + ([-value for value in down] if closed else [])
 
 
 def _branches(x: Sequence[float], y: Sequence[float], steps: int) -> tuple[Any, Any]:
-    """Of a path as by `_to_and_fro`: y as functions of x on the way up and down in the last loop."""
+    """y as functions of x on the rising and falling branch of the last loop of a path `_cycle`."""
     xs, ys = np.array(x), np.array(y)
     down = slice(steps, 3 * steps + 1)
     up = slice(3 * steps, 5 * steps + 1) if len(xs) > 3 * steps + 1 else down
@@ -99,8 +99,10 @@ def _branches(x: Sequence[float], y: Sequence[float], steps: int) -> tuple[Any, 
     return (lambda at: np.interp(at, *rising)), (lambda at: np.interp(at, *falling))
 
 
-def _width_of_loop(record: Record, name: str, up: Any, down: Any, at: float, unit: str, known: float) -> None:
-    """Add the mean width of a loop at ±``at``, and the verdict on it."""
+def _add_loop_width(
+    record: Record, name: str, up: Any, down: Any, at: float, unit: str, known: float
+) -> None:
+    """Add the mean width of a hysteresis loop at ±``at``, and the verdict on it."""
     width = 0.5 * float((up(at) - down(at)) + (up(-at) - down(-at)))
     record.numbers.append(Number(name, width, unit))
     record.claim(name, width, known, 0.01)
@@ -109,37 +111,39 @@ def _width_of_loop(record: Record, name: str, up: Any, down: Any, at: float, uni
 # -- KES-F 1 ---------------------------------------------------------------------------------------------
 
 CLAMPED, GAUGE = 0.2, 0.05
+"""Width of the clamps and distance between them [m]"""
+
 FULL_LOAD = 500.0 * GF_PER_CM
-"""Of a tensile test [N/m]"""
+"""Largest force of a tensile test [N/m]"""
 
 LONGEST, PULLS = 1.0, 30
-"""Strain at which a tensile test ends at the latest, nearly, and its steps"""
+"""Approximate upper bound of the strain of a tensile test, and number of its steps"""
 
 TENSION = 10.0 * GF_PER_CM
-"""Of a shear test [N/m]"""
+"""Tension in a shear test [N/m]"""
 
 SHEARED, SHEARS = KES_ANGLE, 16
-"""Largest angle [°], and steps to it"""
+"""Largest shear angle [°], and number of steps to it"""
 
 WIDE = 15 * CLAMPED
-"""Width of a specimen whose sides do not count [m]"""
+"""Width [m] of a shear specimen, so large that its free sides do not matter"""
 
 FAR = 100.0 * GAUGE
-"""Length [m] of springs that pull with a constant force"""
+"""Length [m] of the springs that exert a nearly constant tension"""
 
 
-def _pull(shell: ShellMaterial, strain: float) -> float:
-    """Force [N/m] of a strip that cannot contract, by its curve or St. Venant-Kirchhoff."""
+def _tensile_force(shell: ShellMaterial, strain: float) -> float:
+    """Force [N/m] of a strip without lateral contraction, by its curve or St. Venant-Kirchhoff."""
     if shell.curves:
         return shell.stretching * force_at(shell.curves[0], strain)
     return shell.c11 * (1.0 + strain) * 0.5 * ((1.0 + strain) ** 2 - 1.0)
 
 
 def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """20 cm × 5 cm between clamps, pulled to 500 gf/cm: EMT, WT, LT."""
+    """Tensile test: 20 cm × 5 cm between clamps, pulled to 500 gf/cm; EMT, WT, LT."""
     shell, record = fabric.shell(degrees), Record()
     strain = 0.01
-    while _pull(shell, strain) < FULL_LOAD and strain < LONGEST:
+    while _tensile_force(shell, strain) < FULL_LOAD and strain < LONGEST:
         strain *= 1.02
     path = [1.1 * strain * (k / PULLS) ** 1.5 for k in range(PULLS + 1)]
     frames = [{"time": k / PULLS, "translate": [e * GAUGE, 0.0, 0.0]} for k, e in enumerate(path)]
@@ -154,16 +158,16 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         motions={"pull": frames},
     )
     strains, forces = [0.0], [0.0]
-    with _through(bench, content, path) as steps:
+    with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
             strains.append(path[len(strains)])
             forces.append(abs(simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
             if forces[-1] >= FULL_LOAD:
                 break
-    percent, told = [100.0 * e for e in strains], [f / GF_PER_CM for f in forces]
-    record.curves = [Curve("tensile", "strain [%]", "force [gf/cm]", percent, told)]
+    percent, converted = [100.0 * e for e in strains], [f / GF_PER_CM for f in forces]
+    record.curves = [Curve("tensile", "strain [%]", "force [gf/cm]", percent, converted)]
     if forces[-1] < FULL_LOAD:
-        record.numbers = [Number(f"force at {percent[-1]:.3g} % (less than 500)", told[-1], "gf/cm")]
+        record.numbers = [Number(f"force at {percent[-1]:.3g} % (less than 500)", converted[-1], "gf/cm")]
         return record
     emt = float(np.interp(FULL_LOAD, forces, strains))
     e = np.linspace(0.0, emt, 400)
@@ -178,14 +182,15 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 
 
 def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """20 cm × 5 cm between clamps, sheared to ±8° under 10 gf/cm: G, 2HG at 0.5°, 2HG5 at 5°.
+    """Shear test: 20 cm × 5 cm between clamps, ±8° under 10 gf/cm; G, 2HG at 0.5°, 2HG5 at 5°.
 
-    The force is that of a piece of a much wider specimen: free sides shear less. The tension keeps its
-    direction, and has the part T tan φ of the force; G and the widths of the loop are those of the rest.
+    The force is measured in the middle of a much wider specimen, since free sides shear less. The tension
+    keeps its direction and contributes T tan φ; G and the widths of the loop are those of the remaining
+    force.
     """
     record, shell = Record(), fabric.shell()
     rubs, rise, cells = shell.friction_force > 0.0, SHEARS, 40
-    path = [0.0, *_to_and_fro(SHEARED, rise, closed=rubs)]  # the first step is of the tension
+    path = [0.0, *_cycle(SHEARED, rise, closed=rubs)]  # the first step applies the tension
     share, width = 1.0 / (len(path) - 1), WIDE / cells
     frames = [
         {"time": k * share, "translate": [GAUGE * math.tan(math.radians(a)), 0.0, 0.0]}
@@ -200,7 +205,7 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             {"nodes": [node for node in range(cells + 1) if node not in middle]},
             {"group": "top", "axes": ["x", "z"], "motion": "shear", "interpolation": "linear"},
             {"group": "sheet", "axes": ["z"]},
-            # loads grow to the end of a static analysis; these springs are too long to tell
+            # long springs, as loads would grow until the end of a static analysis
             {
                 "group": "top",
                 "axes": ["y"],
@@ -215,15 +220,15 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         },
     )
     forces = [0.0]
-    with _through(bench, content, path) as steps:
+    with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
             force = simulation.ledger.handle_forces(5)[0][0]
             forces.append(-float(force) / (len(middle) * width))
-    angles, told = path[1 : len(forces)], [f / GF_PER_CM for f in forces[1:]]
-    record.curves = [Curve("shear", "angle [°]", "force [gf/cm]", angles, told)]
+    angles, converted = path[1 : len(forces)], [f / GF_PER_CM for f in forces[1:]]
+    record.curves = [Curve("shear", "angle [°]", "force [gf/cm]", angles, converted)]
     pull = TENSION / GF_PER_CM
-    left = [f - pull * math.tan(math.radians(angle)) for f, angle in zip(told, angles, strict=True)]
-    up, down = _branches(angles, left, rise)
+    sheared = [f - pull * math.tan(math.radians(angle)) for f, angle in zip(converted, angles, strict=True)]
+    up, down = _branches(angles, sheared, rise)
     stiffness = 0.5 * sum((f(2.5 * s) - f(0.5 * s)) / (2.0 * s) for f, s in ((up, 1), (down, -1)))
     record.numbers = [Number("G", stiffness, "gf/(cm·°)")]
     if shell.law != "measured" and not shell.curves:
@@ -231,50 +236,52 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     if rubs:
         known = 2.0 * shell.friction_force / GF_PER_CM
         for name, at in (("2HG", 0.5), ("2HG5", 5.0)):
-            _width_of_loop(record, name, up, down, at, "gf/cm", known)
+            _add_loop_width(record, name, up, down, at, "gf/cm", known)
     return record
 
 
 # -- KES-F 2 ---------------------------------------------------------------------------------------------
 
 LENGTH = 0.01
+"""Length of a bending specimen [m]"""
+
 CURVED, TURNS = 100.0 * KES_CURVATURE, 10
-"""Largest curvature [1/m], and steps to it"""
+"""Largest curvature [1/m], and number of steps to it"""
 
 
-def _place(curvature: float) -> Array:
-    """Where the end of a strip stands that is bent to an arc, (3,) [m]."""
+def _end_of_arc(curvature: float) -> Array:
+    """Position (3,) [m] of the end of a strip that is bent to a circular arc."""
     half = 0.5 * curvature * LENGTH
     chord = LENGTH * np.sinc(half / math.pi)
     return np.array([chord * math.cos(half), 0.0, chord * math.sin(half)])
 
 
 def _chuck(curvature: float) -> dict[str, Any]:
-    """The motion that takes it there and turns it with the arc."""
+    """Keyframe of the chuck that moves and rotates the end of the strip as the arc."""
     angle = curvature * LENGTH
     turned = LENGTH * np.array([math.cos(angle), 0.0, math.sin(angle)])
     return {
         "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": -math.degrees(angle)},
-        "translate": (_place(curvature) - turned).tolist(),
+        "translate": (_end_of_arc(curvature) - turned).tolist(),
     }
 
 
-def _moves(curvature: float) -> Array:
-    """Derivative (3,) [m²] of the place of the chuck."""
-    before, after = (_place(curvature + way) for way in (-1e-3, 1e-3))
+def _chuck_rate(curvature: float) -> Array:
+    """Derivative (3,) [m²] of the position of the chuck with respect to the curvature."""
+    before, after = (_end_of_arc(curvature + change) for change in (-1e-3, 1e-3))
     return (after - before) / 2e-3
 
 
 def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """1 cm between chucks, wide, bent to ±2.5 cm⁻¹: B from 0.5 to 1.5 cm⁻¹, 2HB at both.
+    """Bending test: 1 cm between chucks, wide, to ±2.5 cm⁻¹; B from 0.5 to 1.5 cm⁻¹, 2HB at both.
 
-    The moment is the power of the moving chuck over its turning: a force along the sheet, which a polygon has
-    for being a little longer than its arc, is no part of it.
+    The moment is the power of the chuck over its rate of rotation. This excludes the effect of the force
+    along the sheet, which arises as the polygon of the mesh is slightly longer than the arc.
     """
     fabric.needs_bending("bending")
     shell, record, cells, rise = fabric.shell(degrees), Record(), 20, TURNS
     limit = shell.friction_moment[0]
-    path = _to_and_fro(CURVED, rise, closed=limit > 0.0)
+    path = _cycle(CURVED, rise, closed=limit > 0.0)
     share, width = 1.0 / (len(path) - 1), LENGTH / cells
     content = _scene(
         _grid(LENGTH, width, cells, 1),
@@ -282,40 +289,41 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         handles=[
             {"group": "left", "clamp": True},
             {"group": "right", "clamp": True, "motion": "chuck", "interpolation": "linear"},
-            *({"group": side, "symmetry": "y"} for side in ("bottom", "top")),  # 20 cm are wide
+            *({"group": side, "symmetry": "y"} for side in ("bottom", "top")),  # as in the middle of 20 cm
         ],
         motions={"chuck": [{"time": k * share, **_chuck(kappa)} for k, kappa in enumerate(path)]},
     )
     moments = [0.0]
-    with _through(bench, content, path) as steps:
+    with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
             ledger, kappa = simulation.ledger, path[len(moments)]
             force, moment = ledger.handle_forces(4)[1], float(ledger.handle_moments()[1][1])
-            moments.append((np.dot(force, _moves(kappa)) / LENGTH - moment) / width)
-    told = [float(m) / (1e-2 * GF_PER_CM) for m in moments]  # gf·cm/cm
+            moments.append((np.dot(force, _chuck_rate(kappa)) / LENGTH - moment) / width)
+    converted = [float(m) / (1e-2 * GF_PER_CM) for m in moments]  # gf·cm/cm
     curvature = [1e-2 * kappa for kappa in path]
-    record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, told)]
-    up, down = _branches(curvature, told, rise)
+    record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, converted)]
+    up, down = _branches(curvature, converted, rise)
     stiffness = 0.5 * ((up(1.5) - up(0.5)) + (down(-0.5) - down(-1.5)))
     record.numbers = [Number("B", stiffness, "gf·cm²/cm")]
     record.claim("B", stiffness, shell.plate[0] / (1e-4 * GF_PER_CM), 0.01)
     if limit > 0.0:
         for at in (0.5, 1.5):
             known = 2.0 * limit / (1e-2 * GF_PER_CM)
-            _width_of_loop(record, f"2HB at {at:g} cm⁻¹", up, down, at, "gf·cm/cm", known)
+            _add_loop_width(record, f"2HB at {at:g} cm⁻¹", up, down, at, "gf·cm/cm", known)
     return record
 
 
 # -- cantilever ------------------------------------------------------------------------------------------
 
 OVERHANG = 41.5
-"""Angle of the chord [°]"""
+"""Prescribed angle of the chord [°]"""
 
 CELLS = 60
+"""Cells along the overhanging strip"""
 
 
 def _cantilever(bench: Bench, fabric: Fabric, degrees: float, length: float) -> tuple[float, Array]:
-    """Angle [°] of the chord of an overhanging strip, and its middle line (n, 2) [m]."""
+    """Simulate an overhanging strip; returns the angle [°] of its chord and its middle line (n, 2) [m]."""
     content = _scene(
         _grid(length, length / CELLS, CELLS, 1),
         fabric.turned(degrees),
@@ -329,16 +337,15 @@ def _cantilever(bench: Bench, fabric: Fabric, degrees: float, length: float) -> 
 
 
 def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """A strip slid over an edge until its chord falls by 41.5°: bending length c, rigidity w c³."""
+    """Cantilever test: the overhang whose chord falls by 41.5°; bending length c, rigidity w c³."""
     fabric.needs_bending("cantilever")
     shell, record = fabric.shell(degrees), Record()
     weight = G * shell.density
     known = fabric.rigidity(degrees)
     length = 2.0 * (known / weight) ** (1.0 / 3.0)
-    # the angle grows with a power of the length near it: by secants in their logarithms
-    lengths, angles = [0.97 * length, length], []
-    for tried in lengths:
-        angles.append(_cantilever(bench, fabric, degrees, tried)[0])
+    # secant method in the logarithms, as the angle is nearly a power of the length
+    lengths = [0.97 * length, length]
+    angles = [_cantilever(bench, fabric, degrees, trial)[0] for trial in lengths]
     line = np.empty((0, 2))
     for _ in range(8):
         if abs(angles[-1] - OVERHANG) < 1e-3:
@@ -364,14 +371,14 @@ def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 # -- heart loop ------------------------------------------------------------------------------------------
 
 LOOP = 0.1337
-"""Height of a loop without weight over the length of its strip, in Peirce's formula"""
+"""Height of a weightless loop over the length of its strip, in Peirce's formula"""
 
 SHOTS = 200
-"""Steps along half a loop"""
+"""Runge-Kutta steps along half a loop"""
 
 
 def loop_length(height: float, strip: float) -> float:
-    """Bending length c of a heart loop by Peirce's formula, in the unit of height and strip."""
+    """Bending length c of a heart loop by Peirce's formula, in the unit of ``height`` and ``strip``."""
     first = LOOP * strip
     angle = math.radians(32.85 * (height - first) / first)
     return float(first * (math.cos(angle) / math.tan(angle)) ** (1.0 / 3.0))
@@ -380,10 +387,11 @@ def loop_length(height: float, strip: float) -> float:
 Ends = tuple[float, float, float]
 
 
-def _shot(slope: float, pull: float, weight: float) -> Ends:
-    """Half of a loop of length 1 with B = 1: angle and x at its lowest point but for what they shall be, z.
+def _shoot(slope: float, pull: float, weight: float) -> Ends:
+    """Integrate half a loop of length 1 with B = 1; returns residuals of angle and x at its lowest point,
+    and z.
 
-    θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by Runge and Kutta.
+    θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by the classical Runge-Kutta method.
     """
     h, y = 1.0 / SHOTS, np.array([0.5 * math.pi, slope, 0.0, 0.0])
 
@@ -401,7 +409,7 @@ def _shot(slope: float, pull: float, weight: float) -> Ends:
 
 
 def loop_height(bending_length: float, strip: float) -> float:
-    """The height of the elastica that hangs as a heart loop, in the unit of strip and bending length.
+    """Height of the elastica of a hanging heart loop, in the unit of strip and bending length; by shooting.
 
     Raises
     ------
@@ -412,21 +420,21 @@ def loop_height(bending_length: float, strip: float) -> float:
     ends, tiny = (0.0, 0.0, 0.0), 1e-6
     for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)).tolist():
         for _ in range(50):
-            ends = _shot(slope, pull, weight)
+            ends = _shoot(slope, pull, weight)
             if max(abs(ends[0]), abs(ends[1])) < 1e-10:
                 break
-            sides = _shot(slope + tiny, pull, weight), _shot(slope, pull + tiny, weight)
+            sides = _shoot(slope + tiny, pull, weight), _shoot(slope, pull + tiny, weight)
             matrix = [[(side[i] - ends[i]) / tiny for side in sides] for i in range(2)]
             one, two = np.linalg.solve(matrix, [-ends[0], -ends[1]]).tolist()
-            most = max(1.0, abs(one), abs(two) / 5.0)
-            slope, pull = slope + one / most, pull + two / most
+            cut = max(1.0, abs(one), abs(two) / 5.0)
+            slope, pull = slope + one / cut, pull + two / cut
         else:
             raise ArithmeticError("the heart loop's elastica was not found")
     return -0.5 * strip * ends[2]
 
 
-def _drop(cells: int, half: float) -> Array:
-    """Half of a loop (cells + 1, 2) [m] of an arc, from which a search begins: no cell is stretched."""
+def _start_loop(cells: int, half: float) -> Array:
+    """Start shape of half a loop (cells + 1, 2) [m]: an arc of 270° with straight end, without stretch."""
     size, s = half / cells, (np.arange(cells) + 0.5) / cells
 
     def line(radius: float) -> Array:
@@ -434,15 +442,15 @@ def _drop(cells: int, half: float) -> Array:
         sides = size * np.column_stack([np.sin(angle), np.cos(angle)])
         return np.concatenate([np.zeros((1, 2)), np.cumsum(sides, axis=0)])
 
-    few, many = 0.5 / (1.5 * math.pi + 1.0), 2.0 / (1.5 * math.pi + 1.0)  # radii over the half's length
+    low, high = 0.5 / (1.5 * math.pi + 1.0), 2.0 / (1.5 * math.pi + 1.0)  # radii over half the length
     for _ in range(60):
-        middle = 0.5 * (few + many)
-        few, many = (middle, many) if line(middle)[-1, 0] < 0.0 else (few, middle)
-    return line(few)
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if line(middle)[-1, 0] < 0.0 else (low, middle)
+    return line(low)
 
 
 def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """A strip whose ends are held together, pointing up: heights of loops, bending length by Peirce."""
+    """Heart loop: a strip whose ends are clamped together, pointing up; heights, bending length by Peirce."""
     fabric.needs_bending("loop")
     shell, record, cells = fabric.shell(degrees), Record(), 64
     known = (fabric.rigidity(degrees) / (G * shell.density)) ** (1.0 / 3.0)
@@ -450,7 +458,7 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     for strip in strips:
         half = 0.5 * strip
         flat, faces = rectangle(cells, 1, half, half / cells)
-        line = _drop(cells, half)[np.rint(flat[:, 0] * cells / half).astype(int)]
+        line = _start_loop(cells, half)[np.rint(flat[:, 0] * cells / half).astype(int)]
         x, z = np.where(flat[:, 0] > half - 1e-9, 0.0, line[:, 0]), line[:, 1]
         nodes = np.arange(len(flat))
         content = _scene(
@@ -476,25 +484,25 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     record.curves = [_shape(f"{1e2 * s:.3g} cm", shape) for s, shape in zip(strips, shapes, strict=True)]
     if not max(shell.friction_moment) > 0.0:
         for strip, height in zip(strips, heights, strict=True):
-            words = f"height of {1e2 * strip:.3g} cm, against the elastica"
-            record.claim(words, height, loop_height(known, strip), 0.01)
+            name = f"height of {1e2 * strip:.3g} cm, against the elastica"
+            record.claim(name, height, loop_height(known, strip), 0.01)
     return record
 
 
 ACROSS = 12
-"""Along the diameter"""
+"""Cells along the diameter of the cloth"""
 
 PIXELS = 240
 
 
 def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
-    """A disc of radius 1, a square of irregular cells mapped smoothly: no direction has more folds for it."""
+    """A disc of radius 1: a square of irregular cells, so that folds have no preferred direction."""
     flat, faces = irregular_rectangle(cells, cells, 2.0, 2.0, seed)
     return square_to_disc(flat - [1.0, 1.0, 0.0]), faces
 
 
 def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """A cloth of 30 cm on a disc of 18 cm: drape coefficient and folds, mean and scatter of five starts."""
+    """Drape test: 30 cm on a disc of 18 cm; drape coefficient and folds, mean and scatter of five starts."""
     fabric.needs_bending("cusick")
     record, coefficients, counts = Record(), [], []
     dark = np.zeros((1, 1), dtype=np.bool_)
@@ -521,16 +529,16 @@ DIRECTIONS = {"warp": 0.0, "weft": 90.0}
 
 @dataclass(frozen=True)
 class TextileTest:
-    """A test.
+    """A textile test.
 
     Attributes
     ----------
     title : str
     measure : callable (bench, fabric, degrees) → Record
     both : bool
-        Warp and weft have one each.
+        Run for warp and weft.
     direct : bool
-        By a direct solver.
+        Use a direct linear solver.
     """
 
     title: str
@@ -556,7 +564,7 @@ def cases_of(test: str) -> list[FabricCase]:
     Raises
     ------
     InputError
-        For a test that there is not.
+        For an unknown test.
     """
     if test != ALL and test not in TESTS:
         raise InputError(f"unknown test, {nearest(test, [*TESTS, ALL])}", key=test)
@@ -567,7 +575,8 @@ def cases_of(test: str) -> list[FabricCase]:
             found.append(FabricCase(name, each.title, name, 0.0))
             continue
         found += [
-            FabricCase(f"{name}-{way}", f"{each.title}, {way}", name, a) for way, a in DIRECTIONS.items()
+            FabricCase(f"{name}-{thread}", f"{each.title}, {thread}", name, degrees)
+            for thread, degrees in DIRECTIONS.items()
         ]
     return found
 
@@ -585,13 +594,13 @@ def run_case(comm: MPI.Comm, case: FabricCase, fabric: Fabric, watch: Watch) -> 
     return outcome_of(case, record)
 
 
-def launched(launcher: Launcher, case: FabricCase, asked: Sequence[str], watch: Watch) -> FabricOutcome:
-    """Run a test in processes of its own; ``asked`` are the material and options.
+def launched(launcher: Launcher, case: FabricCase, arguments: Sequence[str], watch: Watch) -> FabricOutcome:
+    """Run a test in processes of its own; ``arguments`` are the material and options.
 
     Raises
     ------
     InputError
-        If the launched program refuses what it was asked for.
+        If the launched program rejects its arguments.
     """
-    record, message = launcher.run_case([case.test, *asked, "--only", case.name], watch, Record)
+    record, message = launcher.run_case([case.test, *arguments, "--only", case.name], watch, Record)
     return outcome_of(case, record or Record(stopped=message))

@@ -1,9 +1,9 @@
-"""Least squares over the numbers of a scene: the search by PETSc's TAO, and what the data say of its end.
+"""Least squares over numbers of a scene: the search by PETSc's TAO, and the uncertainty of its result.
 
-With values y(p), measurements m and their standard deviations s the residual is r = (y − m) / s, and the sum
-½ rᵀr is made least within bounds. At its end C = (JᵀJ)⁻¹ of the Jacobian J = ∂r/∂p is the covariance of the
-numbers, 1.96 √C_ii half the width of their 95 % intervals; singular values of J, with numbers in units of
-their size, tell which combinations the data leave open.
+With values y(p), measurements m and their standard deviations s the residual is r = (y − m) / s, and the
+cost ½ rᵀr is minimised within bounds. At the minimum C = (JᵀJ)⁻¹ of the Jacobian J = ∂r/∂p is the
+covariance of the parameters, and 1.96 √C_ii half the width of their 95 % intervals. Small singular values
+of J, with parameters scaled by their size, belong to combinations that the data do not determine.
 
 Source: Seber & Wild, Nonlinear Regression, Wiley 1989, ch. 2 and 5.
 """
@@ -27,37 +27,37 @@ from lyra_petsc.linear.reasons import error_message
 QUANTILE = 1.959963984540054
 """Half the width of a 95 % interval over the standard deviation."""
 
-SETTLED = 0.05
-"""Of a standard deviation: a search ends where Gauss and Newton would go no farther."""
+CONVERGED = 0.05
+"""The search ends when the Gauss-Newton step is below this many standard deviations."""
 
 NEAR = 0.5
-"""Of a standard deviation: what an end that TAO declares may be away."""
+"""Gauss-Newton step [standard deviations] up to which convergence that TAO reports is accepted."""
 
 STALLED = 1e-7
-"""Relative change of all numbers below which the search ends, too."""
+"""Relative change of all numbers below which the search ends as well."""
 
-IDLE, LITTLE = 8, 5e-3
-"""Evaluations after which a search that is near ends, too, if the cost has fallen by less: where a sheet
-buckles to one side or the other the cost jumps, and a line search may not find its way."""
+STALL, DECREASE = 8, 5e-3
+"""A search whose step is below `NEAR` also ends if its cost decreases by less than this in so many
+evaluations: if a sheet may buckle to either side the cost is discontinuous, and a line search may fail."""
 
-MOST_ITERATIONS = 40
+MAX_ITERATIONS = 40
 
-NOTHING, UNSEEN = 1e-9, 1e-6
-"""Largest derivative by a number without influence, in units of its size: over that by others, and in
-uncertainties."""
+NO_INFLUENCE, INVISIBLE = 1e-9, 1e-6
+"""A number has no influence if its largest scaled derivative is below this part of the others', or below this
+many uncertainties."""
 
-OPEN = 1.0
-"""Standard deviation of a combination over its size from which on the data do not tell it."""
+UNDETERMINED = 1.0
+"""Relative standard deviation of a combination from which on the data do not determine it."""
 
-ALIKE = 0.98
-"""Correlation from which on two numbers are not told apart."""
+CORRELATED = 0.98
+"""Correlation from which on two numbers are reported as not separable."""
 
 LEAST_SQUARES = ("brgn", "pounders")
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number to be found: where the search begins, and its bounds."""
+    """A number to be fitted, with its start value and bounds."""
 
     key: str
     start: float
@@ -66,13 +66,13 @@ class Unknown:
 
     @property
     def size(self) -> float:
-        """Of its usual changes."""
+        """Typical size of its changes."""
         return max(abs(self.start), 1e-3 * (self.high - self.low))
 
 
 @dataclass
 class Trial:
-    """Residuals (m,) and their derivatives (m, n) at some numbers (n,)."""
+    """Residuals (m,) and their derivatives (m, n) at the numbers (n,)."""
 
     numbers: StoredArray
     residuals: StoredArray
@@ -86,13 +86,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Estimate(Unknown):
-    """A number found.
+    """A fitted number.
 
     Attributes
     ----------
     value : float
     deviation : float
-        Standard deviation; infinite where the data do not tell.
+        Standard deviation; infinite if the data do not determine it.
     at_bound : bool
     """
 
@@ -108,20 +108,20 @@ class Estimate(Unknown):
 
 @dataclass
 class Conclusion:
-    """What the data say at the end of a search.
+    """The result of a search and its uncertainty.
 
     Attributes
     ----------
     estimates : list of Estimate
     correlation : (n, n)
     singular_values : (n,)
-        Of the Jacobian, with numbers in units of their size.
+        Singular values of the Jacobian, with numbers scaled by their size.
     directions : (n, n)
-        Their right singular vectors, in rows.
+        Right singular vectors, in rows.
     misfit : float
-        rᵀr over the degrees of freedom; 1 is expected.
+        rᵀr over the degrees of freedom; expected value 1.
     words : list of str
-        What one should know.
+        Notes for the user.
     """
 
     estimates: list[Estimate]
@@ -135,25 +135,25 @@ class Conclusion:
 Evaluate = Callable[[Array], Trial]
 
 
-class _IdleError(Exception):
-    """Ends a search that is near."""
+class _StalledError(Exception):
+    """Ends a search that is near the minimum but makes no progress."""
 
 
 def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]:
-    """The trial with the least cost, and why the search ended, in words; the same on every rank.
+    """Minimise the cost; returns the best trial and why the search ended, the same on every rank.
 
     Parameters
     ----------
     unknowns : sequence of Unknown
     evaluate : callable
-        Of numbers (n,), the same on all ranks and with the same result; collective.
+        Function of the numbers (n,), with the same argument and result on all ranks; collective.
 
     Raises
     ------
     InputError
-        For options that TAO refuses.
+        For options that TAO rejects.
     SolverError
-        If it ends in a failure.
+        If the search fails.
     """
     n = len(unknowns)
     size = np.array([unknown.size for unknown in unknowns])
@@ -161,18 +161,18 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     known: dict[bytes, Trial] = {}
     failure: list[BaseException] = []
 
-    def idle() -> bool:
+    def is_stalled() -> bool:
         costs = [trial.cost for trial in known.values()]
-        if len(costs) <= IDLE or min(costs[:-IDLE]) - min(costs) >= LITTLE:
+        if len(costs) <= STALL or min(costs[:-STALL]) - min(costs) >= DECREASE:
             return False
-        return _step(min(known.values(), key=lambda trial: trial.cost), low, high) <= NEAR
+        return _gauss_newton_step(min(known.values(), key=lambda trial: trial.cost), low, high) <= NEAR
 
     def at(y: PETSc.Vec) -> Trial:
         numbers = np.clip(np.array(y.getArray(readonly=True)) * size, low, high)
         key = numbers.tobytes()
         if key not in known:
-            if idle():
-                raise _IdleError
+            if is_stalled():
+                raise _StalledError
             try:
                 known[key] = evaluate(numbers)
             except BaseException as error:
@@ -180,7 +180,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
                 raise
         return known[key]
 
-    comm = PETSc.COMM_SELF  # all ranks go the same way
+    comm = PETSc.COMM_SELF  # all ranks make the same search
     tao = PETSc.TAO().create(comm)
     try:
         tao.setType(PETSc.Options().getString("tao_type", PETSc.TAO.Type.BRGN))
@@ -216,11 +216,11 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     def ended(tao: PETSc.TAO) -> int | None:
         y = tao.getSolution()
         trial = at(y)
-        left = _step(trial, low, high)
+        left = _gauss_newton_step(trial, low, high)
         stalled = bool(before) and np.all(np.abs(trial.numbers - before[-1]) <= STALLED * size)
         if not before or not np.array_equal(before[-1], trial.numbers):
             before.append(trial.numbers)
-        if left <= SETTLED or (stalled and len(before) > 1):
+        if left <= CONVERGED or (stalled and len(before) > 1):
             return int(PETSc.TAO.Reason.CONVERGED_USER)
         if tao.getIterationNumber() >= tao.getMaximumIterations():
             return int(PETSc.TAO.Reason.DIVERGED_MAXITS)
@@ -234,12 +234,12 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
         else:
             tao.setObjectiveGradient(cost, None)
         tao.setVariableBounds((lower, upper))
-        tao.setMaximumIterations(MOST_ITERATIONS)
+        tao.setMaximumIterations(MAX_ITERATIONS)
         tao.setFromOptions()
         tao.setSolution(start)
         if tao.getType() == PETSc.TAO.Type.BRGN:
             if not is_set("tao_brgn_regularizer_weight"):
-                tao.setBRGNRegularizerWeight(0.0 if _full(first, size) else 1e-6 * first.cost)
+                tao.setBRGNRegularizerWeight(0.0 if _has_full_rank(first, size) else 1e-6 * first.cost)
             tao.setUp()
             inner = tao.getBRGNSubsolver()
             inner.setMaximumIterations(tao.getMaximumIterations())
@@ -248,7 +248,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
             tao.setConvergenceTest(ended)
         tao.solve()
         reason = int(tao.getConvergedReason())
-    except _IdleError:
+    except _StalledError:
         reason = int(PETSc.TAO.Reason.CONVERGED_USER)
     except PETSc.Error as error:
         if failure:
@@ -258,8 +258,8 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
         for thing in (tao, matrix, start, lower, upper, values):
             thing.destroy()
     best = min(known.values(), key=lambda trial: trial.cost)
-    left = _step(best, low, high)
-    if left <= SETTLED or (reason > 0 and left <= NEAR):
+    left = _gauss_newton_step(best, low, high)
+    if left <= CONVERGED or (reason > 0 and left <= NEAR):
         return (
             best,
             f"the search ended; where it tends to is {left:.2g} standard deviations away",
@@ -275,32 +275,32 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     )
 
 
-def _full(trial: Trial, size: Array) -> bool:
-    """Whether the data tell all combinations of the numbers."""
+def _has_full_rank(trial: Trial, size: Array) -> bool:
+    """Whether the Jacobian has full rank: the data determine all combinations of the numbers."""
     values = np.linalg.svd(trial.jacobian * size, compute_uv=False)
     return len(values) == len(size) and bool(values[-1] > 1e-6 * values[0])
 
 
-def _step(trial: Trial, low: Array, high: Array) -> float:
-    """How far Gauss and Newton would go from a trial, in standard deviations of the numbers."""
+def _gauss_newton_step(trial: Trial, low: Array, high: Array) -> float:
+    """Length of the Gauss-Newton step from a trial, in standard deviations of the numbers."""
     gradient = trial.jacobian.T @ trial.residuals
-    free = ~_held(trial.numbers, gradient, low, high)
+    free = ~_at_bounds(trial.numbers, gradient, low, high)
     if not free.any():
         return 0.0
     jacobian = trial.jacobian[:, free]
     step = np.linalg.lstsq(jacobian, trial.residuals, rcond=1e-10)[0]
-    # in the metric of the data, which is finite also for what they do not tell
+    # norm of J × step, which is finite also for combinations that the data do not determine
     return float(np.linalg.norm(jacobian @ step)) / math.sqrt(free.sum())
 
 
-def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
-    """Which numbers lie at a bound that the cost drives them against."""
+def _at_bounds(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
+    """Mask of numbers at a bound towards which the cost decreases."""
     slack = 1e-9 * (high - low)
     return ((numbers <= low + slack) & (gradient > 0.0)) | ((numbers >= high - slack) & (gradient < 0.0))
 
 
-def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:
-    """Refuse numbers on which no measurement depends.
+def refuse_insensitive(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:
+    """Refuse numbers that do not influence any measurement.
 
     Raises
     ------
@@ -309,7 +309,7 @@ def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) 
     size = np.array([unknown.size for unknown in unknowns])
     largest = np.abs(trial.jacobian * size).max(axis=0)
     for unknown, own in zip(unknowns, largest, strict=True):
-        if own <= max(NOTHING * largest.max(), UNSEEN):
+        if own <= max(NO_INFLUENCE * largest.max(), INVISIBLE):
             raise InputError(
                 "no measurement depends on it; leave it out, or measure something that does",
                 file=file,
@@ -318,16 +318,16 @@ def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) 
 
 
 def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
-    """What the data say at the numbers of a trial."""
+    """Estimates, covariance and notes at the numbers of a trial."""
     n, m = len(unknowns), len(trial.residuals)
     size = np.array([unknown.size for unknown in unknowns])
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
-    held = _held(trial.numbers, trial.jacobian.T @ trial.residuals, low, high)
+    at_bound = _at_bounds(trial.numbers, trial.jacobian.T @ trial.residuals, low, high)
     scaled = trial.jacobian * size
     _, values, directions = np.linalg.svd(scaled, full_matrices=m < n)
     values = np.concatenate([values, np.zeros(n - len(values))])
     covariance = np.full((n, n), np.nan)
-    free = np.flatnonzero(~held)
+    free = np.flatnonzero(~at_bound)
     if len(free):
         _, own, across = np.linalg.svd(scaled[:, free], full_matrices=m < len(free))
         own = np.concatenate([own, np.zeros(len(free) - len(own))])
@@ -340,11 +340,11 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
         correlation = covariance * np.outer(size, size) / np.outer(deviation, deviation)
     estimates = [
         Estimate(u.key, u.start, u.low, u.high, float(value), float(own), bool(bound))
-        for u, value, own, bound in zip(unknowns, trial.numbers, deviation, held, strict=True)
+        for u, value, own, bound in zip(unknowns, trial.numbers, deviation, at_bound, strict=True)
     ]
     freedom = m - len(free)
     misfit = float(trial.residuals @ trial.residuals) / freedom if freedom > 0 else math.nan
-    words = _words(estimates, values, directions, correlation)
+    words = _notes(estimates, values, directions, correlation)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     if freedom > 0 and misfit > 1.0 + 3.0 * spread:
         words.append(
@@ -361,13 +361,13 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
     return Conclusion(estimates, correlation, values, directions, misfit, words)
 
 
-def _words(estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array) -> list[str]:
+def _notes(estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array) -> list[str]:
     keys, words = [estimate.key for estimate in estimates], []
     for estimate in estimates:
         if estimate.at_bound:
             words.append(f"{estimate.key} is at its bound {estimate.value:.6g}: the data ask for more")
     for value, direction in zip(values, directions, strict=True):
-        if value > 0.0 and 1.0 / value < OPEN:
+        if value > 0.0 and 1.0 / value < UNDETERMINED:
             continue
         share = [key for key, part in zip(keys, direction, strict=True) if abs(part) > 0.3]
         how = f"±{100.0 / value:.0f} %" if value > 1e-6 else "not at all"
@@ -379,7 +379,7 @@ def _words(estimates: Sequence[Estimate], values: Array, directions: Array, corr
             )
     for i, one in enumerate(keys):
         for j in range(i):
-            if abs(correlation[i, j]) > ALIKE:
+            if abs(correlation[i, j]) > CORRELATED:
                 words.append(
                     f"{keys[j]} and {one} go together (correlation {correlation[i, j]:.3f}): "
                     "another measurement would tell them apart"

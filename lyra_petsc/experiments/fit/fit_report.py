@@ -1,4 +1,4 @@
-"""What a fit tells: fit.csv with the numbers, fit.json for programs, and a page."""
+"""Report of a fit: fit.csv with the numbers, fit.json with all results, and a page."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from lyra_petsc.experiments.results import View, align_columns
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
 from lyra_petsc.show.report.plots import colour, drawn, empty_figure, surface
 
-MOST_ROWS = 60
-"""Measurements in the page's table; fit.json has all."""
+MAX_ROWS = 60
+"""Largest number of measurements in the table of the page; fit.json has all."""
 
 
 @dataclass
 class FitOutcome(Outcome[Case]):
-    """A fit that has ended."""
+    """The outcome of a fit."""
 
     _: KW_ONLY
     fitted: Fitted
 
 
 def outcome_of(fitted: Fitted) -> FitOutcome:
-    """The outcome of the one case of a fit."""
+    """The outcome of a fit, which has a single case."""
     passed = fitted.words.startswith("the search ended")
     case = Case("fit", "numbers from measurements")
     return FitOutcome(case, {"search": Verdict(passed, fitted.words)}, fitted.seconds, fitted=fitted)
@@ -43,14 +43,14 @@ def _deviation(estimate: Estimate) -> str:
 
 
 class Fit(View[FitOutcome]):
-    """Of one fit."""
+    """Report of one fit."""
 
     verb = "fit"
     pictures = "pictures"
     columns = ("parameter", "start", "lowest", "highest", "value", "deviation", "from", "to", "at_bound")
 
     def __init__(self, title: str) -> None:
-        self.title, self.ready = title, False  # nothing is told of a fit that was stopped
+        self.title, self.ready = title, False  # an interrupted fit is not reported
 
     def case_ended(self, outcomes: Sequence[FitOutcome]) -> None:
         self.ready = True
@@ -126,7 +126,7 @@ class Fit(View[FitOutcome]):
         report.heading("Measurements")
         keys = [unknown.key for unknown in fitted.unknowns]
         times = [reading.time for reading in fitted.readings for _ in reading.parts]
-        shown = list(range(len(fitted.labels)))[:MOST_ROWS]
+        shown = list(range(len(fitted.labels)))[:MAX_ROWS]
         report.table(
             ["measurement", "time", "measured", "uncertainty", "before", "after", *keys],
             [
@@ -136,7 +136,7 @@ class Fit(View[FitOutcome]):
                 for i in shown
             ],
             caption="Last columns: by how many uncertainties the value changes with the whole parameter."
-            + (f" {MOST_ROWS} of {len(fitted.labels)}; fit.json has all." * (len(shown) < len(times))),
+            + (f" {MAX_ROWS} of {len(fitted.labels)}; fit.json has all." * (len(shown) < len(times))),
         )
         report.heading("What the data tell")
         report.table(
@@ -152,7 +152,7 @@ class Fit(View[FitOutcome]):
         )
 
     def terminal(self, outcome: FitOutcome) -> list[str]:
-        """What the terminal shows at the end."""
+        """Lines of the terminal at the end."""
         fitted = outcome.fitted
         table = self.summary_table([outcome])
         return [*align_columns(table, len(table[0])), *fitted.conclusion.words, fitted.words]

@@ -1,4 +1,4 @@
-"""A fit as a whole: a scene with a block ``fit`` → numbers with intervals, kept on disk as it goes.
+"""Fits the numbers of a scene with a block ``fit``; evaluations are stored, so that a fit can be resumed.
 
 Also ``lyra_petsc.fit`` and ``lyra_petsc.gradient``.
 """
@@ -23,7 +23,14 @@ from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, in_python
 from lyra_petsc.experiments.case import Watch, load_record, save_record
-from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, refuse_idle, search
+from lyra_petsc.experiments.fit.estimate import (
+    Conclusion,
+    Trial,
+    Unknown,
+    conclude,
+    refuse_insensitive,
+    search,
+)
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
 from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
 from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose, present
@@ -37,8 +44,8 @@ from lyra_petsc.scene.values import shown
 
 TRIALS_FILE = "trials.json"
 
-FARTHEST = 1e8
-"""Uncertainties by which a start may miss a measurement: beyond, rounding errors of a simulation count."""
+LARGEST_RESIDUAL = 1e8
+"""Largest residual of the start in uncertainties; beyond it round-off of a simulation would matter."""
 
 
 FIT = FolderKind(
@@ -54,12 +61,12 @@ FIT = FolderKind(
 
 @dataclass
 class Trials:
-    """The evaluations of a fit, as they are kept.
+    """The evaluations of a fit as stored in its folder.
 
     Attributes
     ----------
     fingerprint : str
-        Of everything they depend on.
+        Digest of everything that they depend on.
     """
 
     fingerprint: str
@@ -67,18 +74,18 @@ class Trials:
 
 
 class Observer:
-    """Is told how far a fit is; to be overridden."""
+    """Is notified of the progress of a fit; to be overridden."""
 
     def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
         """An evaluation has ended, or was found on disk."""
 
     def progress(self, number: int, part: float) -> None:
-        """Which part of an evaluation is done."""
+        """Completed fraction of an evaluation."""
 
 
 @dataclass
 class Fitted:
-    """What came of a fit.
+    """The result of a fit.
 
     Attributes
     ----------
@@ -95,7 +102,7 @@ class Fitted:
     triangles : (F, 3) or None
         On rank 0.
     runs : int
-        Simulations, those with derivatives once.
+        Number of simulations; one with derivatives counts once.
     seconds : float
         Wall time.
     """
@@ -114,44 +121,44 @@ class Fitted:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The numbers found, by their keys: what ``Scene.changed`` takes."""
+        """The fitted numbers by their keys, as for ``Scene.changed``."""
         return {estimate.key: estimate.value for estimate in self.conclusion.estimates}
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Their 95 % intervals."""
+        """The 95 % intervals by keys."""
         return {estimate.key: estimate.interval for estimate in self.conclusion.estimates}
 
     @property
     def measured(self) -> Array:
-        """(m,)"""
+        """Measured values (m,)."""
         return np.concatenate([reading.measured for reading in self.readings])
 
     @property
     def uncertainty(self) -> Array:
-        """(m,)"""
+        """Standard deviations (m,) of the measured values."""
         return np.concatenate([reading.uncertainty for reading in self.readings])
 
     @property
     def labels(self) -> list[str]:
-        """Of the m values."""
+        """Labels of the m values."""
         return [label for reading in self.readings for label in reading.labels]
 
     @property
     def sensitivity(self) -> Array:
-        """(m, n) of each value, in its uncertainties, to a change of each number by its size."""
+        """Derivatives (m, n) of each value over its uncertainty, by each number over its size."""
         size = np.array([unknown.size for unknown in self.unknowns])
         best = min(self.trials, key=lambda trial: trial.cost)
         return best.jacobian * size
 
 
 def unknowns_of(scene: Scene) -> list[Unknown]:
-    """The numbers that a scene wants to be found.
+    """The numbers to be fitted of a scene.
 
     Raises
     ------
     InputError
-        Without a block ``fit``, or where a key is no number of the scene.
+        If there is no block ``fit``, or a key is not a number of the scene.
     """
     if scene.fit is None:
         raise InputError(
@@ -182,29 +189,29 @@ def fit_scene(
     observer: Observer | None = None,
     measured: Sequence[Array] | None = None,
 ) -> Fitted:
-    """Find the numbers that a scene's block ``fit`` names; collective.
+    """Fit the numbers that the block ``fit`` of a scene names; collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     scene : Scene
     folder : Path, optional
-        Where evaluations are kept; those that are there are not made again.
+        Folder in which evaluations are stored; stored ones are not repeated.
     watch : callable
         Called before every step.
     observer : Observer, optional
     measured : sequence of arrays, optional
-        In place of the measured values of each reading, in their order.
+        Replacements of the measured values of each reading, in their order.
 
     Raises
     ------
     InputError
-        What cannot be fitted.
+        For a scene that cannot be fitted.
     SolverError
-        A simulation that failed.
+        If a simulation fails.
     """
     began = time.monotonic()
-    seen = observer or Observer()
+    listener = observer or Observer()
     unknowns = on_root(comm, lambda: unknowns_of(scene))
     assert scene.fit is not None
     readings = on_root(comm, lambda: readings_of(scene, scene.fit.measurements if scene.fit else ()))
@@ -234,21 +241,21 @@ def fit_scene(
         trial = stored.get(numbers.tobytes())
         resumed = trial is not None
         if trial is None:
-            found = model.evaluate(numbers.tolist(), progress=lambda part: seen.progress(number, part))
+            found = model.evaluate(numbers.tolist(), progress=lambda part: listener.progress(number, part))
             assert found.jacobian is not None
-            # decisions are one rank's
+            # all ranks use the numbers of rank 0, bit by bit
             trial = comm.bcast(
                 Trial(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
             if number == 1:
-                refuse_idle(unknowns, trial, scene.source)
-                _refuse_far(model.readings, trial, scene)
+                refuse_insensitive(unknowns, trial, scene.source)
+                _refuse_large_residuals(model.readings, trial, scene)
             if folder is not None:
                 kept.trials.append(trial)
                 on_root(comm, lambda: save_record(folder / TRIALS_FILE, kept))
         trials.append(trial)
-        seen.trial(number, trial, resumed=resumed)
+        listener.trial(number, trial, resumed=resumed)
         return trial
 
     best, words = search(unknowns, evaluate)
@@ -272,11 +279,11 @@ def fit_scene(
     )
 
 
-def _refuse_far(readings: Sequence[Reading], trial: Trial, scene: Scene) -> None:
-    """Refuse measurements whose squares are no numbers, or leave none to all others."""
+def _refuse_large_residuals(readings: Sequence[Reading], trial: Trial, scene: Scene) -> None:
+    """Refuse measurements whose residuals at the start are not finite, or dominate all others."""
     keys = [reading.key for reading in readings for _ in reading.parts]
     worst = int(np.argmax(np.abs(trial.residuals)))
-    if not abs(trial.residuals[worst]) < FARTHEST:
+    if not abs(trial.residuals[worst]) < LARGEST_RESIDUAL:
         raise InputError(
             f"is missed by {abs(trial.residuals[worst]):.2g} uncertainties; check value and uncertainty, "
             "and their units",
@@ -291,7 +298,7 @@ def _fingerprint(scene: Scene, target: Array, sigma: Array) -> str:
 
 
 def _read(path: Path, new: Trials) -> Trials:
-    """The evaluations in a file, if they are of the same fit."""
+    """Read the stored evaluations, which must be of the same fit."""
     if not path.is_file():
         return new
     try:
@@ -314,11 +321,11 @@ class Gradient:
     Attributes
     ----------
     labels : tuple of str
-        Of its m values.
+        Labels of its m values.
     value : (m,)
-        In its unit.
+        Values in the unit of the quantity.
     derivatives : dict of str to (m,)
-        By each number of the scene, over the number's unit.
+        Derivatives with respect to each number of the scene, by key.
     """
 
     labels: tuple[str, ...]
@@ -334,7 +341,7 @@ def gradient(
     comm: MPI.Comm | None = None,
     trust_mesh: bool = False,
 ) -> Gradient:
-    """Derivatives of what a simulation ends in with respect to numbers of its scene; collective.
+    """Derivatives of a result of a simulation with respect to numbers of its scene; collective.
 
     ::
 
@@ -344,15 +351,15 @@ def gradient(
     ----------
     scene : Scene, path or mapping
     quantity : str or mapping
-        What a measurement of a scene's block ``fit`` can say beside its values: probe, points, overhang,
-        drape or force, with axes and at; or the name of a probe.
+        A measurement as in the block ``fit`` of a scene, without values: probe, points, overhang, drape or
+        force, with axes and at; or the name of a probe.
     parameters : sequence of str, or mapping of str to float
-        Keys of the numbers, as in ``material.bending``; or also their values, in place of the scene's.
+        Keys of the numbers, as in ``material.bending``, optionally with values that replace the scene's.
 
     Raises
     ------
     InputError
-        What the scene does not have.
+        For a quantity or number that the scene does not have.
     SolverError
         If the simulation fails.
     """
@@ -383,7 +390,7 @@ def _quantity(quantity: Any) -> Quantity:
 
 
 def _values(scene: Scene, parameters: Any) -> dict[str, float]:
-    """The numbers by their keys, those that are given and those of the scene."""
+    """The numbers by their keys, as given or from the scene."""
     whole = isinstance(parameters, str) or not isinstance(parameters, Iterable)
     keys = [] if whole else list(dict.fromkeys(parameters))
     if not keys or not all(isinstance(key, str) for key in keys):
@@ -411,25 +418,25 @@ def fit(
     trust_mesh: bool = False,
     comm: MPI.Comm | None = None,
 ) -> Fitted:
-    """Find the numbers that a scene's block ``fit`` names; collective.
+    """Fit the numbers that the block ``fit`` of a scene names; collective.
 
     Parameters
     ----------
     scene : Scene, path or mapping
     out : path, optional
-        Folder in which evaluations are kept, so that ``resume`` goes on with them; without, in memory.
+        Folder in which evaluations are stored, so that ``resume`` can continue; None: not stored.
     force, resume, trust_mesh
         As of `lyra_petsc.run`.
 
     Returns
     -------
     Fitted
-        ``parameters`` are the numbers found, ``intervals`` their 95 % intervals, ``conclusion`` all else.
+        ``parameters`` are the fitted numbers, ``intervals`` their 95 % intervals, ``conclusion`` all else.
 
     Raises
     ------
     InputError
-        What cannot be fitted.
+        For a scene that cannot be fitted.
     SolverError
         If a simulation fails.
     """

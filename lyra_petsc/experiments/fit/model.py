@@ -1,4 +1,4 @@
-"""A scene as a function: from some of its numbers to values of its readings, with derivatives."""
+"""A scene as a function that maps some of its numbers to values of its readings, with derivatives."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.terms.registry import active
 
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
-"""Blocks of a scene whose numbers can be found."""
+"""Blocks of a scene whose numbers can be fitted."""
 
 CHOICES = frozenset({"group", "nodes", "box", "from", "until", "fade", "seed", "law"})
-"""Keys below which numbers choose points, times or curves: nothing changes smoothly with them."""
+"""Keys whose numbers select points, times or curves, so that results do not depend smoothly on them."""
 
 WHOLE_RUNS = 1e-3
-"""Change over the number's size of runs whose difference is a derivative, with contact or friction."""
+"""Relative change of a number for central differences of whole runs, with contact or friction."""
 
 _PART = re.compile(r"[^.\[\]\s]+(\[\d+\])*")
 
 Progress = Callable[[float], None]
-"""Is told which part of an evaluation is done."""
+"""Called with the completed fraction of an evaluation."""
 
 
 @dataclass
 class Evaluation:
-    """Values (m,) of the readings, and their derivatives (m, n) by the numbers where asked for."""
+    """Values (m,) of the readings and, if requested, their derivatives (m, n) with respect to the numbers."""
 
     values: Array
     jacobian: Array | None = None
 
 
 class Model:
-    """A scene with numbers to vary and readings; every method is collective.
+    """A scene with variable numbers and readings; every method is collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     scene : Scene
     sizes : mapping of str to float
-        Keys of the numbers, and the size of their usual changes.
+        Keys of the numbers, and their typical changes.
     readings : sequence of Reading
     watch : callable
         Called before every step.
@@ -64,7 +64,7 @@ class Model:
     Attributes
     ----------
     readings : list of Reading
-        In the order of their values: by time.
+        Sorted by time, as their values are.
     shape : (V, 3) or None
         Positions [m] at the end of the last evaluation, in mesh order, on rank 0.
     mesh : Mesh or None
@@ -94,12 +94,12 @@ class Model:
         self.mesh: Mesh | None = None
         self.shape: Array | None = None
         self.runs = 0
-        # what terms keep from step to step beside the state, and stencils that change, have no tangents
+        # there are no tangents for terms with a state of their own or with changing stencils
         shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
         entries = active(scene, shells)
-        self._remembers = any(entry.neighbours or entry.element_vertices for entry in entries)
+        self._needs_differences = any(entry.neighbours or entry.element_vertices for entry in entries)
 
-        def make() -> None:
+        def check_vertices() -> None:
             self.mesh = build_scene_mesh(scene)
             count = self.mesh.n_vertices
             for reading in self.readings:
@@ -111,11 +111,11 @@ class Model:
                         key=reading.key,
                     )
 
-        on_root(comm, make)
+        on_root(comm, check_vertices)
 
     @property
     def labels(self) -> list[str]:
-        """Of all values."""
+        """Labels of all values."""
         return [label for reading in self.readings for label in reading.labels]
 
     def at(self, numbers: Sequence[float]) -> Scene:
@@ -130,18 +130,18 @@ class Model:
         Raises
         ------
         SolverError
-            Where the simulation fails, naming the numbers.
+            If the simulation fails; the message names the numbers.
         """
         array = np.array([float(number) for number in numbers])
         try:
-            if derivatives and self._remembers:
-                return self._by_differences(array, progress)
+            if derivatives and self._needs_differences:
+                return self._evaluate_by_differences(array, progress)
             return self._evaluate(array, derivatives, progress)
         except SolverError as error:
             pairs = zip(self.keys, array, strict=True)
-            words = ", ".join(f"{key} = {value:.6g}" for key, value in pairs)
+            numbers_text = ", ".join(f"{key} = {value:.6g}" for key, value in pairs)
             raise SolverError(
-                f"with {words}: {error}", collective=error.collective, details=error.details
+                f"with {numbers_text}: {error}", collective=error.collective, details=error.details
             ) from error
 
     def _evaluate(self, numbers: Array, derivatives: bool, progress: Progress) -> Evaluation:
@@ -151,41 +151,42 @@ class Model:
         slopes: list[Array] = []
         self.runs += 1
         with open_simulation(self.comm, scene, mesh=self.mesh, land=land) as simulation:
-            beside: Sensitivities | None = None
+            sensitivities: Sensitivities | None = None
             if derivatives:
                 chosen = [
                     Number(key, float(value), size)
                     for key, value, size in zip(self.keys, numbers, self._sizes, strict=True)
                 ]
                 tolerance = min(1e-6, 0.01 * scene.solver.force_tolerance)
-                beside = Sensitivities(
+                sensitivities = Sensitivities(
                     simulation, chosen, mesh=self.mesh, tolerance=tolerance, reactions=self._forces
                 )
-            left = list(self._instants)
+            remaining = list(self._instants)
             end = simulation.control.end
-            while left and not simulation.finished:
+            while remaining and not simulation.finished:
                 self._watch()
-                if beside is None:
+                if sensitivities is None:
                     simulation.step()
                 else:
-                    beside.step()
+                    sensitivities.step()
                 progress(simulation.time / end)
-                if abs(simulation.time - left[0].time) <= SAME_TIME * end:
-                    instant = left.pop(0)
+                if abs(simulation.time - remaining[0].time) <= SAME_TIME * end:
+                    instant = remaining.pop(0)
                     values.append(instant.values(simulation.problem, simulation.ledger))
-                    if beside is not None:
-                        slopes.append(beside.derivatives(instant.values))
-            if left:
+                    if sensitivities is not None:
+                        slopes.append(sensitivities.derivatives(instant.values))
+            if remaining:
                 raise InputError(
-                    f"is at {left[0].time:g}, where the run has ended before", key=left[0].readings[0].key
+                    f"is at {remaining[0].time:g}, where the run has ended before",
+                    key=remaining[0].readings[0].key,
                 )
             shape = simulation.problem.points.gather(simulation.problem.system.x)
             self.shape = shape if self.comm.rank == 0 else None
-            if beside is not None:
-                beside.destroy()
+            if sensitivities is not None:
+                sensitivities.destroy()
         return Evaluation(np.concatenate(values), np.concatenate(slopes) if slopes else None)
 
-    def _by_differences(self, numbers: Array, progress: Progress) -> Evaluation:
+    def _evaluate_by_differences(self, numbers: Array, progress: Progress) -> Evaluation:
         """By central differences of whole runs."""
         count = 2 * len(numbers) + 1
         columns = []
@@ -207,7 +208,7 @@ def _scaled(progress: Progress, done: int, count: int, part: float) -> None:
 
 
 def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
-    """Refuse what is no number of the scene that can be varied, or the same number twice.
+    """Refuse keys of numbers that cannot be varied, and two keys of one number.
 
     Raises
     ------
@@ -215,12 +216,12 @@ def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
     """
     names: dict[tuple[str, ...], str] = {}
     for key in keys:
-        if words := _wrong(key, names):
-            raise InputError(words, file=scene.source, key=f"{at}.{key}")
+        if reason := _reason_against(key, names):
+            raise InputError(reason, file=scene.source, key=f"{at}.{key}")
 
 
-def _wrong(key: str, names: dict[tuple[str, ...], str]) -> str:
-    """Why a key is not to be varied beside those before it, which ``names`` has; empty if it may be."""
+def _reason_against(key: str, names: dict[tuple[str, ...], str]) -> str:
+    """Why a key cannot be varied, empty if it can; ``names`` has the keys before it by their parts."""
     if not all(map(_PART.fullmatch, key.split("."))):
         return "is no key of a scene; write it as in handles[0].stiffness"
     if (other := names.setdefault(tuple(_parts(key)), key)) != key:
@@ -232,7 +233,7 @@ def _wrong(key: str, names: dict[tuple[str, ...], str]) -> str:
 
 
 def _parts(key: str) -> list[str]:
-    """Where a key leads; ``material`` may stand for the first of a list."""
+    """The parts of a key; ``material`` without a number denotes the first material."""
     parts = key.replace("[", ".").replace("]", "").split(".")
     if parts[0] == "material" and not (len(parts) > 1 and parts[1].isdecimal()):
         parts.insert(1, "0")
@@ -240,12 +241,12 @@ def _parts(key: str) -> list[str]:
 
 
 def value_of(scene: Scene, key: str, *, at: str) -> float:
-    """The number that a scene has at a key.
+    """The number at a key of a scene.
 
     Raises
     ------
     InputError
-        If there is none.
+        If there is no number.
     """
     target: Any = scene
     for part in _parts(key):

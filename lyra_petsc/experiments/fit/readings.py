@@ -1,6 +1,6 @@
-"""What was measured, as values of a simulation's state at given times.
+"""Readings: measurable quantities as functions of the state of a simulation at given times.
 
-Each reading sums something over the ranks and makes its values of the sums.
+Each reading computes its values from sums over all ranks.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from lyra_petsc.stepping.problem import Problem
 
 AXES = ("x", "y", "z")
 LARGEST_TABLE = 2**26
-MOST_ROWS = 100_000
+MAX_ROWS = 100_000
 
 SAME_TIME = 1e-9
-"""Part of the run by which a step may miss a measurement's time."""
+"""Fraction of the end time by which the time of a step may differ from that of a measurement."""
 
 
 @dataclass
@@ -38,15 +38,15 @@ class Reading(ABC):
     Attributes
     ----------
     key : str
-        Of the measurement in the scene.
+        Key of the measurement in the scene.
     name : str
-        Of what is measured.
+        Name of the quantity.
     time : float
-        [s], or load factor.
+        Time [s], or load factor.
     parts : tuple of str
-        Names of its values.
+        Names of its m values.
     measured, uncertainty : (m,)
-        NaN where nothing was measured.
+        Measured values and standard deviations; empty if nothing was measured.
     """
 
     key: str
@@ -58,26 +58,26 @@ class Reading(ABC):
 
     @abstractmethod
     def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
-        """This rank's part of what is to be summed over the ranks."""
+        """This rank's part of the sums over all ranks."""
 
     @abstractmethod
     def values(self, total: Array) -> Array:
-        """Its values (m,) of the sums."""
+        """The values (m,) as a function of the sums."""
 
     @property
     def vertices(self) -> list[int]:
-        """Numbers of the vertices that it names."""
+        """Numbers of the vertices that the measurement names."""
         return []
 
     @property
     def labels(self) -> list[str]:
-        """Of its values, for tables."""
+        """Labels of its values, for tables."""
         return [f"{self.name} {part}".strip() for part in self.parts]
 
 
 @dataclass
-class Places(Reading):
-    """Mean positions of probes (names), or positions of vertices (numbers): of each some axes."""
+class Positions(Reading):
+    """Mean positions of probes (by name) or positions of vertices (by number), each with some axes."""
 
     wanted: list[tuple[str | int, tuple[int, ...]]] = field(default_factory=list)
 
@@ -114,13 +114,13 @@ class Places(Reading):
 
 
 @dataclass
-class HangingAngle(Places):
-    """Angle [°] below the horizontal of the way from one probe to another."""
+class HangingAngle(Positions):
+    """Angle [°] below the horizontal of the line from one probe to another."""
 
     def values(self, total: Array) -> Array:
         edge, tip = self.means(total)
-        way = tip - edge
-        return np.array([math.degrees(math.atan2(-way[2], math.hypot(way[0], way[1])))])
+        chord = tip - edge
+        return np.array([math.degrees(math.atan2(-chord[2], math.hypot(chord[0], chord[1])))])
 
 
 @dataclass
@@ -152,7 +152,7 @@ class HandleForce(Reading):
         assert ledger is not None
         count = len(problem.scene.handles)
         force = ledger.handle_forces(count)[self.handle]
-        # the sum over the ranks already
+        # every rank has the total force
         return force / problem.points.comm.size
 
     def values(self, total: Array) -> Array:
@@ -167,7 +167,7 @@ class Instant:
     readings: tuple[Reading, ...]
 
     def values(self, problem: Problem, ledger: Ledger | None) -> Array:
-        """Their values; collective."""
+        """The values of all readings; collective."""
         sums = [reading.sums(problem, ledger) for reading in self.readings]
         total = np.concatenate(sums)
         problem.points.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
@@ -178,7 +178,7 @@ class Instant:
 
 
 def instants(readings: Sequence[Reading]) -> list[Instant]:
-    """The readings by time, ascending, in their order at each."""
+    """The readings grouped by ascending time."""
     times = sorted({reading.time for reading in readings})
     return [Instant(time, tuple(r for r in readings if r.time == time)) for time in times]
 
@@ -187,12 +187,12 @@ def instants(readings: Sequence[Reading]) -> list[Instant]:
 
 
 def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Reading]:
-    """What a scene's measurements say; reads their tables (one rank).
+    """The readings of the measurements of a scene; reads their tables. On one rank.
 
     Raises
     ------
     InputError
-        Probes, handles, times or columns that there are not.
+        For unknown probes, handles, times or columns.
     """
     found: list[Reading] = []
     for number, measurement in enumerate(measurements):
@@ -226,7 +226,7 @@ def _refuse_times(scene: Scene, readings: Sequence[Reading]) -> None:
 
 
 def readings_without_values(scene: Scene, quantity: Quantity) -> list[Reading]:
-    """A quantity that was not measured, at one time, or at those of its table (one rank).
+    """The readings of a quantity without measured values, at one time or those of its table. On one rank.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def readings_without_values(scene: Scene, quantity: Quantity) -> list[Reading]:
     if quantity.points is not None:
         found = _points(scene, _Table(quantity.points), "quantity", quantity.at, 1.0)
     else:
-        found = [_made(scene, quantity, "quantity", quantity.at or scene.time.end)]
+        found = [_make_reading(scene, quantity, "quantity", quantity.at or scene.time.end)]
     _refuse_times(scene, found)
     return found
 
@@ -246,7 +246,7 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
         table = _Table(measurement.points)
         return _points(scene, table, f"{key}.points", measurement.at, measurement.uncertainty)
     if measurement.table is None:
-        reading = _made(scene, measurement, key, measurement.at or scene.time.end)
+        reading = _make_reading(scene, measurement, key, measurement.at or scene.time.end)
         assert measurement.value is not None
         assert measurement.uncertainty is not None
         if len(measurement.value) != len(reading.parts):
@@ -260,7 +260,7 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
         reading.uncertainty = np.full(len(reading.parts), measurement.uncertainty)
         return [reading]
     table = _Table(measurement.table)
-    one = _made(scene, measurement, key, scene.time.end)
+    one = _make_reading(scene, measurement, key, scene.time.end)
     table.refuse_others("time", "uncertainty", *(AXES if measurement.axes else one.parts))
     times, *columns = (table.numbers(name) for name in ("time", *one.parts))
     sigmas = np.full(len(times), measurement.uncertainty)
@@ -268,21 +268,21 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
         sigmas = table.uncertainties()
     found = []
     for time, sigma, *values in zip(times.tolist(), sigmas, *columns, strict=True):
-        found.append(_made(scene, measurement, key, time))
+        found.append(_make_reading(scene, measurement, key, time))
         found[-1].measured, found[-1].uncertainty = np.array(values), np.full(len(values), sigma)
     return found
 
 
-def _made(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
+def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
     axes = tuple(AXES.index(axis) for axis in quantity.axes or AXES)
     names = tuple(AXES[axis] for axis in axes)
     if quantity.probe is not None:
-        _probe(scene, quantity.probe, f"{key}.probe")
-        return Places(key, quantity.probe, time, names, wanted=[(quantity.probe, axes)])
+        _check_probe(scene, quantity.probe, f"{key}.probe")
+        return Positions(key, quantity.probe, time, names, wanted=[(quantity.probe, axes)])
     if quantity.overhang is not None:
         overhang: Overhang = quantity.overhang
-        _probe(scene, overhang.edge, f"{key}.overhang.edge")
-        _probe(scene, overhang.tip, f"{key}.overhang.tip")
+        _check_probe(scene, overhang.edge, f"{key}.overhang.edge")
+        _check_probe(scene, overhang.tip, f"{key}.overhang.tip")
         wanted: list[tuple[str | int, tuple[int, ...]]] = [(overhang.edge, ()), (overhang.tip, ())]
         return HangingAngle(key, "overhang", time, ("degrees",), wanted=wanted)
     if quantity.drape is not None:
@@ -298,19 +298,19 @@ def _made(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
     return HandleForce(key, f"handle {quantity.force}", time, names, handle=quantity.force, axes=axes)
 
 
-def _probe(scene: Scene, name: str, key: str) -> None:
+def _check_probe(scene: Scene, name: str, key: str) -> None:
     if name not in scene.probes:
         hint = nearest(name, list(scene.probes)) if scene.probes else "the scene has no probes"
         raise InputError(f"unknown probe {name!r}, {hint}", file=scene.source, key=key)
 
 
 class _Table:
-    """A table with a heading, commas, semicolons or tabs between columns; what follows # is a comment.
+    """A table with a heading and columns separated by commas, semicolons or tabs; # starts a comment.
 
     Raises
     ------
     InputError
-        Without a heading or rows, or where a row has another number of columns.
+        If heading or rows are missing, or a row has a wrong number of columns.
     """
 
     def __init__(self, path: Path) -> None:
@@ -319,8 +319,8 @@ class _Table:
         kept = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
         if len(kept) < 2:
             raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)
-        if len(kept) - 1 > MOST_ROWS:
-            raise InputError(f"holds {len(kept) - 1} lines; thin it out to at most {MOST_ROWS}", file=path)
+        if len(kept) - 1 > MAX_ROWS:
+            raise InputError(f"holds {len(kept) - 1} lines; thin it out to at most {MAX_ROWS}", file=path)
         heading = kept[0][1]
         sign = next((sign for sign in ";\t" if sign in heading), ",")
         try:  # each line by itself: quotes do not reach beyond it
@@ -344,7 +344,7 @@ class _Table:
                 raise InputError(f"line {line} is line {first[tuple(row)]} again; leave it out", file=path)
 
     def refuse_others(self, *known: str) -> None:
-        """Refuse columns that are none of these.
+        """Refuse columns with other names.
 
         Raises
         ------
@@ -354,8 +354,8 @@ class _Table:
             if name not in known:
                 raise InputError(f"unknown column {name!r}, {nearest(name, known)}", file=self.path)
 
-    def words(self, name: str) -> list[str]:
-        """A column as it is written.
+    def texts(self, name: str) -> list[str]:
+        """A column of texts.
 
         Raises
         ------
@@ -375,21 +375,21 @@ class _Table:
         Raises
         ------
         InputError
-            If it is missing, or holds something else.
+            If it is missing, or contains other texts.
         """
-        words = self.words(name)
-        found = np.array([_number(word) for word in words])
-        self.refuse(~np.isfinite(found), lambda row: f"{name} must be a number, not {words[row]!r}")
+        texts = self.texts(name)
+        found = np.array([_number(text) for text in texts])
+        self.refuse(~np.isfinite(found), lambda row: f"{name} must be a number, not {texts[row]!r}")
         return found
 
     def uncertainties(self) -> Array:
-        """The column of that name, whose numbers must be positive."""
+        """The column ``uncertainty``, which must be positive."""
         found = self.numbers("uncertainty")
         self.refuse(~(found > 0.0), lambda row: f"uncertainty must be > 0, not {found[row]:g}")
         return found
 
     def refuse(self, wrong: Mask, why: Callable[[int], str]) -> None:
-        """Refuse the first row of these, if there is one.
+        """Refuse the first of the rows in a mask, if there is one.
 
         Raises
         ------
@@ -399,9 +399,9 @@ class _Table:
             raise InputError(f"line {self.lines[row]}: {why(row)}", file=self.path)
 
 
-def _number(word: str) -> float:
+def _number(text: str) -> float:
     try:
-        return float(word)
+        return float(text)
     except ValueError:
         return math.nan
 
@@ -414,18 +414,18 @@ def _points(
     if not names:
         raise InputError("has none of the columns x, y, z", file=table.path)
     columns = np.column_stack([table.numbers(name) for name in names])
-    whats: list[str | int] = []
+    points: list[str | int] = []
     if "vertex" in table.names and "probe" in table.names:
         raise InputError("has columns 'vertex' and 'probe'; leave one out", file=table.path)
     if "vertex" in table.names:
         numbers = table.numbers("vertex")
         whole = np.rint(numbers)
         table.refuse(numbers != whole, lambda row: f"vertex must be a whole number, not {numbers[row]:g}")
-        whats += whole.astype(int).tolist()
+        points += whole.astype(int).tolist()
     elif "probe" in table.names:
-        for name in table.words("probe"):
-            _probe(scene, name, key)
-            whats.append(name)
+        for name in table.texts("probe"):
+            _check_probe(scene, name, key)
+            points.append(name)
     else:
         raise InputError(
             f"has neither a column 'vertex' nor 'probe'; its columns are {', '.join(table.names)}",
@@ -435,10 +435,10 @@ def _points(
     if "uncertainty" in table.names:
         sigmas = table.uncertainties()
     elif uncertainty is not None:
-        sigmas = np.full(len(whats), uncertainty)
+        sigmas = np.full(len(points), uncertainty)
     else:
         raise InputError("has no column 'uncertainty'; add it, or give uncertainty", file=table.path, key=key)
-    times = np.full(len(whats), at or scene.time.end)
+    times = np.full(len(points), at or scene.time.end)
     if "time" in table.names:
         if at is not None:
             raise InputError("has a column time; leave at out", file=table.path, key=key)
@@ -447,8 +447,8 @@ def _points(
     axes = tuple(AXES.index(name) for name in names)
     for time in sorted(set(times.tolist())):
         rows = np.flatnonzero(times == time)
-        parts = tuple(f"{whats[row]} {name}" for row in rows for name in names)
-        place = Places(key, table.path.stem, time, parts, wanted=[(whats[row], axes) for row in rows])
+        parts = tuple(f"{points[row]} {name}" for row in rows for name in names)
+        place = Positions(key, table.path.stem, time, parts, wanted=[(points[row], axes) for row in rows])
         place.measured, place.uncertainty = columns[rows].ravel(), np.repeat(sigmas[rows], len(names))
         found.append(place)
     return found

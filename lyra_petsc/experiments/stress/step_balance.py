@@ -75,7 +75,7 @@ def energy(terms: Terms, x: Array) -> float:
     return sum(float(term.energies(x, frozen).sum()) for term, frozen in terms.items())
 
 
-def work_of_forces(
+def force_work(
     comm: MPI.Comm, n: int, terms: Terms, start_frames: Terms, x0: Array, dx: Array, tolerance: float
 ) -> tuple[float, bool]:
     """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether energy differences replace a part of it; collective.
@@ -195,7 +195,7 @@ class StepBalance:
     momentum_tolerance: float
     angular: float = 0.0
     angular_tolerance: float = 0.0
-    hinges_jumped: bool = False
+    jumped: bool = False
 
     @property
     def energy_exchanged(self) -> float:
@@ -314,9 +314,7 @@ class BalanceRecorder:
         # positions are rounded: x' − x equals Δt v' only to the last digit of x
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
-        along, hinges_jumped = work_of_forces(
-            comm, n, self._sheet, self._start_frames, x0, dx, 0.1 * tolerance
-        )
+        along, jumped = force_work(comm, n, self._sheet, self._start_frames, x0, dx, 0.1 * tolerance)
         bracket = along - inner
         change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
         work = outer + turn
@@ -332,7 +330,7 @@ class BalanceRecorder:
             work=work,
             defect=defect,
             tolerance=tolerance,
-            hinges_jumped=hinges_jumped,
+            jumped=jumped,
             **left,
             **self._momentum_defects(defects, damped_defects, dt, unsolved, forces, reach),
         )
@@ -440,8 +438,8 @@ class BalanceRecorder:
         return {
             "momentum": float(np.abs(sums[:3]).max()),
             "momentum_tolerance": float(linear),
-            "spin": float(np.abs(sums[3:]).max()),
-            "spin_tolerance": float(angular),
+            "angular": float(np.abs(sums[3:]).max()),
+            "angular_tolerance": float(angular),
         }
 
 
@@ -477,9 +475,7 @@ class StageBalanceRecorder(BalanceRecorder):
         left = self._residual_norms(parts, reach, dt)
         unsolved = (left["residual"] + left["floor"]) * math.sqrt(system.points.n_global)
         tolerance = EPSILON * (noise + forces * reach) + left["floor"] * math.sqrt(all_dx)
-        along, hinges_jumped = work_of_forces(
-            comm, n, self._sheet, self._start_frames, x0, x1 - x0, 0.1 * tolerance
-        )
+        along, jumped = force_work(comm, n, self._sheet, self._start_frames, x0, x1 - x0, 0.1 * tolerance)
         return StepBalance(
             change=change,
             bracket=along,
@@ -487,7 +483,7 @@ class StageBalanceRecorder(BalanceRecorder):
             tolerance=tolerance,
             momentum=dt * max(map(abs, sums)),
             momentum_tolerance=dt * (unsolved + EPSILON * forces),
-            hinges_jumped=hinges_jumped,
+            jumped=jumped,
             **left,
         )
 
@@ -615,10 +611,10 @@ SMALL_DISSIPATION = 0.05
 MAX_DISSIPATION = 0.5
 """The same ratio beyond which a run fails if its steps have no other balance (semi-implicit)."""
 
-MAX_NEWTON_MEDIAN, MAX_NEWTON = 10, 30
+NEWTON_MEDIAN, NEWTON_MAX = 10, 30
 """Allowed Newton iterations per step of a stiff sheet, median and maximum."""
 
-MAX_TIME_RATIO = 5.0
+MAX_RATIO = 5.0
 """Allowed median time per step of a stiff sheet over that of the base scene."""
 
 
@@ -626,26 +622,26 @@ def judge_convergence(record: RunRecord) -> Verdict:
     """Whether every step was solved and the end was reached."""
     if record.stop_reason:
         return Verdict(False, f"{len(record.reports)} steps, then: {record.stop_reason}")
-    message = f"all {len(record.reports)} steps"
+    text = f"all {len(record.reports)} steps"
     if record.rejected:
         smallest = short(record.smallest_step)
-        message += (
+        text += (
             f", {record.rejected} attempts rejected, smallest Δt {smallest} s of {short(record.nominal)} s"
         )
-    return Verdict(bool(record.reports), message)
+    return Verdict(bool(record.reports), text)
 
 
 def judge_equations(record: RunRecord) -> Verdict:
     """Whether the residual, computed again, is as small as the solver promised in every step."""
-    number, worst = _worst_step(record, lambda b: ratio_to(b.residual, b.promised + b.floor))
+    number, worst = _worst_step(record, lambda b: ratio(b.residual, b.promised + b.floor))
     at_floor = sum(balance.promised <= balance.floor for balance in record.balances)
-    message = (
+    text = (
         f"worst in step {number}: {short(worst.residual)} N left on the free vertices, "
         f"{short(worst.promised)} N promised"
     )
     if at_floor:
-        message += f"; in {at_floor} steps that is the floor of round-off"
-    return Verdict(worst.residual <= worst.promised + worst.floor, message)
+        text += f"; in {at_floor} steps that is the floor of round-off"
+    return Verdict(worst.residual <= worst.promised + worst.floor, text)
 
 
 def judge_resolution(record: RunRecord) -> Verdict:
@@ -654,20 +650,20 @@ def judge_resolution(record: RunRecord) -> Verdict:
     At the round-off floor the residual of stiff forces may be as large as the weight without any effect.
     """
     steps = zip(record.balances, record.reports, strict=True)
-    by_force = [ratio_to(balance.residual, NEGLIGIBLE * balance.driving) for balance in record.balances]
-    by_displacement = [ratio_to(report.left, NEGLIGIBLE * balance.displacement) for balance, report in steps]
+    by_force = [ratio(balance.residual, NEGLIGIBLE * balance.driving) for balance in record.balances]
+    by_displacement = [ratio(report.left, NEGLIGIBLE * balance.displacement) for balance, report in steps]
     number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_displacement[i]))
     worst, last = record.balances[number], record.reports[number].left
-    message = (
+    text = (
         f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
     )
     if worst.promised <= worst.floor:
-        message += "; round-off at this stiffness allows no better"
+        text += "; round-off at this stiffness allows no better"
     if by_displacement[number] < by_force[number]:
-        message += (
+        text += (
             f"; they still move it by {short(last)} m, and the step's forces by {short(worst.displacement)} m"
         )
-    return Verdict(min(by_force[number], by_displacement[number]) <= 1.0, message)
+    return Verdict(min(by_force[number], by_displacement[number]) <= 1.0, text)
 
 
 def judge_energy(record: RunRecord) -> Verdict:
@@ -675,18 +671,18 @@ def judge_energy(record: RunRecord) -> Verdict:
 
     For other integrators: whether the work of elastic forces equals the change of their energy.
     """
-    number, worst = _worst_step(record, lambda b: ratio_to(abs(b.defect), b.tolerance))
-    message = (
+    number, worst = _worst_step(record, lambda b: ratio(abs(b.defect), b.tolerance))
+    text = (
         f"worst in step {number}: off by {short(abs(worst.defect))} J, tolerance {short(worst.tolerance)} J, "
         f"{short(worst.energy_exchanged)} J turned over"
     )
-    hinges_jumped = sum(balance.hinges_jumped for balance in record.balances)
-    if hinges_jumped:
-        message += (
-            f"; in {hinges_jumped} steps hinges turned too far or jumped, or contact came from too far, and "
+    jumped = sum(balance.jumped for balance in record.balances)
+    if jumped:
+        text += (
+            f"; in {jumped} steps hinges turned too far or jumped, or contact came from too far, and "
             "count by their energies"
         )
-    return Verdict(abs(worst.defect) <= worst.tolerance, message)
+    return Verdict(abs(worst.defect) <= worst.tolerance, text)
 
 
 def judge_gain(record: RunRecord) -> Verdict:
@@ -700,13 +696,11 @@ def judge_gain(record: RunRecord) -> Verdict:
     about_gain = f"; in {with_gain} steps buckling could feed energy in" if with_gain else ""
     if not steps:
         return Verdict(True, f"not to be judged{about_gain}")
-    number, worst = max(steps, key=lambda step: ratio_to(_gain(step[1]), step[1].tolerance))
+    number, worst = max(steps, key=lambda step: ratio(_gain(step[1]), step[1].tolerance))
     gain = _gain(worst)
     if gain > worst.tolerance:
-        message = (
-            f"step {number} gained {short(gain)} J beyond the work, tolerance {short(worst.tolerance)} J"
-        )
-        return Verdict(False, message + about_gain)
+        text = f"step {number} gained {short(gain)} J beyond the work, tolerance {short(worst.tolerance)} J"
+        return Verdict(False, text + about_gain)
     negative = [n for n, b in enumerate(record.balances, 1) if -b.viscous > b.tolerance]
     if negative:
         return Verdict(False, f"damping fed energy into step {negative[0]}{about_gain}")
@@ -717,32 +711,30 @@ def judge_run(record: RunRecord) -> Verdict:
     """Whether the whole run gains no energy and, if semi-implicit, does not lose most of it."""
     gained, dissipation = (float(record.balance[f"numerical_{what}"]) for what in ("gain", "dissipation"))
     net = gained - dissipation
-    message = (
+    text = (
         f"{100.0 * dissipation:.2g} % of the largest energy at work lost to the integrator, "
         f"{100.0 * gained:.2g} % made by it"
     )
     if record.balance["repeated"]:
-        message += f", {record.balance['repeated']} attempts repeated for it"
+        text += f", {record.balance['repeated']} attempts repeated for it"
     good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or dissipation <= MAX_DISSIPATION)
     if good and dissipation > SMALL_DISSIPATION:
-        message += "; solved, but a smaller Δt moves otherwise"
-    return Verdict(good, message)
+        text += "; solved, but a smaller Δt moves otherwise"
+    return Verdict(good, text)
 
 
 def judge_momentum(record: RunRecord) -> Verdict:
     """Whether linear and angular momentum change by external forces only: internal forces sum to zero."""
-    at, line = _worst_step(record, lambda b: ratio_to(b.momentum, b.momentum_tolerance))
-    turn_at, turn = _worst_step(record, lambda b: ratio_to(b.angular, b.angular_tolerance))
-    message = (
-        f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
-    )
+    at, line = _worst_step(record, lambda b: ratio(b.momentum, b.momentum_tolerance))
+    turn_at, turn = _worst_step(record, lambda b: ratio(b.angular, b.angular_tolerance))
+    text = f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
     if turn.angular_tolerance:
-        message += (
+        text += (
             f"; angular in step {turn_at}: {short(turn.angular)} N m s, "
             f"tolerance {short(turn.angular_tolerance)} N m s"
         )
     good = line.momentum <= line.momentum_tolerance and turn.angular <= turn.angular_tolerance
-    return Verdict(good, message)
+    return Verdict(good, text)
 
 
 def judge_softening(record: RunRecord) -> Verdict:
@@ -751,10 +743,10 @@ def judge_softening(record: RunRecord) -> Verdict:
     if not smallest < SOFTENS_BELOW:
         return Verdict(True, f"no triangle below {SOFTENS_BELOW:.3f} of its length")
     notes = [note for note in record.notes if "St. Venant-Kirchhoff model softens" in note]
-    message = f"down to {short(smallest)} of its length, " + (
+    text = f"down to {short(smallest)} of its length, " + (
         "which is said" if notes else "and NOTHING was said"
     )
-    return Verdict(bool(notes), message)
+    return Verdict(bool(notes), text)
 
 
 def judge_speed(record: RunRecord, wall_ratio: float, cpu_ratio: float) -> Verdict:
@@ -764,15 +756,13 @@ def judge_speed(record: RunRecord, wall_ratio: float, cpu_ratio: float) -> Verdi
     times mean little on a machine with other load.
     """
     median, worst = record.median_newton, max(record.newton, default=0)
-    good = (
-        median <= MAX_NEWTON_MEDIAN and worst <= MAX_NEWTON and min(wall_ratio, cpu_ratio) <= MAX_TIME_RATIO
-    )
-    message = (
+    good = median <= NEWTON_MEDIAN and worst <= NEWTON_MAX and min(wall_ratio, cpu_ratio) <= MAX_RATIO
+    text = (
         f"Newton iterations {short(median)} in the median and {worst} at worst "
-        f"({MAX_NEWTON_MEDIAN} and {MAX_NEWTON} allowed), {short(wall_ratio)} times the base's wall time, "
-        f"{short(cpu_ratio)} times its CPU time ({MAX_TIME_RATIO:g} allowed)"
+        f"({NEWTON_MEDIAN} and {NEWTON_MAX} allowed), {short(wall_ratio)} times the base's wall time, "
+        f"{short(cpu_ratio)} times its CPU time ({MAX_RATIO:g} allowed)"
     )
-    return Verdict(good and not record.stop_reason, message)
+    return Verdict(good and not record.stop_reason, text)
 
 
 def judge_physics(record: RunRecord) -> dict[str, Verdict]:
@@ -798,7 +788,7 @@ def _gain(balance: StepBalance) -> float:
     return balance.change - balance.work
 
 
-def ratio_to(amount: float, tolerance: float) -> float:
+def ratio(amount: float, tolerance: float) -> float:
     """The amount over its tolerance; infinite if one of them is NaN."""
     if math.isnan(amount) or math.isnan(tolerance):
         return math.inf

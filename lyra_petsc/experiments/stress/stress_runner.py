@@ -24,15 +24,9 @@ from lyra_petsc.experiments.stress.step_balance import (
     StageBalanceRecorder,
     judge_physics,
     judge_speed,
-    ratio_to,
+    ratio,
 )
-from lyra_petsc.experiments.stress.stress_scenes import (
-    NotApplicable,
-    Scope,
-    Setting,
-    StressCase,
-    base_scene,
-)
+from lyra_petsc.experiments.stress.stress_scenes import NotApplicable, Scope, Setting, StressCase, base_scene
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
 from lyra_petsc.show.report.plots import Series, over_time, surface
@@ -278,10 +272,9 @@ def csv_row(outcome: StressOutcome) -> dict[str, Any]:
     """The row of a case in the CSV file; energies in J, times in s, NaN where a value is missing."""
     record = outcome.record
     balances = record.balances
-    worst = max(balances, key=lambda b: ratio_to(abs(b.defect), b.tolerance), default=None)
+    worst = max(balances, key=lambda b: ratio(abs(b.defect), b.tolerance), default=None)
     momenta = [
-        (ratio_to(b.momentum, b.momentum_tolerance), ratio_to(b.angular, b.angular_tolerance))
-        for b in balances
+        (ratio(b.momentum, b.momentum_tolerance), ratio(b.angular, b.angular_tolerance)) for b in balances
     ]
     nan = math.nan
     return {
@@ -298,7 +291,7 @@ def csv_row(outcome: StressOutcome) -> dict[str, Any]:
         "newton_median": record.median_newton,
         "newton_worst": max(record.newton, default=0),
         "linear_iterations": record.linear,
-        "residual_over_promised": max((ratio_to(b.residual, b.promised) for b in balances), default=nan),
+        "residual_over_promised": max((ratio(b.residual, b.promised) for b in balances), default=nan),
         "energy_defect": abs(worst.defect) if worst else nan,
         "energy_tolerance": worst.tolerance if worst else nan,
         "energy_turned_over": worst.energy_exchanged if worst else nan,

@@ -1,9 +1,9 @@
-"""Errors of a run against a reference at the sample times, slab by slab: no rank holds a whole state.
+"""Errors of a run against a reference at the sample times.
 
-Between meshes of the same sheets rest shapes are compared, sheet by sheet: each point goes to the nearest
-triangle of its sheet and gets the barycentric weights of the nearest place in it. On flat sheets that is
-linear interpolation in material coordinates; where a curved outline or surface is cut into different
-triangles the points are projected onto the nearest.
+Each rank compares a slab of vertices, so that no rank holds a whole state. Between different meshes of the
+same sheets each vertex gets the barycentric coordinates of the closest point of its sheet in the other mesh's
+rest shape. On flat sheets this is linear interpolation in material coordinates; where two meshes approximate
+a curved outline or surface differently, vertices are projected onto the closest triangle.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
 SAME_TIME = 1e-6
-"""Fraction of the time between samples by which a state may miss a sample time."""
+"""Fraction of the time between samples by which the time of a state may differ from a sample time."""
 
 ROWS_AT_ONCE = 1 << 16
-"""Rows of a file that a rank reads at a time."""
+"""Rows of a file that a rank reads at once."""
 
 
 @dataclass
@@ -47,7 +47,7 @@ class RestSurface:
         [m].
     triangles : (F, 3) int64
     areas : (V,) float64
-        Rest area of each vertex [m²]: a third of that of its triangles.
+        Rest area of each vertex [m²]: a third of the area of its triangles.
     """
 
     rest: Array
@@ -68,7 +68,7 @@ class RestSurface:
 
 @dataclass
 class Samples:
-    """A run at the sample times; the same on all ranks.
+    """Data of a run at the sample times; the same on all ranks.
 
     Attributes
     ----------
@@ -79,15 +79,15 @@ class Samples:
         File and dataset of the positions at each time.
     n_vertices : int
     size : float
-        Diagonal [m] of the rest shape's bounding box.
+        Diagonal [m] of the bounding box of the rest shape.
     energies : (T, 4) float64
-        Kinetic, membrane, bending, potential [J] at each time.
+        Kinetic, membrane, bending and potential energy [J] at each time.
     exchanged : float
-        Largest change [J] of any of them since the start, over all steps.
+        Largest change [J] of any of these energies since the start, over all steps.
     probes : dict of name → (T, 3) float64
-        [m].
+        Positions of probes [m].
     sheets : sequence of int
-        Vertices of each mesh source; needed between different meshes.
+        Number of vertices of each mesh source; needed for runs on different meshes.
     """
 
     folder: Path
@@ -121,28 +121,28 @@ class Samples:
             with open_stored(self.folder / file) as opened:
                 stored = opened[dataset]
                 if wanted is not None:
-                    return _picked(stored, wanted)
+                    return _read_rows(stored, wanted)
                 return stored[slice(*slab(comm, self.n_vertices))]
 
         return on_each(comm, read)
 
 
 def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:
-    """First row and the row after the last of a rank's share of n rows; this one's unless told."""
+    """First row and the row after the last of a rank's share of n rows; by default of this rank."""
     rank = comm.rank if rank is None else rank
     return rank * n // comm.size, (rank + 1) * n // comm.size
 
 
 def scatter(comm: MPI.Comm, rows: NDArray[Any] | None) -> NDArray[Any]:
-    """This rank's slab of rows (n, …) that rank 0 has; collective."""
+    """Distribute rows (n, …) of rank 0; returns this rank's slab; collective."""
     pieces: list[NDArray[Any]] = []
     if rows is not None:
         pieces = [rows[slice(*slab(comm, len(rows), rank))] for rank in range(comm.size)]
     return np.asarray(comm.scatter(pieces, root=0))
 
 
-def _picked(stored: Any, wanted: Ints) -> Array:
-    """Rows of a dataset, read in pieces so that a rank never holds all of it."""
+def _read_rows(stored: Any, wanted: Ints) -> Array:
+    """Some rows of a dataset, read in pieces so that a rank never holds all of it."""
     out = np.empty((len(wanted), 3))
     for start in range(0, stored.shape[0], ROWS_AT_ONCE):
         first, last = np.searchsorted(wanted, [start, start + ROWS_AT_ONCE])
@@ -153,7 +153,7 @@ def _picked(stored: Any, wanted: Ints) -> Array:
 
 
 def read_surface(folder: Path) -> RestSurface:
-    """The mesh of a run. For rank 0.
+    """Read the rest shape of a run. For rank 0.
 
     Raises
     ------
@@ -171,28 +171,28 @@ def read_surface(folder: Path) -> RestSurface:
 def read_samples(
     comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()
 ) -> Samples:
-    """What a run left at the sample times; collective.
+    """Read the data of a run at the sample times; collective.
 
     Parameters
     ----------
     folder : Path
     times : sequence of float
-        [s].
+        Sample times [s].
     spacing : float
-        Time between samples [s]; states within 1e-6 of it count.
+        Time between samples [s]; times of states may differ by 1e-6 of it.
     sheets : sequence of int
-        Vertices of each mesh source, if it may be compared with another mesh.
+        Number of vertices of each mesh source; needed for comparison with another mesh.
 
     Raises
     ------
     InputError
         On every rank, if a state, the mesh or the history is missing.
     """
-    return on_root(comm, lambda: read_here(folder, times, spacing, sheets))
+    return on_root(comm, lambda: read_local(folder, times, spacing, sheets))
 
 
-def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
-    """As ``read_samples``, on one rank and for it alone."""
+def read_local(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
+    """As ``read_samples``, on one rank only."""
     if folder.is_dir():
         check_folder(folder)
     states = stored_states(folder) if folder.is_dir() else []
@@ -226,7 +226,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequ
 
 
 def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
-    """A table's columns, and the rows nearest to the sample times."""
+    """The columns of a table, and the rows nearest to the sample times."""
     columns = read_table(path)
     if not len(columns["time"]):
         raise InputError("has no rows", file=path)
@@ -234,20 +234,21 @@ def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
 
 
 CANDIDATES = 12
-"""Triangles with the nearest centroids among which the nearest triangle is looked for."""
+"""Number of triangles with the nearest centroids among which the closest triangle is searched."""
 
 
 @dataclass
-class Transfer:
-    """This rank's part: corners and weights for its slab of points.
+class Interpolation:
+    """Interpolation from another mesh at this rank's slab of points.
 
     Attributes
     ----------
     wanted : (m,) int64
         Vertices of the other mesh that this rank reads, ascending.
     corner : (n, 3) int64
-        Numbers in ``wanted``.
+        Corners of the triangle of each point, as indices into ``wanted``.
     weight : (n, 3) float64
+        Barycentric coordinates.
     """
 
     wanted: Ints
@@ -260,21 +261,21 @@ class Transfer:
         return np.einsum("nc,nci->ni", self.weight, found[self.corner])
 
 
-def make_transfer(
+def make_interpolation(
     comm: MPI.Comm,
     points: RestSurface | None,
     point_sheets: Sequence[int],
     other: RestSurface | None,
     other_sheets: Sequence[int],
-) -> Transfer:
-    """Plan the way from ``other`` to the vertices of ``points``; collective, set up on rank 0.
+) -> Interpolation:
+    """Make the interpolation from ``other`` to the vertices of ``points``; collective, computed on rank 0.
 
     Parameters
     ----------
     points, other : RestSurface
         Needed on rank 0 only.
     point_sheets, other_sheets : sequence of int
-        Vertices of each sheet, which are numbered consecutively.
+        Number of vertices of each sheet; the vertices of a sheet are numbered consecutively.
     """
 
     def locate() -> tuple[Ints, Array]:
@@ -286,33 +287,33 @@ def make_transfer(
         for sheet in range(len(point_sheets)):
             mine = slice(ends[sheet], ends[sheet + 1])
             first = other.triangles[:, 0]
-            inside = (first >= others[sheet]) & (first < others[sheet + 1])
-            corner[mine], weight[mine] = _nearest(points.rest[mine], other.rest, other.triangles[inside])
+            triangles = other.triangles[(first >= others[sheet]) & (first < others[sheet + 1])]
+            corner[mine], weight[mine] = _nearest_triangles(points.rest[mine], other.rest, triangles)
         return corner, weight
 
     corner, weight = (scatter(comm, rows) for rows in on_root(comm, locate, share=False) or (None, None))
     wanted, inverse = np.unique(corner, return_inverse=True)
-    return Transfer(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
+    return Interpolation(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
 
 
-def _nearest(places: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
+def _nearest_triangles(points: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
     from scipy.spatial import cKDTree
 
     corners = vertices[triangles]
     count = min(CANDIDATES, len(triangles))
-    _, found = cKDTree(corners.mean(axis=1)).query(places, k=count)
+    _, found = cKDTree(corners.mean(axis=1)).query(points, k=count)
     near = np.asarray(found).ravel()
-    points = np.repeat(places, count, axis=0)
-    weights = barycentric(points, corners[near])
-    distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[near]) - points, axis=1)
-    best = distance.reshape(-1, count).argmin(axis=1) + count * np.arange(len(places))
+    repeated = np.repeat(points, count, axis=0)
+    weights = barycentric(repeated, corners[near])
+    distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[near]) - repeated, axis=1)
+    best = distance.reshape(-1, count).argmin(axis=1) + count * np.arange(len(points))
     return triangles[near[best]], weights[best]
 
 
-def barycentric(places: Array, corners: Array) -> Array:
-    """Weights (n, 3) of the nearest place in each triangle; ``corners`` is (n, 3, 3), ``places`` (n, 3)."""
+def barycentric(points: Array, corners: Array) -> Array:
+    """Barycentric coordinates (n, 3) of the closest points of triangles (n, 3, 3) to points (n, 3)."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    u, v, w = b - a, c - a, places - a
+    u, v, w = b - a, c - a, points - a
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
     wu, wv = _dot(w, u), _dot(w, v)
     area = uu * vv - uv * uv
@@ -320,15 +321,15 @@ def barycentric(places: Array, corners: Array) -> Array:
     weights: Array = np.stack([1.0 - s - t, s, t], axis=1)
     outside = (weights < 0.0).any(axis=1)
     if outside.any():
-        weights[outside] = _on_sides(places[outside], corners[outside])
+        weights[outside] = _nearest_on_sides(points[outside], corners[outside])
     return weights
 
 
-def _on_sides(places: Array, corners: Array) -> Array:
-    """Weights of the nearest place on the three sides."""
-    sides, ways = np.roll(corners, -1, axis=1) - corners, places[:, None] - corners
-    along = np.clip(_dot(ways, sides) / _dot(sides, sides), 0.0, 1.0)
-    side = np.linalg.norm(along[:, :, None] * sides - ways, axis=2).argmin(axis=1)
+def _nearest_on_sides(points: Array, corners: Array) -> Array:
+    """Barycentric coordinates of the closest points on the three sides."""
+    sides, offsets = np.roll(corners, -1, axis=1) - corners, points[:, None] - corners
+    along = np.clip(_dot(offsets, sides) / _dot(sides, sides), 0.0, 1.0)
+    side = np.linalg.norm(along[:, :, None] * sides - offsets, axis=2).argmin(axis=1)
     rows, weights = np.arange(len(side)), np.zeros((len(side), 3))
     weights[rows, side], weights[rows, (side + 1) % 3] = 1.0 - along[rows, side], along[rows, side]
     return weights
@@ -339,16 +340,16 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 Errors = dict[str, float]
-"""By the name of the quantity; relative, see ``quantities``. NaN where nothing can be told."""
+"""Relative errors by the name of the quantity; NaN where an error is unknown."""
 
 History = dict[str, Array]
-"""Errors at each sample after the start, by the name of the quantity."""
+"""Relative errors at each sample after the start, by the name of the quantity."""
 
 Rows = Callable[[int], Array]
 """Positions (n, 3) [m] of this rank's points at a sample."""
 
 
-def against_motion(
+def motion_errors(
     comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[Quantity]
 ) -> Errors:
     """Errors of a run against an exact motion; collective."""
@@ -363,12 +364,12 @@ def against_motion(
 
     def positions() -> History:
         surface = on_root(comm, lambda: read_surface(samples.folder), share=False)
-        return _positions(comm, samples, lambda i: motion.positions(start, times[i]), surface, samples.size)
+        return _distances(comm, samples, lambda i: motion.positions(start, times[i]), surface, samples.size)
 
     return overall(_errors(samples, whole, quantities, positions))
 
 
-def against_run(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
+def run_errors(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
     """Errors of a run against another, over all samples; collective."""
     return overall(history_against_run(comm, mine, other, quantities))
 
@@ -378,16 +379,16 @@ def history_against_run(
 ) -> History:
     """Errors of a run against another at each sample; collective.
 
-    On different meshes the finer solution is interpolated at the rest places of the coarser one's
+    On different meshes the finer solution is interpolated at the rest positions of the coarser mesh's
     vertices.
     """
-    return _errors(mine, other, quantities, lambda: _between(comm, mine, other))
+    return _errors(mine, other, quantities, lambda: _errors_between(comm, mine, other))
 
 
 def _errors(
     mine: Samples, other: Samples, quantities: Sequence[Quantity], positions: Callable[[], History]
 ) -> History:
-    """The quantities in their order; empty where nothing can be told."""
+    """Errors of the quantities in their order; empty where they are unknown."""
     found: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
         found |= positions()
@@ -397,13 +398,13 @@ def _errors(
     for quantity in quantities:
         name = quantity.probe
         if name in mine.probes and name in other.probes:
-            way = mine.probes[name] - other.probes[name]
-            found[quantity.name] = np.asarray(np.linalg.norm(way, axis=1) / other.size)
+            error = mine.probes[name] - other.probes[name]
+            found[quantity.name] = np.asarray(np.linalg.norm(error, axis=1) / other.size)
     return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
 
 
 def overall(history: History) -> Errors:
-    """The error over all samples: the root mean square of the L2 norms, of all others the largest."""
+    """The error over all samples: root mean square of L2 norms, maximum of other quantities."""
     found = dict.fromkeys(history, math.nan)
     for name, errors in history.items():
         if len(errors):
@@ -412,27 +413,27 @@ def overall(history: History) -> Errors:
     return found
 
 
-def _between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
+def _errors_between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
     coarse, fine = (reference, run) if run.n_vertices > reference.n_vertices else (run, reference)
     found = on_root(comm, lambda: [read_surface(each.folder) for each in (coarse, fine)], share=False)
-    at, beyond = found or (None, None)
-    same = comm.bcast(at is not None and beyond is not None and at.same_as(beyond), root=0)
-    there: Rows = partial(fine.rows, comm)
+    points, other = found or (None, None)
+    same = comm.bcast(points is not None and other is not None and points.same_as(other), root=0)
+    rows: Rows = partial(fine.rows, comm)
     if not same:
-        there = partial(make_transfer(comm, at, coarse.sheets, beyond, fine.sheets).rows, comm, fine)
-    return _positions(comm, coarse, there, at, reference.size)
+        rows = partial(make_interpolation(comm, points, coarse.sheets, other, fine.sheets).rows, comm, fine)
+    return _distances(comm, coarse, rows, points, reference.size)
 
 
-def _positions(
-    comm: MPI.Comm, samples: Samples, there: Rows, surface: RestSurface | None, size: float
+def _distances(
+    comm: MPI.Comm, samples: Samples, exact: Rows, surface: RestSurface | None, size: float
 ) -> History:
-    """Largest and area-weighted L2 error over space, at each sample after the start; surface on rank 0."""
+    """Largest and area-weighted L2 error at each sample after the start; ``surface`` is on rank 0."""
     areas = scatter(comm, None if surface is None else surface.areas)
     whole = comm.allreduce(float(areas.sum()))
     count = len(samples.times) - 1
     largest, squares = np.empty(count), np.empty(count)
     for i in range(count):
-        distance = np.linalg.norm(samples.rows(comm, i + 1) - there(i + 1), axis=1)
+        distance = np.linalg.norm(samples.rows(comm, i + 1) - exact(i + 1), axis=1)
         largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
         squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
     return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}

@@ -1,7 +1,7 @@
-"""A study's request, folder, and inputs and results of cases, kept as files so that it can be resumed.
+"""Runs of a study: their input and result files, by which a study can be resumed, and how they are timed.
 
-A case runs in this communicator, or with ``--ranks P`` in an mpirun of its own: states come from the first
-repeat, the wall time from all.
+A case runs on the present communicator, or with ``--ranks P`` in an mpirun of its own. Its states are written
+by the first repeat; wall times come from all repeats.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from lyra_petsc.scene.schema import Scene
 RESULT_FILE = "result.json"
 
 PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
-"""Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
+"""Timed phases of a run; ``balance`` is the energy balance; writing files is not timed."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run to make.
+    """The input of one run.
 
     Attributes
     ----------
     scene : str
         Path of the scene file.
     overrides : tuple of str
-        All that ``--set`` would say.
+        All ``--set`` arguments.
     folder : str
-        Where its states and its result go.
+        Folder of its states and its result.
     repeats : int
         How often it is timed; the first repeat writes the states.
     fingerprint : str
-        Of everything the result depends on.
+        Digest of everything that the result depends on.
     trust_mesh : bool
-        Give gmsh the scene's scripts whatever they say.
+        Pass the scripts of the scene to gmsh unchecked.
     """
 
     scene: str
@@ -65,7 +65,7 @@ class Job:
 
 @dataclass
 class Timing:
-    """Wall seconds of one repeat, the slowest rank's.
+    """Wall times [s] of one repeat, maxima over the ranks.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Timing:
     run : float
         All steps, without output.
     phases : dict of str to float
-        By phase; ``files`` is the writing of states.
+        Time per phase; ``files`` is the writing of states.
     """
 
     set_up: float
@@ -90,7 +90,7 @@ class Result:
     ----------
     fingerprint : str
     problem : str
-        Why it failed, in words; empty if it did not.
+        Why it failed; empty if it did not.
     ranks : int
     integrator : str
     vertices, triangles : int
@@ -133,28 +133,28 @@ class Result:
         return self.end / self.steps if self.steps else 0.0
 
     def fail(self, problem: str) -> None:
-        """It has not ended as it should: no time of it counts."""
+        """Mark the run as failed and discard its times."""
         self.problem, self.timings = problem, []
 
     @property
     def run_seconds(self) -> list[float]:
-        """Of each repeat: the steps alone."""
+        """Time of the steps, for each repeat."""
         return [timing.run for timing in self.timings]
 
     @property
     def total_seconds(self) -> list[float]:
-        """Of each repeat: set-up and steps."""
+        """Time of set-up and steps, for each repeat."""
         return [timing.set_up + timing.run for timing in self.timings]
 
     @property
     def phase_seconds(self) -> dict[str, float]:
-        """Median of each phase over the repeats; empty without any."""
-        of = {name: [timing.phases.get(name, 0.0) for timing in self.timings] for name in PHASES}
-        return {name: statistics.median(times) for name, times in of.items() if times}
+        """Median over the repeats for each phase; empty without repeats."""
+        by_phase = {name: [timing.phases.get(name, 0.0) for timing in self.timings] for name in PHASES}
+        return {name: statistics.median(times) for name, times in by_phase.items() if times}
 
 
 def read_result(folder: Path, fingerprint: str) -> Result | None:
-    """The result of a finished case, or None if there is none for this fingerprint."""
+    """Read the result of a finished case; None if there is none with this fingerprint."""
     found = read_record(folder / RESULT_FILE, Result)
     return found if found is not None and found.fingerprint == fingerprint else None
 
@@ -165,7 +165,7 @@ RESULT = re.compile(
     r"(study\.(csv|json)|request\.json|report\.(html|md)"
     r"|(work-precision|convergence)[\w.+-]*\.(png|svg))(\.part)?"
 )
-"""What a study writes beside its cases."""
+"""Files of a study beside its cases."""
 
 
 STUDY = FolderKind(
@@ -179,8 +179,8 @@ STUDY = FolderKind(
 )
 
 
-def empty_case(folder: Path) -> None:
-    """An empty folder for a case; what a stopped one left is removed.
+def prepare_folder(folder: Path) -> None:
+    """Create an empty folder for a case; files of an interrupted one are removed.
 
     Raises
     ------
@@ -195,10 +195,10 @@ def empty_case(folder: Path) -> None:
 
 
 Watch = Callable[[float], None]
-"""Called with the fraction of the case that is done, after every step, on all ranks; may raise."""
+"""Called with the completed fraction of the case, after every step, on all ranks; may raise."""
 
 
-def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
+def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm_up: bool) -> Result:
     """Run a case and write its result; collective.
 
     Parameters
@@ -207,31 +207,31 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     job : Job
     watch : callable
     warm : bool
-        Take one untimed step first, so that no case is charged with compiling and loading kernels.
+        Take one untimed step first, so that the times do not include compiling and loading kernels.
 
     Returns
     -------
     Result
-        Also of a case that failed: its ``problem`` says why.
+        Also for a case that failed: its ``problem`` says why.
 
     Raises
     ------
     Interrupted
         From ``watch``; the case is then unfinished.
     SolverError
-        If ranks failed in different ways and cannot go on together.
+        If ranks failed in different ways and cannot continue together.
     OutputError
     """
     folder = Path(job.folder)
-    on_root(comm, lambda: empty_case(folder))
+    on_root(comm, lambda: prepare_folder(folder))
     result = Result(job.fingerprint, ranks=comm.size)
     try:
         scene = on_root(comm, lambda: scene_of(job.scene, job.overrides, trust_mesh=job.trust_mesh))
         result.integrator = str(scene.time.scheme)
-        if warm:
+        if warm_up:
             _warm_up(comm, scene)
         for repeat in range(job.repeats):
-            _repeat(comm, scene, job, repeat, result, watch)
+            _run_repeat(comm, scene, job, repeat, result, watch)
     except (InputError, SolverError) as error:
         result.fail(failure_message(comm, error))
     on_root(comm, lambda: save_record(folder / RESULT_FILE, result))
@@ -245,8 +245,8 @@ def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
             simulation.step()
 
 
-def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result, watch: Watch) -> None:
-    """One timed run; the first also writes results, whose time is measured separately."""
+def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result, watch: Watch) -> None:
+    """One timed run; the first one also writes its states, which is timed separately."""
     folder = Path(job.folder)
     comm.Barrier()
     phases, began = Phases(), time.perf_counter()
@@ -292,7 +292,7 @@ def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result,
         def slowest(seconds: float) -> float:
             return float(comm.allreduce(seconds, MPI.MAX))
 
-        # phases are entered together, so that all ranks have the same
+        # ranks enter phases together, so that all have the same names
         by_phase = {name: slowest(seconds) for name, seconds in phases.seconds().items()}
         result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
 
@@ -300,57 +300,57 @@ def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result,
 PROGRESS_FILE = "progress"
 
 
-def launched(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
-    """The result of a job that is run in processes of its own.
+def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
+    """Run a job in processes of its own.
 
     Parameters
     ----------
     launcher : Launcher
     job : Job
     watch : callable
-        Called again and again with the fraction that is done; where it raises, the processes are ended.
+        Called repeatedly with the completed fraction; if it raises, the processes are terminated.
     lock : int
-        File descriptor that the processes keep open, so that the folder stays locked while they live.
+        File descriptor that the processes keep open, so that the folder stays locked while they run.
     """
     folder = Path(job.folder)
-    told, progress = folder.with_name(f"{folder.name}.job.json"), folder / PROGRESS_FILE
+    job_file, progress = folder.with_name(f"{folder.name}.job.json"), folder / PROGRESS_FILE
     folder.parent.mkdir(exist_ok=True)
-    save_record(told, job)
+    save_record(job_file, job)
     try:
-        _, words = launcher(["--job", str(told)], lambda: watch(_fraction(progress)), (lock,))
+        _, message = launcher(["--job", str(job_file)], lambda: watch(_read_progress(progress)), (lock,))
         watch(1.0)
     finally:
-        told.unlink(missing_ok=True)
+        job_file.unlink(missing_ok=True)
         progress.unlink(missing_ok=True)
     result = read_result(folder, job.fingerprint)
     if result is None:
-        result = Result(job.fingerprint, problem=words)
+        result = Result(job.fingerprint, problem=message)
         folder.mkdir(parents=True, exist_ok=True)
         save_record(folder / RESULT_FILE, result)
     return result
 
 
-def _fraction(progress: Path) -> float:
+def _read_progress(progress: Path) -> float:
     try:
         return min(1.0, float(progress.read_text(encoding="ascii")))
     except (OSError, ValueError):
         return 0.0
 
 
-def run_job(comm: MPI.Comm, path: Path, obey: Callable[[], None]) -> None:
+def run_job(comm: MPI.Comm, path: Path, check_stop: Callable[[], None]) -> None:
     """Run the job in a file, and report its progress a few times a second; collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     path : Path
-    obey : callable
+    check_stop : callable
         Called after every step on all ranks; may raise.
 
     Raises
     ------
     InputError
-        If the file is no job.
+        If the file does not hold a job.
     """
     job = on_root(comm, lambda: read_record(path, Job))
     if job is None:
@@ -359,9 +359,9 @@ def run_job(comm: MPI.Comm, path: Path, obey: Callable[[], None]) -> None:
 
     def watch(fraction: float) -> None:
         nonlocal last
-        obey()
+        check_stop()
         if comm.rank == 0 and time.monotonic() - last > 0.3:
             last = time.monotonic()
             progress.write_text(f"{fraction:.6f}", encoding="ascii")
 
-    run_case(comm, job, watch, warm=True)
+    run_case(comm, job, watch, warm_up=True)

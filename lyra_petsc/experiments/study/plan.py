@@ -1,5 +1,5 @@
-"""What a study runs, worked out before anything does: axes of ``--vary``, combinations and their scenes,
-sample times, and the quantities whose errors are measured.
+"""Plan of a study, made before anything runs: axes of ``--vary``, combinations and their scenes, sample
+times, and the quantities whose errors are measured.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lyra_petsc.stepping.ts_options import STEP_OPTIONS
 
 Value = float | str
 Physics = tuple[tuple[str, Value], ...]
-"""The settings that make a scene another one, in the axes' order."""
+"""The settings that change the physical problem, in the order of the axes."""
 
 SHORT_NAMES = {
     "mesh": "mesh",
@@ -39,16 +39,16 @@ SHORT_NAMES = {
     "max_iterations": "solver.max_iterations",
     "hessian": "solver.hessian",
 }
-"""Names of ours for keys of the scene; ``mesh`` is the element size [m]."""
+"""Short names of keys of the scene; ``mesh`` is the element size [m]."""
 
-WORDS = frozenset({"time.integrator", "solver.hessian"})
-"""Keys of the scene with short names whose values are words."""
+TEXT_VALUED = frozenset({"time.integrator", "solver.hessian"})
+"""Keys of the scene with short names whose values are texts."""
 
 OPTION = re.compile(r"(ksp|pc|snes|ts|mat|mg|gamg|sub|redundant|vec)_\w+", re.ASCII)
 USUAL_OPTIONS = ("ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_type", "pc_type", "snes_rtol", "snes_atol")
 
 NUMERICAL = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius", "solver.", "petsc.")
-"""Keys that change how a scene is solved; every other key makes another scene, with its own reference."""
+"""Keys that change how a scene is solved; other keys change the scene, which then has its own reference."""
 
 SYNONYMS = {
     "step": "dt",
@@ -63,21 +63,21 @@ SYNONYMS = {
     "ts_time_step": "dt",
     "ts_type": "integrator",
 }
-"""What users may call the keys; refused with the right name."""
+"""Other names that users may try for the keys; the error message gives the right name."""
 
-MOST_COMBINATIONS = 10_000
+MAX_COMBINATIONS = 10_000
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that varies.
+    """A setting that varies.
 
     Attributes
     ----------
     key : str
-        As the user wrote it.
+        The key as the user wrote it.
     path : str
-        The scene's key; ``mesh`` for the element size.
+        The key of the scene; ``mesh`` for the element size.
     values : tuple of float or str
         In the order given.
     """
@@ -93,21 +93,21 @@ class Axis:
 
     @property
     def physical(self) -> bool:
-        """Whether its values are different scenes and not different ways to solve one."""
+        """Whether its values make different physical problems, not different ways to solve one."""
         return self.path != "mesh" and not self.path.startswith(NUMERICAL)
 
     @property
     def refines(self) -> bool:
-        """Whether errors may shrink along it: several numbers that are ways to solve one scene."""
+        """Whether errors may decrease along it: several numbers that change how a scene is solved."""
         return self.numeric and not self.physical and len(self.values) > 1
 
 
 Choice = Sequence[tuple[Axis, Value]]
-"""Axes and a value of each."""
+"""Axes with one value of each."""
 
 
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
-    """The axes of ``--vary``, in their order.
+    """Parse the axes of ``--vary``, in their order.
 
     Raises
     ------
@@ -116,49 +116,49 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     """
     axes: dict[str, Axis] = {}
     for text in texts:
-        axis = _axis(text)
+        axis = _parse_axis(text)
         if twin := axes.get(axis.path):
-            words = f"varies what {twin.key} varies already; give all values at once"
-            raise InputError(words, key=_named(text))
+            message = f"varies what {twin.key} varies already; give all values at once"
+            raise InputError(message, key=_option(text))
         axes[axis.path] = axis
     if {"time.step", "time.tolerance"} <= set(axes):
         raise InputError(
             "a tolerance is for steps of automatic length, dt for fixed ones: vary one of them", key="--vary"
         )
-    if math.prod(len(axis.values) for axis in axes.values()) > MOST_COMBINATIONS:
-        raise InputError(f"makes more than {MOST_COMBINATIONS} combinations", key="--vary")
+    if math.prod(len(axis.values) for axis in axes.values()) > MAX_COMBINATIONS:
+        raise InputError(f"makes more than {MAX_COMBINATIONS} combinations", key="--vary")
     return list(axes.values())
 
 
-def _named(text: str) -> str:
+def _option(text: str) -> str:
     return f"--vary {text if len(text) <= 60 else text[:57] + '...'}"
 
 
-def _axis(text: str) -> Axis:
+def _parse_axis(text: str) -> Axis:
     key, equals, listed = text.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise InputError("must read key=value,value,…, as in dt=0.02,0.01", key=_named(text))
-    path = path_of(key)
-    words = [word.strip() for word in _split(listed)]
+        raise InputError("must read key=value,value,…, as in dt=0.02,0.01", key=_option(text))
+    path = scene_key(key)
+    words = [word.strip() for word in _split_at_commas(listed)]
     if not any(words):
-        raise InputError(f"no values: give at least one, as in {key}=…,…", key=_named(text))
+        raise InputError(f"no values: give at least one, as in {key}=…,…", key=_option(text))
     if not all(words):
-        raise InputError("has an empty value between its commas", key=_named(text))
-    values = tuple(_value(path, word, text) for word in words)
+        raise InputError("has an empty value between its commas", key=_option(text))
+    values = tuple(_parse_value(path, word, text) for word in words)
     for number, value in enumerate(values):
         if value in values[:number]:
-            raise InputError(f"has the value {words[number]} twice", key=_named(text))
+            raise InputError(f"has the value {words[number]} twice", key=_option(text))
     return Axis(key, path, values)
 
 
-def path_of(key: str) -> str:
-    """The scene's key that a key of ``--vary`` stands for.
+def scene_key(key: str) -> str:
+    """The key of the scene that a key of ``--vary`` denotes.
 
     Raises
     ------
     InputError
-        For a key that stands for nothing, with the nearest that does.
+        For an unknown key; the message suggests the nearest known one.
     """
     if key in SHORT_NAMES or key == "mesh.size":
         return SHORT_NAMES.get(key, "mesh")
@@ -173,8 +173,8 @@ def path_of(key: str) -> str:
     )
 
 
-def _split(text: str) -> list[str]:
-    """At the commas outside of brackets."""
+def _split_at_commas(text: str) -> list[str]:
+    """Split at the commas outside of brackets."""
     pieces, depth = [""], 0
     for sign in text:
         depth += (sign in "[{(") - (sign in "]})")
@@ -185,40 +185,40 @@ def _split(text: str) -> list[str]:
     return pieces
 
 
-def _value(path: str, word: str, text: str) -> Value:
+def _parse_value(path: str, word: str, text: str) -> Value:
     if path == "time.integrator":
         if word not in INTEGRATORS:
-            raise InputError(f"unknown integrator '{word}', {nearest(word, INTEGRATORS)}", key=_named(text))
+            raise InputError(f"unknown integrator '{word}', {nearest(word, INTEGRATORS)}", key=_option(text))
         return word
     with suppress(ValueError):
         if math.isfinite(number := float(word)):
             return number
     option = path.startswith("petsc.") and not path.endswith("_type")
-    if option or (path in SHORT_NAMES.values() and path not in WORDS):
-        raise InputError(f"'{word}' is no number", key=_named(text))
+    if option or (path in SHORT_NAMES.values() and path not in TEXT_VALUED):
+        raise InputError(f"'{word}' is no number", key=_option(text))
     return word
 
 
 LONGEST_NAME = 80
 
-LEAN = ("output.fields=[]", "output.reactions=false")
-"""What no run of a study needs to write."""
+REDUCED_OUTPUT = ("output.fields=[]", "output.reactions=false")
+"""Settings that switch off output which a study does not need."""
 
 
 @dataclass(frozen=True)
 class StudyCase(Case):
-    """A run that a study makes; ``name`` is its folder.
+    """A run of a study; ``name`` is its folder.
 
     Attributes
     ----------
     overrides : tuple of str
-        What ``--set`` would say to make it of the scene file.
+        ``--set`` arguments that make its scene from the scene file.
     weight : float
-        Its cost, as steps × vertices, in a unit that all cases share.
+        Estimated cost, as steps × vertices, in a unit that all cases share.
     repeats : int
         How often it is timed.
     kernels : tuple of str
-        What cases with the same kernels share: the first of them begins with a step to warm up.
+        Key of its compiled kernels: the first case with a key takes a warm-up step.
     """
 
     overrides: tuple[str, ...] = ()
@@ -245,28 +245,28 @@ class Combination(StudyCase):
 
     @property
     def settings(self) -> dict[str, Value]:
-        """Values by the axes' keys."""
+        """Values by the keys of the axes."""
         return {axis.key: value for axis, value in self.chosen}
 
     @property
     def physics(self) -> Physics:
-        """Key of the physical scene it belongs to."""
+        """Its settings that change the physical problem."""
         return tuple((axis.key, value) for axis, value in self.chosen if axis.physical)
 
 
-def _folder(chosen: Choice) -> str:
-    """The settings, so that a wider study finds what a smaller one has finished."""
-    words = []
+def _folder_name(chosen: Choice) -> str:
+    """Name of a case from its settings, so that a wider study finds the finished cases of a smaller one."""
+    parts = []
     for axis, value in chosen:
         key = "" if axis.path == "time.integrator" else axis.key
-        words.append(f"{key}{value!r}" if isinstance(value, float) else f"{key}-{value}".lstrip("-"))
-    plain = "-".join(words)
-    tame = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
-    return tame if tame == plain else f"{tame}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
+        parts.append(f"{key}{value!r}" if isinstance(value, float) else f"{key}-{value}".lstrip("-"))
+    plain = "-".join(parts)
+    safe = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
+    return safe if safe == plain else f"{safe}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
 
-def described(key: str, value: Value) -> str:
-    """A setting in words."""
+def describe_setting(key: str, value: Value) -> str:
+    """A setting as shown to the user."""
     if key in ("integrator", "time.integrator"):
         return str(value)
     if isinstance(value, str):
@@ -276,18 +276,18 @@ def described(key: str, value: Value) -> str:
     return f"h {value:g} m" if key == "mesh" else f"{key} {short(value)}"
 
 
-def in_words(settings: Iterable[tuple[str, Value]]) -> str:
-    """Settings by key in words."""
-    return ", ".join(described(key, value) for key, value in settings)
+def describe_settings(settings: Iterable[tuple[str, Value]]) -> str:
+    """Settings by key as shown to the user."""
+    return ", ".join(describe_setting(key, value) for key, value in settings)
 
 
-def combinations(axes: Sequence[Axis]) -> list[Combination]:
+def make_combinations(axes: Sequence[Axis]) -> list[Combination]:
     """All combinations, the last axis varying fastest."""
     found = []
     for values in itertools.product(*(axis.values for axis in axes)):
         chosen = tuple(zip(axes, values, strict=True))
-        title = in_words((axis.key, value) for axis, value in chosen) or "the scene as it is"
-        found.append(Combination(_folder(chosen), title, chosen=chosen))
+        title = describe_settings((axis.key, value) for axis, value in chosen) or "the scene as it is"
+        found.append(Combination(_folder_name(chosen), title, chosen=chosen))
     return found
 
 
@@ -295,12 +295,12 @@ def combinations(axes: Sequence[Axis]) -> list[Combination]:
 
 
 def overrides(base: Scene, chosen: Choice) -> list[str]:
-    """The ``--set`` overrides for these values of axes, with the changes of ``time`` that they require.
+    """The ``--set`` arguments for these values of axes, with the changes of ``time`` that they require.
 
     Raises
     ------
     InputError
-        An element size for a mesh that comes with its elements.
+        An element size for a mesh with fixed elements.
     """
     found: list[str] = []
     for axis, value in chosen:
@@ -320,12 +320,12 @@ def overrides(base: Scene, chosen: Choice) -> list[str]:
 
 
 def mesh_overrides(base: Scene, size: float) -> list[str]:
-    """Element size [m] for every sheet: of gmsh scripts, or the nearest number of cells of grids.
+    """The ``--set`` arguments for an element size [m]: ``size`` of gmsh scripts, numbers of cells of grids.
 
     Raises
     ------
     InputError
-        For a mesh file that comes with its elements, or a size that is no size.
+        For a mesh file with fixed elements, or a size that is not positive.
     """
     if not (math.isfinite(size) and size > 0.0):
         raise InputError(f"an element size must be > 0 m, not {size:g}", key="--vary mesh")
@@ -348,12 +348,12 @@ def mesh_overrides(base: Scene, size: float) -> list[str]:
 
 
 def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -> Scene:
-    """The scene with the overrides of a case.
+    """Load the scene with the overrides of a case.
 
     Raises
     ------
     InputError
-        As ``load_scene`` does; what comes from the combination says so.
+        As of ``load_scene``; the message names ``--vary`` where a combination is the cause.
     """
     try:
         scene = load_scene(path, overrides)
@@ -366,16 +366,16 @@ def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -
 
 @dataclass(frozen=True)
 class Quantity:
-    """One error that is measured of each combination.
+    """A kind of error that is measured for each combination.
 
     Attributes
     ----------
     name : str
         ``position_max``, ``position_l2``, ``energy`` or ``probe_<name>``: columns are ``error_<name>``.
     title : str
-        In words.
+        Name for reports.
     probe : str
-        The scene's probe it is about; empty if it is about none.
+        The probe of the scene that it belongs to; empty for none.
     """
 
     name: str
@@ -384,36 +384,36 @@ class Quantity:
 
 
 MEAN_SQUARE = "position_l2"
-"""Name of the quantity whose samples are combined by their mean square; of all others the largest counts."""
+"""Name of the quantity whose samples are combined by their mean square; others by their maximum."""
 
 POSITION = (
     Quantity(MEAN_SQUARE, "L2 error in position / sheet size"),
     Quantity("position_max", "largest error in position / sheet size"),
 )
-"""Root mean square over area and sample times; and the largest at any vertex and sample time."""
+"""Root mean square over area and sample times, and maximum over vertices and sample times."""
 
 ENERGY = Quantity("energy", "error in energy / largest energy exchanged")
 
 
 def probe_quantity(name: str) -> Quantity:
-    """The error of a probe's position."""
+    """The error in the position of a probe."""
     return Quantity(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
 
 
-def chosen(text: str, probes: Iterable[str]) -> list[Quantity]:
-    """The quantities that ``--quantities`` names; all for an empty text.
+def parse_quantities(text: str, probes: Iterable[str]) -> list[Quantity]:
+    """The quantities of ``--quantities``; all for an empty text.
 
     Parameters
     ----------
     text : str
-        ``position``, ``energy``, ``probes`` (all of the scene's) or names of probes, separated by commas.
+        ``position``, ``energy``, ``probes`` (all of the scene) or names of probes, separated by commas.
     probes : iterable of str
-        The scene's.
+        Probes of the scene.
 
     Raises
     ------
     InputError
-        For an unknown one, one given twice, or probes where the scene has none.
+        For an unknown quantity, one given twice, or probes if the scene has none.
     """
     key, every = "--quantities", [probe_quantity(name) for name in probes]
     known = {quantity.probe: [quantity] for quantity in every}
@@ -438,7 +438,7 @@ REQUEST_FILE = "request.json"
 
 @dataclass(frozen=True)
 class Request:
-    """A study as asked for.
+    """The request for a study, as stored in its folder.
 
     Attributes
     ----------
@@ -470,24 +470,24 @@ class Request:
     trust_mesh: bool = False
 
     def with_changes(self, overrides: Sequence[str]) -> Scene:
-        """The scene with its settings and further overrides, without what a study need not write.
+        """Load the scene with its settings and further overrides, and with reduced output.
 
         Raises
         ------
         InputError
-            If they do not go together.
+            If the settings contradict each other.
         """
-        given = (*self.settings, *LEAN, *overrides)
+        given = (*self.settings, *REDUCED_OUTPUT, *overrides)
         return scene_of(self.scene, given, trust_mesh=self.trust_mesh)
 
 
 def read_request(folder: Path) -> Request:
-    """The request that a study's folder was begun with.
+    """Read the request in the folder of a study.
 
     Raises
     ------
     InputError
-        If there is none, or it cannot be read.
+        If it is missing or cannot be read.
     """
     path = folder / REQUEST_FILE
     try:
@@ -498,23 +498,23 @@ def read_request(folder: Path) -> Request:
         raise InputError("is damaged; begin the study anew with --force", file=path, key="--resume") from None
 
 
-AUTO_STEPS = 200.0
-"""Steps that a run with automatic ones is guessed to take, for the time left."""
+ASSUMED_STEPS = 200.0
+"""Assumed number of steps of a run with adaptive steps, for the estimate of the remaining time."""
 
-LANDING = 1e-6
-"""Fraction of Δt by which a multiple of it may miss a sample time."""
+TIME_TOLERANCE = 1e-6
+"""Fraction of Δt by which the end of a step may differ from a sample time."""
 
-FIXED_BY = {
+OVERRIDING_OPTIONS = {
     "time.step": STEP_OPTIONS,
     "time.integrator": ("ts_type",),
     "time.tolerance": STEP_OPTIONS,
 }
-"""PETSc options that would override what an axis varies."""
+"""PETSc options that override the key of an axis."""
 
 
 @dataclass
 class Plan:
-    """What a study will do.
+    """The plan of a study.
 
     Attributes
     ----------
@@ -524,11 +524,11 @@ class Plan:
     combinations : list of Combination
     quantities : list of Quantity
     end : float
-        Last time [s]; of a static analysis, load factor.
-    every : float
-        Time between samples [s]; the end is sampled too.
+        End time [s], or load factor of a static analysis.
+    interval : float
+        Time between samples [s]; the end is sampled as well.
     notes : list of str
-        What the user should know.
+        Notes for the user.
     """
 
     request: Request
@@ -537,23 +537,23 @@ class Plan:
     combinations: list[Combination]
     quantities: list[Quantity]
     end: float
-    every: float
+    interval: float
     notes: list[str] = field(default_factory=list)
 
     def axis(self, path: str) -> Axis | None:
-        """The axis that varies a key of the scene."""
+        """The axis of a key of the scene; None if it does not vary."""
         return next((axis for axis in self.axes if axis.path == path), None)
 
     def sample_times(self) -> list[float]:
-        """[s], ascending, from 0 to the end."""
-        count = math.floor(self.end / self.every * (1.0 + LANDING))
-        times = [number * self.every for number in range(count + 1)]
-        return times if self.end - times[-1] <= LANDING * self.every else [*times, self.end]
+        """Sample times [s], ascending, from 0 to the end."""
+        count = math.floor(self.end / self.interval * (1.0 + TIME_TOLERANCE))
+        times = [number * self.interval for number in range(count + 1)]
+        return times if self.end - times[-1] <= TIME_TOLERANCE * self.interval else [*times, self.end]
 
     def overrides(self, chosen: Choice) -> tuple[str, ...]:
-        """What makes the scene with these values of axes, and with what the whole study sets."""
-        further = f"output.every={self.every!r}", *overrides(self.base, chosen)
-        return (*self.request.settings, *LEAN, *further)
+        """All ``--set`` arguments of the scene with these values of axes."""
+        further = f"output.every={self.interval!r}", *overrides(self.base, chosen)
+        return (*self.request.settings, *REDUCED_OUTPUT, *further)
 
     def scene(self, case: StudyCase) -> Scene:
         """The scene of a case.
@@ -561,59 +561,59 @@ class Plan:
         Raises
         ------
         InputError
-            If its settings do not go together.
+            If its settings contradict each other.
         """
         return scene_of(self.request.scene, case.overrides, trust_mesh=self.request.trust_mesh)
 
 
 def make_plan(request: Request) -> Plan:
-    """Plan a requested study; reads the scene and its meshes, runs and writes nothing. For rank 0.
+    """Plan a requested study: reads the scene and its meshes, but runs and writes nothing. For rank 0.
 
     Raises
     ------
     InputError
-        Whatever in the request, the scene or its meshes cannot be used.
+        For any part of the request, the scene or its meshes that cannot be used.
     """
     if request.repeats < 1:
         raise InputError(f"must be at least 1, not {request.repeats}", key="--repeats")
     axes = parse_axes(request.vary)
     base = request.with_changes([])
-    quantities = chosen(request.quantities, base.probes)
+    quantities = parse_quantities(request.quantities, base.probes)
     notes: list[str] = []
     axes = axes or default_axes(base, notes)
     for axis in axes:
         if axis.path in ("output.every", "time.end", "time.analysis"):
             raise InputError("decides when errors are sampled and cannot vary", key=f"--vary {axis.key}")
-        _refuse_fixed(axis)
-        _check_alone(request, base, axis)
+        _refuse_overridden(axis)
+        _check_each_value(request, base, axis)
         if axis.path == "mesh":
-            notes += _numbered_vertices(base)
+            notes += _note_numbered_vertices(base)
     end = petsc_number("ts_max_time", base.time.end)
-    every = _sampling(base, axes, end, notes)
-    plan = Plan(request, base, axes, combinations(axes), quantities, end, every, notes)
-    plan.combinations = [_timed(plan, combination) for combination in plan.combinations]
+    every = _sampling_interval(base, axes, end, notes)
+    plan = Plan(request, base, axes, make_combinations(axes), quantities, end, every, notes)
+    plan.combinations = [_with_cost(plan, combination) for combination in plan.combinations]
     return plan
 
 
-def _timed(plan: Plan, combination: Combination) -> Combination:
-    """The combination with what it takes to run it."""
+def _with_cost(plan: Plan, combination: Combination) -> Combination:
+    """The combination with its overrides, cost, repeats and kernels."""
     settings = {axis.path: value for axis, value in combination.chosen}
     step = settings.get("time.step", plan.base.time.step)
     if isinstance(step, str) or "time.tolerance" in settings:
-        step = plan.end / AUTO_STEPS
+        step = plan.end / ASSUMED_STEPS
     weight = plan.request.repeats / step / float(settings.get("mesh", 1.0)) ** 2
-    words = (value for value in combination.values if isinstance(value, str))
+    texts = (value for value in combination.values if isinstance(value, str))
     return replace(
         combination,
         overrides=plan.overrides(combination.chosen),
         weight=weight,
         repeats=plan.request.repeats,
-        kernels=("combination", *words),
+        kernels=("combination", *texts),
     )
 
 
 def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
-    """Without ``--vary``: integrators and halved steps (or tolerances); for an equilibrium, meshes."""
+    """The axes without ``--vary``: integrators and halved steps or tolerances; element sizes in statics."""
     if base.time.static:
         size = mean_edge_length(build_scene_mesh(base))
         grid = base.mesh[0].grid
@@ -640,11 +640,11 @@ def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
 
 def _divides(step: float, every: float) -> bool:
     count = every / step
-    return count >= 1.0 - LANDING and abs(count - round(count)) <= LANDING * max(1.0, count)
+    return count >= 1.0 - TIME_TOLERANCE and abs(count - round(count)) <= TIME_TOLERANCE * max(1.0, count)
 
 
-def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -> float:
-    """Time between samples [s]; tells of steps that do not fit in."""
+def _sampling_interval(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -> float:
+    """Time between samples [s]; adds a note about Δt that do not divide it."""
     if base.time.static:
         return end
     steps = [float(v) for axis in axes if axis.path == "time.step" for v in axis.values if v != "auto"]
@@ -665,8 +665,8 @@ def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -
     return every
 
 
-def _numbered_vertices(base: Scene) -> list[str]:
-    """A note on vertices picked by number, which differ from mesh to mesh."""
+def _note_numbered_vertices(base: Scene) -> list[str]:
+    """A note on vertices selected by number, which differ between meshes; empty if there are none."""
     picked = [f"handles[{i}]" for i, handle in enumerate(base.handles) if handle.nodes is not None]
     picked += [f"loads[{i}]" for i, load in enumerate(base.loads) if load.nodes is not None]
     picked += [f"probes.{name}" for name, probe in base.probes.items() if probe.nodes is not None]
@@ -674,10 +674,10 @@ def _numbered_vertices(base: Scene) -> list[str]:
     return [f"{', '.join(picked)}: {words}"] if picked else []
 
 
-def _refuse_fixed(axis: Axis) -> None:
-    """An option on the command line wins over the scene, and the axis would vary nothing."""
+def _refuse_overridden(axis: Axis) -> None:
+    """Refuse an axis that a PETSc option of the command line overrides: its values would have no effect."""
     option = (axis.path.removeprefix("petsc."),) if axis.path.startswith("petsc.") else ()
-    for name in filter(is_set, FIXED_BY.get(axis.path, option)):
+    for name in filter(is_set, OVERRIDING_OPTIONS.get(axis.path, option)):
         raise InputError(
             f"-{name} on the command line (or in PETSC_OPTIONS, .petscrc) would fix what varies; "
             "leave it out",
@@ -685,15 +685,15 @@ def _refuse_fixed(axis: Axis) -> None:
         )
 
 
-def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
-    """Each value must be possible by itself; conflicts in combination are reported in the row."""
+def _check_each_value(request: Request, base: Scene, axis: Axis) -> None:
+    """Check each value by itself; conflicts between axes are reported in the rows of combinations."""
     seen: dict[tuple[str, ...], Value] = {}
     for value in axis.values:
         found = overrides(base, [(axis, value)])
         try:
             request.with_changes(found)
         except InputError:
-            # a value may be allowed beside those of other axes only
+            # a spectral radius may be valid only together with values of other axes
             if len(request.vary) <= 1 or axis.path != "time.spectral_radius":
                 raise
         if axis.path == "mesh" and (other := seen.setdefault(tuple(found), value)) != value:

@@ -1,4 +1,4 @@
-"""Results of a study: errors, observed orders, Pareto front and recommendation, as CSV, JSON and pages."""
+"""Results of a study: errors, observed orders, Pareto front and recommendation, as CSV, JSON and a page."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from lyra_petsc.experiments.study.plan import (
     Plan,
     Quantity,
     StudyCase,
-    described,
-    in_words,
+    describe_setting,
+    describe_settings,
 )
-from lyra_petsc.experiments.study.study_runner import SAFETY, Reference, StudyRow, Work, refines_time
+from lyra_petsc.experiments.study.study_runner import SAFETY, Reference, StudyRow, StudyRunner, refines_time
 from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.summary import versions
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
 
 
-def extent(row: StudyRow, axis: Axis) -> float:
-    """The length, time or tolerance that shrinks along a numeric axis: as it really was."""
+def spacing(row: StudyRow, axis: Axis) -> float:
+    """Actual mean edge length [m], mean Δt [s] or value of a row along a numeric axis."""
     if axis.path == "mesh":
         return row.result.spacing
     if axis.path == "time.step" and row.result.mean_step > 0.0:
@@ -46,21 +46,21 @@ def extent(row: StudyRow, axis: Axis) -> float:
 
 
 def families(rows: Sequence[StudyRow], axis: Axis | None) -> dict[str, list[StudyRow]]:
-    """Rows that ran and differ in one axis alone, coarsest first; by what they share, in words."""
+    """Rows that ran, grouped so that rows of a group differ in one axis only; coarsest first, by label."""
     found: dict[str, list[StudyRow]] = {}
     for row in rows:
         if row.passed:
             found.setdefault(shared_label(row, axis), []).append(row)
     if axis is not None:
         for group in found.values():
-            group.sort(key=lambda row: -extent(row, axis))
+            group.sort(key=lambda row: -spacing(row, axis))
     return found
 
 
 def shared_label(row: StudyRow, axis: Axis | None) -> str:
-    """The settings of a row but for one axis, in words, with the integrator first."""
+    """Text of the settings of a row except for one axis, with the integrator first."""
     rest = ((a.key, v) for a, v in row.case.chosen if a is not axis and a.path != "time.integrator")
-    return ", ".join(filter(None, [row.line, in_words(rest)]))
+    return ", ".join(filter(None, [row.integrator, describe_settings(rest)]))
 
 
 @dataclass(frozen=True)
@@ -84,75 +84,76 @@ class Order:
 
 
 def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: Sequence[str]) -> list[Order]:
-    """Orders along every numeric axis; also noted in the rows."""
+    """Observed orders along every numeric axis; orders between neighbours are also stored in the rows."""
     found = []
     for axis in (axis for axis in axes if axis.refines):
         for label, group in families(rows, axis).items():
             for name in quantities:
-                told = [row for row in group if row.shown(name) > 0.0]
-                for coarse, fine in itertools.pairwise(told):
-                    a, b = extent(coarse, axis), extent(fine, axis)
+                known = [row for row in group if row.resolved(name) > 0.0]
+                for coarse, fine in itertools.pairwise(known):
+                    a, b = spacing(coarse, axis), spacing(fine, axis)
                     if a > b > 0.0:
-                        order = math.log(coarse.shown(name) / fine.shown(name)) / math.log(a / b)
+                        order = math.log(coarse.resolved(name) / fine.resolved(name)) / math.log(a / b)
                         fine.orders[axis.key, name] = order
-                if len(told) >= 2:
-                    slope = fitted_slope([extent(r, axis) for r in told], [r.shown(name) for r in told])
-                    between = tuple(r.orders.get((axis.key, name), math.nan) for r in told[1:])
+                if len(known) >= 2:
+                    slope = fitted_slope([spacing(r, axis) for r in known], [r.resolved(name) for r in known])
+                    between = tuple(r.orders.get((axis.key, name), math.nan) for r in known[1:])
                     found.append(Order(axis.key, name, label, slope, between))
     return found
 
 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
-    """Mark the Pareto front: the rows that no other beats in both run time and error."""
-    able = _able(rows, quantity)
-    costs = [(row.run, row.at_most(quantity)) for row in able]
+    """Mark the Pareto front: rows for which no other row has both less run time and less error."""
+    able = _rows_with_error(rows, quantity)
+    costs = [(row.run_time, row.error_bound(quantity)) for row in able]
     for row, mine in zip(able, costs, strict=True):
         row.on_front = not any(one[0] <= mine[0] and one[1] <= mine[1] and one != mine for one in costs)
 
 
-def _able(rows: Sequence[StudyRow], quantity: str) -> list[StudyRow]:
+def _rows_with_error(rows: Sequence[StudyRow], quantity: str) -> list[StudyRow]:
     """The rows whose error is known."""
-    return [row for row in rows if row.passed and not math.isnan(row.at_most(quantity))]
+    return [row for row in rows if row.passed and not math.isnan(row.error_bound(quantity))]
 
 
 TARGETS = (0.1, 0.01, 0.001)
 DEFAULT_TARGET = 0.01
-"""The accuracy that the diagram's recommended setting is for."""
+"""The accuracy for which the diagram marks the recommended setting."""
 
 FINEST_TARGET = 1e-6
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to choose for an accuracy.
+    """Recommended setting for an accuracy.
 
     Attributes
     ----------
     target : float
+        Relative error.
     row : StudyRow or None
-        The fastest that keeps it; None if none does.
-    words : str
+        The fastest row that reaches it; None if there is none.
+    text : str
     """
 
     target: float
     row: StudyRow | None
-    words: str
+    text: str
 
 
 def advise(rows: Sequence[StudyRow], quantity: str, axis: Axis | None = None) -> list[Advice]:
-    """The fastest setting for each accuracy, among what ran; nothing is extrapolated.
+    """The fastest setting for each accuracy among those that ran; nothing is extrapolated.
 
     Parameters
     ----------
     rows : sequence of StudyRow
     quantity : str
     axis : Axis, optional
-        Along it a winner may be the coarsest that ran, which the words then say.
+        The text says if the recommended row is the coarsest along this axis.
     """
-    able = _able(rows, quantity)
+    able = _rows_with_error(rows, quantity)
     if not able:
         return []
-    best = min(row.at_most(quantity) for row in able)
+    best = min(row.error_bound(quantity) for row in able)
     targets = list(TARGETS)
     while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
         targets.append(targets[-1] / 10.0)
@@ -162,55 +163,57 @@ def advise(rows: Sequence[StudyRow], quantity: str, axis: Axis | None = None) ->
 
 def _advice(rows: Sequence[StudyRow], quantity: str, target: float, coarsest: Sequence[StudyRow]) -> Advice:
     def error(row: StudyRow) -> float:
-        return row.at_most(quantity)
+        return row.error_bound(quantity)
 
     good = [row for row in rows if error(row) <= target]
     if not good:
         best = min(rows, key=error)
-        words = f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run)}"
+        text = f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run_time)}"
         nothing = "nothing that ran is accurate enough; the most accurate is"
-        return Advice(target, None, f"For {percent(target)} {nothing} {words}.")
-    winner = min(good, key=lambda row: row.run)
+        return Advice(target, None, f"For {percent(target)} {nothing} {text}.")
+    winner = min(good, key=lambda row: row.run_time)
     tried = ", the coarsest that ran" if any(row is winner for row in coarsest) else ""
-    words = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run)}"
-    words += f" ({_error(winner, quantity)}{tried})"
+    text = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run_time)}"
+    text += f" ({_error(winner, quantity)}{tried})"
     high = max(winner.result.run_seconds)
-    ties = [row for row in good if row.line == winner.line and min(row.result.run_seconds) <= high]
+    ties = [
+        row for row in good if row.integrator == winner.integrator and min(row.result.run_seconds) <= high
+    ]
     if ties := [row for row in ties if row is not winner]:
-        words += f", or as fast within the spread, {setting(min(ties, key=error))}"
-    for line in dict.fromkeys(row.line for row in rows if row.line != winner.line):
-        others = [row for row in rows if row.line == line]
+        text += f", or as fast within the spread, {setting(min(ties, key=error))}"
+    for line in dict.fromkeys(row.integrator for row in rows if row.integrator != winner.integrator):
+        others = [row for row in rows if row.integrator == line]
         if able := [row for row in others if error(row) <= target]:
-            row = min(able, key=lambda row: row.run)
-            words += f"; {line} needs {seconds(row.run)} ({_without_line(row)})"
+            row = min(able, key=lambda row: row.run_time)
+            text += f"; {line} needs {seconds(row.run_time)} ({_without_line(row)})"
         else:
             row = min(others, key=error)
-            found = f"{_without_line(row)}: {_error(row, quantity)}, {seconds(row.run)}"
-            words += f"; {line} did not reach it ({found})"
-    return Advice(target, winner, words + ".")
+            found = f"{_without_line(row)}: {_error(row, quantity)}, {seconds(row.run_time)}"
+            text += f"; {line} did not reach it ({found})"
+    return Advice(target, winner, text + ".")
 
 
 def setting(row: StudyRow) -> str:
-    """All settings of a row, in words, with the integrator first."""
+    """Text of all settings of a row, with the integrator first."""
     return shared_label(row, None) or row.case.title
 
 
 def _without_line(row: StudyRow) -> str:
-    return setting(row).removeprefix(row.line).removeprefix(", ") or row.line
+    return setting(row).removeprefix(row.integrator).removeprefix(", ") or row.integrator
 
 
 def _error(row: StudyRow, quantity: str) -> str:
     unresolved = quantity in row.unresolved
-    bound = f"below {percent(row.at_most(quantity))}" if unresolved else percent(row.errors[quantity])
-    words = f"error {bound}"
-    largest = row.at_most("position_max")
+    bound = f"below {percent(row.error_bound(quantity))}" if unresolved else percent(row.errors[quantity])
+    text = f"error {bound}"
+    largest = row.error_bound("position_max")
     if quantity == "position_l2" and math.isfinite(largest):
-        words += f", at most {percent(largest)} anywhere"
-    return words
+        text += f", at most {percent(largest)} anywhere"
+    return text
 
 
 def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
-    """Mark the setting that the diagram's star names: the fastest for 1 %; none if no setting keeps that."""
+    """Mark the fastest row for 1 %, which the diagram shows by a star; None if no row reaches 1 %."""
     for one in advice:
         if one.row is not None and math.isclose(one.target, DEFAULT_TARGET):
             one.row.recommended = True
@@ -221,8 +224,8 @@ def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
 COUNTS = ("steps", "rejected", "newton_iterations", "linear_iterations")
 
 
-def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
-    """A row of ``study.csv`` by its columns; None where there is nothing to tell."""
+def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
+    """A row of ``study.csv`` by its columns; None where a value is missing."""
     result, settings = row.result, row.case.settings
     names = [quantity.name for quantity in plan.quantities]
     keys = {axis.path: axis.key for axis in plan.axes}
@@ -245,7 +248,7 @@ def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
         "combination": row.case.name,
         "status": "done" if row.passed else "failed",
         "reason": result.problem,
-        "integrator": row.line,
+        "integrator": row.integrator,
         "dt": settings.get(keys.get("time.step", ""), step),
         "dt_mean": result.mean_step,
         "dt_min": result.shortest,
@@ -258,14 +261,14 @@ def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
         "force_tolerance": tolerance("force_tolerance"),
         "step_tolerance": tolerance("step_tolerance"),
         "linear_solver": result.linear_solver,
-        **{f"error_{name}": row.shown(name) for name in names},
-        **{f"reference_error_{name}": row.own.get(name) for name in names},
+        **{f"error_{name}": row.resolved(name) for name in names},
+        **{f"reference_error_{name}": row.own_errors.get(name) for name in names},
         "not_resolved": " ".join(sorted(row.unresolved)),
         **{f"order_{axis}_{name}": row.orders.get((axis, name)) for axis in refined for name in names},
         "repeats": len(result.timings),
         "ranks": result.ranks,
-        **spread("run_seconds", row.run, result.run_seconds),
-        **spread("total_seconds", row.total, result.total_seconds),
+        **spread("run_seconds", row.run_time, result.run_seconds),
+        **spread("total_seconds", row.total_time, result.total_seconds),
         **{f"seconds_{phase}": result.phase_seconds.get(phase) for phase in PHASES},
         **{name: getattr(result, name) for name in COUNTS},
         "pareto": row.on_front,
@@ -282,10 +285,12 @@ def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
 BELOW = "below what the reference can tell"
 
 
-def _advise(report: Report, plan: Plan, physics: Physics, known: Reference, advice: Sequence[Advice]) -> None:
-    report.heading("Recommendation" + (f" for {in_words(physics)}" if physics else ""))
+def _write_advice(
+    report: Report, plan: Plan, physics: Physics, known: Reference, advice: Sequence[Advice]
+) -> None:
+    report.heading("Recommendation" + (f" for {describe_settings(physics)}" if physics else ""))
     if not advice:
-        report.paragraph(f"None can be given: {known.words or 'no errors are known'}.")
+        report.paragraph(f"None can be given: {known.description or 'no errors are known'}.")
         return
     main, over = plan.quantities[0], "the largest at any sample time"
     if main.name == MEAN_SQUARE:
@@ -293,13 +298,13 @@ def _advise(report: Report, plan: Plan, physics: Physics, known: Reference, advi
     report.paragraph(
         f"Errors are meant as: {main.title}, {over}. Run times are medians of the steps alone, "
         "without set-up and output. Nothing is extrapolated: only what ran is recommended. "
-        + _left_out(plan, known)
+        + _excluded_error(plan, known)
     )
-    report.bullets([one.words for one in advice])
+    report.bullets([one.text for one in advice])
 
 
-def _left_out(plan: Plan, known: Reference) -> str:
-    """Which error all runs share with their reference, so that the numbers do not contain it."""
+def _excluded_error(plan: Plan, known: Reference) -> str:
+    """Sentence on the error that all runs share with their reference and that is not measured therefore."""
     if known.kind == "exact":
         return "The errors are whole: the reference is exact on any mesh."
     if plan.axis("mesh") is None:
@@ -312,11 +317,11 @@ def _left_out(plan: Plan, known: Reference) -> str:
     return "The errors are those of the mesh and of all else that is solved."
 
 
-def _what(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str]:
+def _describe_runs(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str]:
     done = [row for row in rows if row.passed]
     values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
-    varied = "; ".join(f"{key} = {', '.join(told)}" for key, told in values.items())
-    repeats, end = plan.request.repeats, f"every {seconds(plan.every)} to {seconds(plan.end)}"
+    varied = "; ".join(f"{key} = {', '.join(texts)}" for key, texts in values.items())
+    repeats, end = plan.request.repeats, f"every {seconds(plan.interval)} to {seconds(plan.end)}"
     times = {1: "once", 2: "twice"}.get(repeats, f"{repeats} times")
     meshes = dict.fromkeys((row.result.vertices, row.result.triangles) for row in done)
     count = len(plan.sample_times()) - 1
@@ -334,7 +339,7 @@ def _what(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str]:
 # -- tables --------------------------------------------------------------------------------------------
 
 
-def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
+def _write_tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     names = [quantity.name for quantity in plan.quantities]
     head = ["setting", *(_short_title(quantity) for quantity in plan.quantities)]
     head += ["run time", "fastest – slowest", "with set-up", "steps", "rejected", "Newton", "linear"]
@@ -344,7 +349,7 @@ def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
         result, times = row.result, row.result.run_seconds
         body.append(
             [setting(row) + (" ★" if row.recommended else ""), *(_error_cell(row, name) for name in names),
-             seconds(row.run), f"{seconds(min(times))} – {seconds(max(times))}", seconds(row.total),
+             seconds(row.run_time), f"{seconds(min(times))} – {seconds(max(times))}", seconds(row.total_time),
              result.steps, result.rejected, result.newton_iterations, result.linear_iterations]
         )  # fmt: skip
     starred = any(row.recommended for row in done)
@@ -364,18 +369,18 @@ def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
 
 
 def _short_title(quantity: Quantity) -> str:
-    words = {"position_max": "position, max", "position_l2": "position, L2"}
-    return "error in " + words.get(quantity.name, quantity.name.replace("_", " ", 1))
+    text = {"position_max": "position, max", "position_l2": "position, L2"}
+    return "error in " + text.get(quantity.name, quantity.name.replace("_", " ", 1))
 
 
 def _error_cell(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
-        return f"< {short(SAFETY * row.own[name])}"
+        return f"< {short(SAFETY * row.own_errors[name])}"
     error = row.errors.get(name, math.nan)
     return short(error) if math.isfinite(error) else ""
 
 
-def _orders(report: Report, orders: Sequence[Order]) -> None:
+def _write_orders(report: Report, orders: Sequence[Order]) -> None:
     if not orders:
         return
     report.heading("Observed orders")
@@ -389,13 +394,13 @@ def _orders(report: Report, orders: Sequence[Order]) -> None:
     )  # fmt: skip
 
 
-def _references(report: Report, known: Mapping[Physics, Reference]) -> None:
+def _write_references(report: Report, known: Mapping[Physics, Reference]) -> None:
     report.heading("Reference")
     for physics, one in known.items():
-        where = f"{in_words(physics)}: " if physics else ""
+        where = f"{describe_settings(physics)}: " if physics else ""
         took = f"; its steps took {seconds(one.seconds)}" if math.isfinite(one.seconds) else ""
-        report.paragraph(f"{where}{one.words}{took}.")
-        if one.kind == "finer" and one.own:
+        report.paragraph(f"{where}{one.description}{took}.")
+        if one.kind == "finer" and one.own_errors:
             report.table(
                 ["quantity", "own error", "observed order", "converges"],
                 [
@@ -405,7 +410,7 @@ def _references(report: Report, known: Mapping[Physics, Reference]) -> None:
                         f"{own.order:.2f}" if math.isfinite(own.order) else "",
                         own.trusted,
                     ]
-                    for name, own in one.own.items()
+                    for name, own in one.own_errors.items()
                 ],
                 caption="The reference's own error, estimated from coarser runs (Richardson)",
             )
@@ -426,74 +431,77 @@ def drawings(plan: Plan, rows: Sequence[StudyRow], known: Reference, mark: str) 
     found = []
     axis = main_axis(plan.axes)
     for quantity in plan.quantities:
-        if any(0.0 < row.shown(quantity.name) < math.inf for row in rows):
-            found.append(_work(plan, rows, known, quantity, axis, mark))
+        if any(0.0 < row.resolved(quantity.name) < math.inf for row in rows):
+            found.append(_work_precision(plan, rows, known, quantity, axis, mark))
     for one in (axis for axis in plan.axes if axis.refines):
         for quantity in plan.quantities:
             found += _convergence(rows, known, quantity, one, mark)
     return found
 
 
-def _floor(known: Reference, quantity: Quantity) -> float | None:
-    own = known.own.get(quantity.name)
+def _error_floor(known: Reference, quantity: Quantity) -> float | None:
+    own = known.own_errors.get(quantity.name)
     return None if own is None or not own.error > 0.0 else SAFETY * own.error
 
 
-def _work(
+def _work_precision(
     plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
     lines = []
     for label, group in families(rows, axis).items():
         times = [row.result.run_seconds for row in group]
-        points = [row.run for row in group], [row.shown(name) for row in group]
-        labels = [_point(row, axis) for row in group]
+        points = [row.run_time for row in group], [row.resolved(name) for row in group]
+        labels = [_point_label(row, axis) for row in group]
         lines.append(Series(label, *points, [*map(min, times)], [*map(max, times)], labels))
     hidden = [row for row in rows if row.passed and name in row.unresolved]
     main, place, stars = quantity == plan.quantities[0], None, ""
     for star in (row for row in rows if row.recommended and main):
         stars = f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
-        place = star.run, SAFETY * star.own[name] if name in star.unresolved else star.errors[name]
+        place = (
+            star.run_time,
+            SAFETY * star.own_errors[name] if name in star.unresolved else star.errors[name],
+        )
     return work_precision(
         lines,
-        name=("work-precision" if main else f"work-precision-{_file(name)}") + mark,
+        name=("work-precision" if main else f"work-precision-{_file_name(name)}") + mark,
         caption=f"{quantity.title} against run time of the steps: median, bars from fastest to slowest of "
         f"{plan.request.repeats}",
         y_label=quantity.title,
-        front=[(row.run, row.shown(name)) for row in rows if row.on_front] if main else (),
-        bounds=[(row.run, SAFETY * row.own[name]) for row in hidden],
+        front=[(row.run_time, row.resolved(name)) for row in rows if row.on_front] if main else (),
+        bounds=[(row.run_time, SAFETY * row.own_errors[name]) for row in hidden],
         recommended=place,
         recommendation=stars,
-        floor=_floor(known, quantity),
+        floor=_error_floor(known, quantity),
         floor_label=BELOW,
     )
 
 
-def _point(row: StudyRow, axis: Axis | None) -> str:
+def _point_label(row: StudyRow, axis: Axis | None) -> str:
     if axis is None:
         return ""
-    return described(axis.key, row.case.settings[axis.key]).removeprefix(axis.key).strip()
+    return describe_setting(axis.key, row.case.settings[axis.key]).removeprefix(axis.key).strip()
 
 
 def _convergence(
     rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
-        Series(label, [extent(row, axis) for row in group], [row.shown(quantity.name) for row in group])
+        Series(label, [spacing(row, axis) for row in group], [row.resolved(quantity.name) for row in group])
         for label, group in families(rows, axis).items()
     ]
     if not any(len(line.shown.x) > 1 for line in lines):
         return []
     label = {"time.step": "Δt [s] (mean)", "mesh": "h [m] (mean edge)"}.get(axis.path, axis.key)
     drawing = convergence(
-        lines, name=f"convergence-{_file(axis.key)}-{_file(quantity.name)}{mark}",
+        lines, name=f"convergence-{_file_name(axis.key)}-{_file_name(quantity.name)}{mark}",
         caption=f"{quantity.title} along {axis.key}", x_label=label, y_label=quantity.title,
-        floor=_floor(known, quantity), floor_label=BELOW,
+        floor=_error_floor(known, quantity), floor_label=BELOW,
     )  # fmt: skip
     return [drawing]
 
 
-def _file(name: str) -> str:
+def _file_name(name: str) -> str:
     return "".join(sign if sign.isalnum() or sign in "-." else "-" for sign in name).strip("-")
 
 
@@ -501,15 +509,15 @@ def _file(name: str) -> str:
 
 
 class Study(View[Outcome[Any]]):
-    """Errors against run times, which are told when all has been compared.
+    """Errors against run times; written once all cases have been compared with their references.
 
     Parameters
     ----------
-    work : Work
+    runner : StudyRunner
 
     Attributes
     ----------
-    work : Work
+    runner : StudyRunner
     orders : list of Order
     advice : dict of physics → list of Advice
     """
@@ -517,33 +525,33 @@ class Study(View[Outcome[Any]]):
     verb = "study"
     ready = False
 
-    def __init__(self, work: Work) -> None:
-        self.work, self.plan = work, work.plan
+    def __init__(self, runner: StudyRunner) -> None:
+        self.runner, self.plan = runner, runner.plan
         self.title = f"Error against run time: {self.plan.base.title or self.plan.request.scene}"
         self.orders: list[Order] = []
         self.advice: dict[Physics, list[Advice]] = {}
-        self.plan.notes += busy(self.ranks)
+        self.plan.notes += note_load(self.ranks)
 
     @property
     def ranks(self) -> int:
-        """On which each case is run."""
-        return self.plan.request.ranks or self.work.comm.size
+        """Number of ranks of each case."""
+        return self.plan.request.ranks or self.runner.comm.size
 
     def cases(self) -> Iterator[StudyCase]:
-        """All that is to be run, after which orders, Pareto front and advice are found."""
-        yield from self.work.cases()
-        plan, work = self.plan, self.work
+        """All cases to run; afterwards computes orders, Pareto front and advice."""
+        yield from self.runner.cases()
+        plan, runner = self.plan, self.runner
         names = [quantity.name for quantity in plan.quantities]
-        self.orders = observed_orders(work.rows, plan.axes, names)
-        for physics in work.known:
-            mark_front(work.of(physics), names[0])
-            self.advice[physics] = advise(work.of(physics), names[0], main_axis(plan.axes))
+        self.orders = observed_orders(runner.rows, plan.axes, names)
+        for physics in runner.references:
+            mark_front(runner.rows_of(physics), names[0])
+            self.advice[physics] = advise(runner.rows_of(physics), names[0], main_axis(plan.axes))
             choose_recommended(self.advice[physics])
-        self.columns, self.ready = list(record(plan, work.rows[0])), True
+        self.columns, self.ready = list(csv_row(plan, runner.rows[0])), True
 
     def csv_rows(self, outcome: Outcome[Any]) -> Iterator[dict[str, Any]]:
         if isinstance(outcome, StudyRow):
-            yield record(self.plan, outcome)
+            yield csv_row(self.plan, outcome)
 
     def csv_cell(self, value: Any) -> str:
         if value is None:
@@ -553,8 +561,8 @@ class Study(View[Outcome[Any]]):
         return repr(float(value)) if isinstance(value, float) else str(value)
 
     def content(self, outcomes: Sequence[Outcome[Any]], ranks: int, command: Sequence[str]) -> dict[str, Any]:
-        """All of the table, the repeats, the references, orders and advice."""
-        plan, known = self.plan, self.work.known
+        """Content of the JSON file: the table with all repeats, references, orders and advice."""
+        plan, known = self.plan, self.runner.references
         return {
             "scene": plan.request.scene,
             "title": plan.base.title,
@@ -571,11 +579,15 @@ class Study(View[Outcome[Any]]):
                 {
                     "scene": dict(physics),
                     "kind": one.kind,
-                    "reference": one.words,
+                    "reference": one.description,
                     "run_seconds": one.seconds,
                     "own_error": {
-                        name: {"error": own.error, "observed_order": own.order, "trusted": own.trusted}
-                        for name, own in one.own.items()
+                        name: {
+                            "error": own.error,
+                            "observed_order": own.order,
+                            "trusted": own.trusted,
+                        }
+                        for name, own in one.own_errors.items()
                     },
                     "notes": one.notes,
                 }
@@ -583,13 +595,13 @@ class Study(View[Outcome[Any]]):
             ],
             "combinations": [
                 {
-                    **{key: value for key, value in record(plan, row).items() if value not in ("", None)},
-                    "errors": {name: row.shown(name) for name in row.errors},
+                    **{key: value for key, value in csv_row(plan, row).items() if value not in ("", None)},
+                    "errors": {name: row.resolved(name) for name in row.errors},
                     "not_resolved": sorted(row.unresolved),
                     "timings": [asdict(timing) for timing in row.result.timings],
                     "notes": row.result.notes,
                 }
-                for row in self.work.rows
+                for row in self.runner.rows
             ],
             "orders": [asdict(order) for order in self.orders],
             "advice": [
@@ -597,7 +609,7 @@ class Study(View[Outcome[Any]]):
                     "scene": dict(physics),
                     "accuracy": one.target,
                     "combination": one.row.case.name if one.row is not None else None,
-                    "words": one.words,
+                    "words": one.text,
                 }
                 for physics, advice in self.advice.items()
                 for one in advice
@@ -605,21 +617,21 @@ class Study(View[Outcome[Any]]):
         }
 
     def fill(self, report: Report, outcomes: Sequence[Outcome[Any]], summary: str, *, plots: bool) -> None:
-        plan, rows, known = self.plan, self.work.rows, self.work.known
+        plan, rows, known = self.plan, self.runner.rows, self.runner.references
         for physics, one in known.items():
-            _advise(report, plan, physics, one, self.advice[physics])
+            _write_advice(report, plan, physics, one, self.advice[physics])
         report.heading("What was run")
-        report.bullets(_what(plan, rows, self.ranks))
+        report.bullets(_describe_runs(plan, rows, self.ranks))
         report.bullets([*plan.notes, *(note for one in known.values() for note in one.notes)])
         for number, (physics, one) in enumerate(known.items(), start=1):
-            report.heading("Diagrams" + (f" for {in_words(physics)}" if physics else ""))
+            report.heading("Diagrams" + (f" for {describe_settings(physics)}" if physics else ""))
             mark = "" if len(known) == 1 else f"-{number}"
-            for drawing in drawings(plan, self.work.of(physics), one, mark):
+            for drawing in drawings(plan, self.runner.rows_of(physics), one, mark):
                 report.figure(drawing)
         report.heading("Errors and run times")
-        _tables(report, plan, rows)
-        _orders(report, self.orders)
-        _references(report, known)
+        _write_tables(report, plan, rows)
+        _write_orders(report, self.orders)
+        _write_references(report, known)
         failed = [[row.case.title, row.result.problem] for row in rows if not row.passed]
         if failed:
             report.heading("What failed")
@@ -634,7 +646,7 @@ class Study(View[Outcome[Any]]):
 
 
 def all_versions() -> dict[str, str]:
-    """Versions of the program and all that takes part."""
+    """Versions of the program and of the packages that it uses."""
     found = versions()
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
@@ -642,13 +654,13 @@ def all_versions() -> dict[str, str]:
     return found
 
 
-def busy(ranks: int) -> list[str]:
-    """A note where other processes leave too few cores of this machine idle for so many ranks."""
+def note_load(ranks: int) -> list[str]:
+    """A note if other processes leave fewer idle cores than there are ranks."""
     cores, load = os.cpu_count() or 1, -math.inf
     with suppress(OSError):
         load = os.getloadavg()[0]
-    words = "run times may be larger and spread more than on an idle one"
-    note = f"the machine was busy when this began (load {load:.1f} on {cores} cores): {words}"
+    note = f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
+    note += "run times may be larger and spread more than on an idle one"
     return [note] if load + ranks > cores + 0.5 else []
 
 
@@ -662,5 +674,5 @@ def processor() -> str:
 
 
 def machine() -> str:
-    """Processor and cores, in words."""
+    """Processor and number of cores."""
     return f"{processor()}, {os.cpu_count() or 1} cores"

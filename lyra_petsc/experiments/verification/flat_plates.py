@@ -1,13 +1,11 @@
-"""Rectangles and strips, their meshes (patterns of grids, an irregular one, gmsh's), materials and
-vibrations.
+"""Plates and strips: meshes (patterns of grids, irregular, gmsh), materials, small vibrations.
 
-Strips one cell wide are cantilevers clamped at x = 0, of length 1 m with B = 1 N·m and c12 = 0, or hang
-between two supports. One cell across keeps apart what a plate adds to a strip: wider strips resist with their
-membrane against the lateral curvature that hinges give them.
+Strips one cell wide are cantilevers of length 1 m, clamped at x = 0, with B = 1 N·m and c12 = 0, or hang
+between two supports. In wider strips the membrane resists the lateral curvature that hinges cause, which is
+an effect of plates that one cell across excludes.
 
-Natural frequencies come from the assembled stiffness and the lumped masses, by Lanczos iterations that solve
-with the (shifted) stiffness. Unknowns of edges have no mass: forces of inertia let them balance by
-themselves.
+Natural frequencies follow from the assembled stiffness and the lumped masses by Lanczos iterations with the
+shifted and inverted stiffness. Unknowns on edges have no mass.
 """
 
 from __future__ import annotations
@@ -32,11 +30,11 @@ KINDS = ("diagonal", "alternating", "criss-cross", "irregular", "gmsh")
 
 
 HELD = {"CCCC": (True, SIDES), "SSSS": (False, SIDES), "CFFF": (True, ("left",)), "FFFF": (True, ())}
-"""Whether edges of plates are clamped (C) or supported (S), and which; the others are free (F)."""
+"""Whether the named edges of a plate are clamped (C) or supported (S); the other edges are free (F)."""
 
 
 def held(edges: str) -> list[dict[str, Any]]:
-    """The handles of a plate whose edges are named as in `HELD`."""
+    """The handles of a plate with the boundary conditions ``edges``, a key of `HELD`."""
     clamp, clamped = HELD[edges]
     return [{"group": side, "clamp": clamp} for side in clamped]
 
@@ -46,10 +44,10 @@ def flat_mesh(
 ) -> dict[str, Any]:
     """The mesh block of a rectangle of nx × ny cells with groups left, right, bottom, top; collective.
 
-    gmsh's edges are as long as a cell along x, and it puts a vertex in the middle where ny is even.
+    Edges of gmsh's mesh are as long as a cell along x; it has a vertex in the middle if ny is even.
     """
     if kind == "irregular":
-        return bench.mesh_with_groups(*irregular_rectangle(nx, ny, width, height), side_edges(nx, ny))
+        return bench.grouped_mesh(*irregular_rectangle(nx, ny, width, height), side_edges(nx, ny))
     if kind == "gmsh":
         middle = () if ny % 2 else (0.5 * width, 0.5 * height)
         return bench.gmsh_mesh(rectangle_script(width, height, width / nx, middle))
@@ -57,16 +55,16 @@ def flat_mesh(
 
 
 def strip_mesh(bench: Bench, kind: str, n: float, width: float, length: float = 1.0) -> dict[str, Any]:
-    """The mesh block of a strip, n cells along; ``width`` over its length, 0 is one square cell; collective.
+    """The mesh block of a strip with n cells along it; collective.
 
-    Cells are as near to squares as the width allows.
+    ``width`` is relative to the length; 0 means one square cell. Cells are nearly square.
     """
     across = max(1, round(width * n))
     return flat_mesh(bench, kind, round(n), across, length, (width or 1.0 / n) * length)
 
 
 def plate_material(membrane: float, stiffness: float = 1.0, poisson: float = 0.0) -> dict[str, Any]:
-    """Material of 1 kg/m²: c11 [N/m] and the plate stiffness D [N·m], both with ``poisson``; directors."""
+    """Material of 1 kg/m² with directors: c11 [N/m] and plate stiffness D [N·m], both with ``poisson``."""
     return {
         "density": 1.0,
         "membrane": isotropic(membrane, poisson),
@@ -81,16 +79,16 @@ def plate_material(membrane: float, stiffness: float = 1.0, poisson: float = 0.0
 
 
 MEMBRANE = 1e6
-"""C L²/B: as of a strip with a thickness of 0.0035 L. The exact shapes take its stretch into account."""
+"""C L²/B, as of a strip of thickness 0.0035 L. The exact shapes take its stretch into account."""
 
 DENSITY = 1.0
 """kg/m²"""
 
 
 def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> dict[str, Any]:
-    """A scene: n square cells along the strip, its end clamped, static.
+    """Static scene of a strip with n square cells along it, clamped at one end.
 
-    ``more`` are further keys of the scene; ``material`` is added to.
+    ``more`` are further keys of the scene; entries of ``material`` are added.
     """
     along = round(n)
     material = {"density": DENSITY, "membrane": isotropic(membrane), "bending": 1.0}
@@ -100,7 +98,7 @@ def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> di
 
 
 LENGTH, WIDTH, STIFFNESS, G = 1.0, 0.1, 1000.0, 9.81
-"""m, m, N/m, m/s²"""
+"""Length [m], width [m], membrane stiffness [N/m], gravity [m/s²] of hanging strips"""
 
 
 def arc(s: Array, span: float) -> Array:
@@ -118,11 +116,11 @@ def arc(s: Array, span: float) -> Array:
 
 
 def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]:
-    """The scene: supports (dx, dz) [m] apart, weight e times c11, n cells; static.
+    """Static scene of a strip between two supports at distance (dx, dz) [m]; weight e × c11, n cells.
 
-    Nothing in it knows the catenary: the strip starts from an arc of a circle between the supports.
+    The strip starts from a circular arc between the supports, independent of the catenary.
     """
-    # all inner vertices of a diagonal grid have the same mass, so that the edges hang alike
+    # all inner vertices of a diagonal grid have the same mass, so that both edges hang equally
     vertices, triangles = rectangle(n, 1, LENGTH, WIDTH, alternating=False)
     chord = math.hypot(dx, dz)
     along = arc(vertices[:, 0], chord)
@@ -137,22 +135,22 @@ def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]
 
 
 MORE = 8
-"""Vectors beside those asked for: one of an unstable state may be farther away than stable ones."""
+"""Additional eigenvectors: the mode of an unstable state may be farther from the shift than stable modes."""
 
 ROUND_OFF = 1e-6
-"""Square over the shift below which a frequency is called zero."""
+"""Squared frequency over the shift below which a frequency counts as zero."""
 
 
 @dataclass(frozen=True)
 class SmallMotions:
-    """K and M of a sheet about its present state, the same on every rank.
+    """Stiffness and mass matrices of a sheet in its present state, the same on every rank.
 
     Attributes
     ----------
     stiffness : (n, n) scipy.sparse.csr_array
-        [N/m], of the coordinates of vertices and the unknowns of edges.
+        Stiffness [N/m] of the coordinates of vertices and the unknowns of edges.
     mass : (n,) float64
-        [kg]; 0 of edges.
+        Masses [kg]; 0 for unknowns of edges.
     free : (n,) int64
         Unknowns that no handle prescribes at the present time.
     vertices : (V, 3) int64
@@ -166,7 +164,7 @@ class SmallMotions:
 
     @property
     def stiffness_of_free(self) -> Any:
-        """(m, m) csc"""
+        """Stiffness of the free unknowns, (m, m), in csc format."""
         return self.stiffness[self.free][:, self.free].tocsc()
 
     def displacements(self, force: Array) -> Array:
@@ -180,7 +178,7 @@ class SmallMotions:
 
 
 def small_motions(trial: Trial) -> SmallMotions:
-    """K of all elastic terms, and M, at the present state; collective."""
+    """Stiffness of all elastic terms and masses in the present state; collective."""
     from scipy.sparse import csr_array, vstack
 
     problem = trial.simulation.problem
@@ -233,15 +231,15 @@ def lowest_modes(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, A
 def lowest_squares(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, Array]:
     """Lowest squared natural frequencies and their shapes about the present state; collective.
 
-    Handles hold what they prescribe at the present time. The state is taken to be an equilibrium.
+    Handles fix what they prescribe at the present time. The state must be an equilibrium.
 
     Parameters
     ----------
     trial : Trial
     count : int
-        How many.
+        Number of modes.
     shift : float [1/s²]
-        K + shift · M is factored, which must be positive definite: for what moves without a force.
+        K + shift · M is factored and must be positive definite, which rigid-body modes require.
 
     Returns
     -------
@@ -272,7 +270,7 @@ def _lowest(motions: SmallMotions, count: int, shift: float) -> tuple[Array, Arr
     inertia = diags(mass, format="csc")
     rank = np.count_nonzero(mass)
     more = min(count + MORE, rank - 1)
-    first = np.random.default_rng(0).standard_normal(len(mass))  # the same whenever it is run
+    first = np.random.default_rng(0).standard_normal(len(mass))  # reproducible
     try:
         squares, vectors = eigsh(
             stiffness, more, inertia, sigma=-shift, v0=first, ncv=min(2 * more + 1, rank)

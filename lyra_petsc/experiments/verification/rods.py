@@ -1,29 +1,30 @@
-"""Cantilevers that bend without limit: exact shapes by collocation (scipy).
+"""Large deflections of cantilevers and buckled rods: accurate shapes by collocation (scipy).
 
 A strip clamped horizontally at S = 0 carries its weight w [N/m²] and a tip load P [N/m], both dead and
-downwards. θ is the angle below the horizontal, V = P + w (L − S) the vertical force per width carried by
-the section at the material coordinate S, so that T = V sin θ is the tension and V cos θ the shear::
+downwards. θ is the angle below the horizontal and V = P + w (L − S) the vertical force per width in the
+section at the material coordinate S, so that T = V sin θ is the tension and V cos θ the shear force::
 
     B θ'' + λ V cos θ = 0,   θ(0) = 0, θ'(L) = 0,   T = ½ C (λ³ − λ),   x' = λ cos θ, z' = −λ sin θ
 
-with the stretch λ of a St. Venant-Kirchhoff strip without lateral contraction (λ = 1 where C is infinite).
+with the stretch λ of a St. Venant-Kirchhoff strip without lateral contraction (λ = 1 if C is infinite).
 Sources: Bisshopp and Drucker, Quart. Appl. Math. 3 (1945) 272-275 (tip load); heavy elastica: Romero et
 al., ACM TOG 40(4):66 (2021), the cantilever test.
 
-A narrow strip is a rod that cannot bend in its own plane. On a mesh of single diagonals bending and twist
-are coupled; with the lateral curvature relaxed, hinges give square cells the energy per area::
+A narrow strip is a rod that cannot bend in its own plane. Hinges on a mesh of single diagonals couple bending
+and twist; with relaxed lateral curvature the energy per area of square cells is::
 
     ½ B (κ² + 2 κ τ + 5 τ²)
 
-which for free twist is ½ · 0.8 B κ², but a strip that bends far cannot twist freely: it leaves its plane.
-Frame d1 (along), d2 (across), d3 (normal), rotation rate ω = (τ, −κ, 0) in it, force F of the part beyond::
+With free twist this is ½ · 0.8 B κ², but a strip with large deflections cannot twist freely: it leaves its
+plane. Its frame is d1 (along), d2 (across), d3 (normal), with the rotation rate ω = (τ, −κ, 0) in this frame
+and the internal force F::
 
     M' = −λ d1 × F,   M · d1 = B (κ + 5 τ),   M · d2 = −B (κ + τ),   r' = λ d1,   F · d1 = ½ C (λ³ − λ)
 
-M · d3 is what keeps the strip from bending in its plane. Source: Kirchhoff rods, e.g. S. S. Antman, Nonlinear
-Problems of Elasticity, 2nd ed., chapter 8.
+M · d3 is the reaction to the constraint against bending in the plane. Source: Kirchhoff rods, e.g. S. S.
+Antman, Nonlinear Problems of Elasticity, 2nd ed., chapter 8.
 
-Columns and tall cantilevers buckle: `column_shape`, `tall_cantilever`. Pressure follows: `pressed_tip`.
+Buckling of columns and tall cantilevers: `column_shape`, `tall_cantilever`. Follower pressure: `pressed_tip`.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ import numpy as np
 from lyra_petsc.arrays import Array
 
 POINTS, ACCURACY = 201, 1e-10
-"""Of a rod in the first guess, and the relative residual of its equations in the end."""
+"""Points of a rod in the initial guess, and relative residual of its equations in the solution."""
 
 PACE = 0.7
-"""Steps of the load in a doubling of it."""
+"""Load steps per doubling of the load."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Cantilever:
 
 @cache
 def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Cantilever:
-    """The shape that grows out of the straight strip.
+    """The equilibrium that is continuously connected to the straight strip.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
     tip_load : float
         α = P L² / B.
     stretch : float
-        B / (C L²); 0 is an inextensible strip.
+        B / (C L²); 0 for an inextensible strip.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
         If Newton's method does not converge.
     """
 
-    # θ, θ', reach, drop
+    # state: θ, θ', reach, drop
     def rates(s: Array, state: Array, part: float) -> Array:
         angle, bend, _, _ = state
         force = part * (tip_load + weight * (1.0 - s))
@@ -124,20 +125,20 @@ def _grown(
     along: int,
     load: float,
 ) -> Array:
-    """The state (m, n) from the clamp to the tip of a rod that has grown with its load, by collocation.
+    """The state (m, n) of a rod from clamp to tip, by continuation in its load and collocation.
 
     Parameters
     ----------
     rates : callable
-        Derivatives (m, n) along the rod, of places s, a state and the part of the load.
+        Derivatives (m, n) along the rod as a function of s, the state and the load factor.
     ends : callable
-        What is to vanish (m,), of the states at the clamp and at the tip.
+        Residuals (m,) of the boundary conditions at the clamp and at the tip.
     start : (m,)
-        The state at the clamp of the straight rod, which is the same all along.
+        The state of the straight rod, the same for all s except for one entry.
     along : int
-        But for this one, the place along it.
+        This entry: the position along the rod.
     load : float
-        Its size.
+        Size of the load.
 
     Raises
     ------
@@ -162,7 +163,7 @@ def _solved(
     accuracy: float = ACCURACY,
     parameters: Sequence[float] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Places, states and parameters that solve a boundary value problem."""
+    """Solve a boundary value problem; returns s, states and parameters."""
     from scipy.integrate import solve_bvp
 
     found = solve_bvp(rates, ends, s, state, p=parameters, tol=accuracy, max_nodes=50_000)
@@ -172,7 +173,7 @@ def _solved(
 
 
 def stretches(tension: Array, compliance: float) -> Array:
-    """Stretch λ of ½ (λ³ − λ) = tension × compliance."""
+    """Solve ½ (λ³ − λ) = tension × compliance for the stretch λ, by Newton's method."""
     length = np.ones_like(tension)
     for _ in range(50):
         change = (0.5 * (length**3 - length) - compliance * tension) / (1.5 * length**2 - 0.5)
@@ -199,7 +200,7 @@ def heavy_coupled_strip(weight: float, stretch: float = 0.0) -> tuple[float, flo
         If Newton's method does not converge.
     """
 
-    # quaternion of the frame, moment in space, and place
+    # state: quaternion of the frame, moment in space, position
     def ends(clamp: Array, tip: Array) -> Array:
         return np.concatenate([clamp[:4] - [1.0, 0.0, 0.0, 0.0], tip[4:7], clamp[7:]])
 
@@ -231,15 +232,15 @@ def _rates(s: Array, state: Array, part: float, weight: float, stretch: float) -
 def column_shape(*, shortening: float | None = None, load: float | None = None) -> tuple[float, float]:
     """P L²/B and height over length of a buckled inextensible column with pinned ends.
 
-    One is given: the way of the ends towards each other over the length, or P L²/B > π². With k the sine of
-    half the angle at the ends, P L²/B = 4 K², distance of the ends 2 E/K − 1 and height k/K. Clamped, each
-    half of the column is the same curve at half the size: four times the load, the same height.
+    Give either the shortening of the distance of the ends over the length, or P L²/B > π². With the sine k of
+    half the angle at the ends: P L²/B = 4 K², distance of the ends 2 E/K − 1, height k/K. Each half of a
+    clamped column is the same curve at half the size: four times the load, the same height.
     """
     from scipy.optimize import brentq
     from scipy.special import ellipe, ellipk
 
     def off(k: float) -> float:
-        """How far the curve of modulus k is off what is given."""
+        """Residual of the given quantity for the modulus k."""
         if load is None:
             return 2.0 - 2.0 * ellipe(k * k) / ellipk(k * k) - shortening
         return 4.0 * ellipk(k * k) ** 2 - load
@@ -250,15 +251,15 @@ def column_shape(*, shortening: float | None = None, load: float | None = None) 
 
 
 def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]:
-    """P L²/√(EI GJ) at which a cantilever tips over, and the turn of its tip over the deflection over L.
+    """Buckling load P L²/√(EI GJ) of a tall cantilever, and rotation of its tip over deflection/L.
 
-    With u = θ' the rate of turn, s from the clamp over the length and μ = EΓ/(GJ L²) of the warping that
-    the clamp suppresses::
+    With the twist u = θ', the distance s from the clamp over the length, and μ = EΓ/(GJ L²) for the warping
+    that the clamp suppresses::
 
         u − μ u'' = κ² ∫ₛ¹ (1 − t)² θ dt,   EI w'' = P L³ (1 − s) θ,   θ(0) = w(0) = w'(0) = 0
         with μ: u(0) = u'(1) = 0
 
-    Without μ κ = 4.0126 (Prandtl and Michell 1899); of a tall strip μ counts as the depth over the length.
+    For μ = 0: κ = 4.0126 (Prandtl and Michell 1899). The effect of √μ is of the order of depth over length.
 
     Parameters
     ----------
@@ -266,7 +267,7 @@ def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]
         EI/GJ and μ.
     """
 
-    # θ and ∫ₛ¹ (1 − t)² θ dt, with μ also u and √μ u'; the parameter is κ², the turn of the tip is 1
+    # θ and ∫ₛ¹ (1 − t)² θ dt, with μ also u and √μ u'; the parameter is κ², the rotation of the tip is 1
     layer = math.sqrt(warping)
 
     def rates(s: Array, state: Array, square: Array) -> Array:
@@ -288,11 +289,10 @@ def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]
 
 
 def pressed_tip(load: float) -> tuple[float, float]:
-    """Where the tip (x, z) of an inextensible cantilever of length 1 along x is under a pressure of ``load``
-    B/L³ that follows it and lifts it at first.
+    """Tip (x, z) of an inextensible cantilever of length 1 along x under a follower pressure ``load`` B/L³.
 
-    With θ, κ, N and Q the angle, the curvature and the tension and shear over B/L², from the tip on, where
-    the last three are 0: θ' = κ, κ' = −Q, N' = Q κ, Q' = −N κ − load.
+    The pressure lifts the strip at first. With angle θ, curvature κ, tension N and shear force Q over B/L²,
+    integrated from the tip, where κ, N and Q vanish: θ' = κ, κ' = −Q, N' = Q κ, Q' = −N κ − load.
     """
     from scipy.integrate import solve_ivp
 

@@ -1,6 +1,4 @@
-"""Cases of ``verify``: questions with known answers at several resolutions, how they are run and judged, and
-what is reported of them.
-"""
+"""Cases of ``verify``: problems with known solutions, and how they are run, judged and reported."""
 
 from __future__ import annotations
 
@@ -28,25 +26,25 @@ from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
 @dataclass
 class ErrorRow:
-    """One line of a case's table.
+    """One row in the table of a case.
 
     Attributes
     ----------
     quantity, unit : str
     n, h : float
-        Resolution, and the length or time that shrinks.
+        Resolution n, and the length or time h that decreases with it.
     value, exact : float
         In ``unit``.
     error : float
-        Relative to the scale of the quantity.
+        Error relative to the scale of the quantity.
     order : float
-        From the row before: log of the errors' ratio over log of the ratio of h; NaN where there is none.
+        Order of convergence from the row before; NaN if there is none.
     steps : int
-        Accepted time or load steps of all simulations of this resolution.
+        Accepted time or load steps of all simulations at this resolution.
     wall_seconds : float
-        Of all of them, set-up included.
+        Wall time [s] of these simulations, set-up included.
     problem : str
-        Why there is no value, in words; empty if there is one.
+        Why there is no value; empty if there is one.
     """
 
     quantity: str
@@ -63,29 +61,29 @@ class ErrorRow:
 
 
 class Claim(ABC):
-    """A statement about the rows of one quantity."""
+    """A claim about the rows of one quantity."""
 
-    #: whether the errors are of a size that an order can be read from
+    #: whether errors are large enough for an order of convergence
     has_order: ClassVar[bool] = True
 
     @abstractmethod
     def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
-        """The verdict on rows without problems, coarsest first, at least one.
+        """The verdict on one or more rows without problems, coarsest first.
 
-        ``finest`` is h of the finest resolution the case has, which a quick run leaves out.
+        ``finest`` is h of the finest resolution of the case, which a quick run does not reach.
         """
 
 
 @dataclass(frozen=True)
 class Exact(Claim):
-    """At every resolution the error is at most ``bound``: only round-off and the solver's tolerance."""
+    """At every resolution the error is at most ``bound``: round-off and the tolerance of the solver."""
 
     has_order: ClassVar[bool] = False
 
     bound: float = 1e-10
 
     def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
-        worst = max(rows, key=_size_of_error)
+        worst = max(rows, key=_error_or_infinity)
         good = worst.error <= self.bound
         words = f"largest error {worst.error:.1e}, " + ("within" if good else "above")
         return Verdict(good, f"{words} {self.bound:.0e}")
@@ -93,9 +91,9 @@ class Exact(Claim):
 
 @dataclass(frozen=True)
 class Converges(Claim):
-    """The error shrinks with ``order`` in h, within ``slack``, to at most ``bound`` at the finest.
+    """The error decreases with ``order`` in h, ± ``slack``, to at most ``bound`` at the finest resolution.
 
-    The order is that of the two finest rows; with an infinite slack none is claimed. Where a quick run
+    The order is that between the two finest rows; with an infinite slack no order is claimed. If a quick run
     stops at a larger h, the bound grows with h to the power of the order.
     """
 
@@ -117,20 +115,20 @@ class Converges(Claim):
 
 
 def at_finest(bound: float) -> Converges:
-    """At the finest resolution the error is at most ``bound``; where a run stops before, (h / finest)² of it.
+    """At the finest resolution the error is at most ``bound``; at a larger h (h / finest)² times as much.
 
-    No order is claimed: strips that bend within a cell or two, and criss-cross ones whose membrane resists
-    the dimple in every cell, converge faster at first than in the end.
+    No order is claimed: strips that bend within one or two cells, and criss-cross meshes whose membrane
+    resists the dimple in every cell, converge faster on coarse meshes than on fine ones.
     """
     return Converges(2.0, bound, slack=math.inf)
 
 
-def _size_of_error(row: ErrorRow) -> float:
+def _error_or_infinity(row: ErrorRow) -> float:
     return math.inf if math.isnan(row.error) else row.error
 
 
 def observed_order(before: ErrorRow, row: ErrorRow) -> float:
-    """Order of convergence between two rows; NaN where one error is zero or missing."""
+    """Order of convergence between two rows; NaN if an error is zero or missing."""
     if not (before.error > 0.0 and row.error > 0.0 and before.h != row.h):
         return math.nan
     return math.log(before.error / row.error) / math.log(before.h / row.h)
@@ -148,7 +146,7 @@ class Measured:
     unit : str
         ``1`` for a pure number.
     scale : float or None
-        What the error is relative to, in ``unit``; None: the size of ``exact``.
+        Reference size for the error, in ``unit``; None: the size of ``exact``.
     """
 
     quantity: str
@@ -164,14 +162,14 @@ class Measured:
         return abs(self.value - self.exact) / scale
 
 
-def missed(quantity: str, found: Array, exact: Array, unit: str = "1") -> Measured:
-    """By how much a vector is missed, whatever the direction, over the size of the exact one."""
+def vector_error(quantity: str, found: Array, exact: Array, unit: str = "1") -> Measured:
+    """The norm of the error of a vector, relative to the norm of the exact one."""
     size = float(np.linalg.norm(exact))
     return Measured(quantity, size + float(np.linalg.norm(found - exact)), size, unit)
 
 
 def worst(found: Iterable[Sequence[Measured]]) -> list[Measured]:
-    """Of each quantity, of which each entry has one, the one that errs most."""
+    """For each quantity the measurement with the largest error; each entry of ``found`` has all of them."""
     return [max(each, key=lambda one: one.error) for each in zip(*found, strict=True)]
 
 
@@ -180,28 +178,28 @@ Measure = Callable[[Bench, float], Iterable[Measured]]
 
 @dataclass(frozen=True)
 class VerificationCase(Case):
-    """A question with a known answer; `case` makes one of a function that measures.
+    """A problem with a known solution; the decorator `case` makes one from a function that measures it.
 
     Attributes
     ----------
     measure : callable (bench, n) → Measured, one by one
-        Collective; the same result on every rank. A generator that yields what a simulation gave as soon
-        as that has ended has its steps and run time charged to it, any other iterable those of all its
-        simulations.
+        Collective; the same result on every rank. Rows of a generator, which yields results as soon as a
+        simulation has ended, have the steps and run time of this simulation; rows of other iterables those
+        of all simulations.
     source : str
-        Where the answer comes from.
+        Source of the solution.
     resolutions : sequence of float
-        n, ascending: the higher, the finer.
+        Resolutions n, coarsest first.
     claim : Claim
-        What every quantity must satisfy.
+        Claim about every quantity.
     claims : mapping of quantity → Claim
-        For quantities of which something else is claimed.
+        Exceptions from ``claim``.
     quick : int
-        How many of the resolutions ``--quick`` takes, from the coarsest.
+        Number of resolutions of ``--quick``, from the coarsest.
     counts : str
         What n counts.
     size : callable n → h
-        The length or time that shrinks; orders are with respect to it.
+        The length or time h; orders of convergence are with respect to it.
     """
 
     measure: Measure
@@ -214,17 +212,17 @@ class VerificationCase(Case):
     size: Callable[[float], float] = lambda n: 1.0 / n
 
     def claim_of(self, quantity: str) -> Claim:
-        """What is claimed of a quantity."""
+        """The claim about a quantity."""
         return self.claims.get(quantity, self.claim)
 
 
 def case(title: str, **more: Any) -> Callable[[Measure], VerificationCase]:
-    """A decorator: the case that is named as the function which measures it; ``more`` as in `Case`."""
+    """Decorator that makes a case of a function, named as the function; ``more`` as of `VerificationCase`."""
     return lambda measure: VerificationCase(measure.__name__.replace("_", "-"), title, measure, **more)
 
 
-def data(name: str) -> dict[str, Any]:
-    """A file of ``verification/data``, without ``.json``."""
+def load_data(name: str) -> dict[str, Any]:
+    """Read a JSON file of ``verification/data``; ``name`` is without suffix."""
     path = files("lyra_petsc.experiments.verification").joinpath("data", f"{name}.json")
     return json.loads(path.read_text(encoding="utf-8"))
 
@@ -232,13 +230,13 @@ def data(name: str) -> dict[str, Any]:
 STATIC: dict[str, Any] = {"analysis": "static"}
 FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
 ASSEMBLED = {"end": 1.0, "step": 1.0}
-"""Time of a scene that is set up and not stepped."""
+"""Time block of a scene that is set up but not stepped."""
 
 
 def scene(
     mesh: dict[str, Any], material: dict[str, Any], time: dict[str, Any] = STATIC, **more: Any
 ) -> dict[str, Any]:
-    """A scene as in a file; ``more`` are further keys."""
+    """The content of a scene file; ``more`` are further keys."""
     return {"mesh": mesh, "material": material, "time": dict(time), **more}
 
 
@@ -248,30 +246,30 @@ def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal
 
 
 def isotropic(stiffness: float, poisson: float = 0.0) -> dict[str, float]:
-    """The membrane block [N/m] of a material with c11 = ``stiffness`` in all directions."""
+    """The membrane block [N/m] of an isotropic material with c11 = ``stiffness``."""
     shear = 0.5 * (1.0 - poisson) * stiffness
     return {"c11": stiffness, "c22": stiffness, "c12": poisson * stiffness, "c33": shear}
 
 
-def farthest(values: Array, exact: float) -> float:
-    """The one of the values that differs most from the exact one."""
+def worst_value(values: Array, exact: float) -> float:
+    """The value that differs most from the exact one."""
     return float(values[np.argmax(np.abs(values - exact))])
 
 
 @dataclass
 class VerificationOutcome(Outcome[VerificationCase]):
-    """What came of a case; its verdicts are by quantity.
+    """The result of a case; its verdicts are by quantity.
 
     Attributes
     ----------
     rows : list of ErrorRow
-        By quantity, within a quantity from the coarsest on.
+        Sorted by quantity, coarsest first.
     """
 
     rows: list[ErrorRow] = field(default_factory=list)
 
     def tables(self) -> dict[str, list[ErrorRow]]:
-        """The rows of each quantity, in the order in which they were measured."""
+        """The rows of each quantity, in the order of measurement."""
         found: dict[str, list[ErrorRow]] = {}
         for row in self.rows:
             found.setdefault(row.quantity, []).append(row)
@@ -295,18 +293,18 @@ def run_case(
     quick : bool
         Only the coarsest resolutions.
     warm : bool
-        Measure the coarsest once before the clock runs, so that no compilation is counted.
+        Measure the coarsest resolution once untimed, so that compilation is not counted.
     watch : callable, optional
         Called before every step on all ranks; may raise to end the work.
     """
     began = time.perf_counter()
     resolutions = list(case.resolutions)[: case.quick] if quick else list(case.resolutions)
     if warm and len(resolutions) > 1:
-        _rows_at(comm, watch, case, resolutions[0])
+        _measure_rows(comm, watch, case, resolutions[0])
     tables: dict[str, list[ErrorRow]] = {}
     problems: list[ErrorRow] = []
     for n in resolutions:
-        for row in _rows_at(comm, watch, case, n):
+        for row in _measure_rows(comm, watch, case, n):
             if row.problem:
                 problems.append(row)
                 continue
@@ -327,10 +325,10 @@ def run_case(
     return outcome
 
 
-def _rows_at(
+def _measure_rows(
     comm: MPI.Comm, watch: Callable[[], None] | None, case: VerificationCase, n: float
 ) -> list[ErrorRow]:
-    """The rows of one resolution, and one that says why where it cannot run to its end."""
+    """The rows of one resolution; if it cannot run to its end, also a row with the reason."""
     comm.Barrier()
     began, h = time.perf_counter(), case.size(n)
     rows: list[ErrorRow] = []
@@ -364,7 +362,7 @@ HEADINGS = ("n", "h", "value", "exact", "error", "order", "steps", "run time [s]
 
 
 def cells(row: ErrorRow) -> list[str]:
-    """A row of a quantity's table, as it is shown."""
+    """The cells of a row in the table of a quantity."""
     return [
         f"{row.n:g}",
         f"{row.h:.4g}",
@@ -378,7 +376,7 @@ def cells(row: ErrorRow) -> list[str]:
 
 
 def headings(unit: str) -> list[str]:
-    """The heads of ``cells``, with the quantity's unit."""
+    """The headings of ``cells``, with the unit of the quantity."""
     suffix = "" if unit == "1" else f" [{unit}]"
     return [name + suffix if name in ("value", "exact") else name for name in HEADINGS]
 
@@ -445,7 +443,7 @@ class Verification(View[VerificationOutcome]):
 
 
 def _figures(report: Report, outcome: VerificationOutcome) -> None:
-    """Error against h and against run time, of the quantities that converge."""
+    """Plot error against h and against run time, for the quantities that converge."""
     case = outcome.case
     tables = {
         quantity: rows

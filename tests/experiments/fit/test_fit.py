@@ -16,7 +16,7 @@ import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.fit.estimate import Trial, Unknown, conclude, search
 from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene
-from lyra_petsc.experiments.fit.readings import Places
+from lyra_petsc.experiments.fit.readings import Positions
 
 TRUE = 4.2e-5
 
@@ -280,7 +280,7 @@ def test_values_are_in_the_order_of_their_axes() -> None:
 def test_each_simulation_has_its_own_rows() -> None:
     """Another partition may come at the address that the last one had."""
     rng = np.random.default_rng(1)
-    tip = Places("", "tip", 1.0, ("z", "x"), "m", wanted=[("tip", (2,)), (7, (0,))])
+    tip = Positions("", "tip", 1.0, ("z", "x"), "m", wanted=[("tip", (2,)), (7, (0,))])
     for _ in range(20):
         original, rows = rng.permutation(12), rng.permutation(12)[:3]
         x = rng.normal(size=(12, 3))

@@ -67,7 +67,7 @@ def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
     assert len(outcome.record.balances) == 4
     assert outcome.failures == {}
     assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
-    assert not any(balance.hinges_jumped for balance in outcome.record.balances)
+    assert not any(balance.jumped for balance in outcome.record.balances)
 
 
 @pytest.mark.parallel(2)
@@ -80,7 +80,7 @@ def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
 def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     [case] = selected(["pressed"], Scope.QUICK)
     outcome = run_case(comm, case, Setting(hanging_sheet(10), False, Scope.QUICK))
-    assert any(balance.hinges_jumped for balance in outcome.record.balances)
+    assert any(balance.jumped for balance in outcome.record.balances)
     assert "jumped" in outcome.verdicts["energy"].message
     assert outcome.failures == {}
 
@@ -89,7 +89,7 @@ def test_a_balance_does_not_miss_a_narrow_barrier(comm: MPI.Comm) -> None:
     """Of steps thousands of gaps long."""
     [case] = selected(["contact-gap-1e-5-10ms"], Scope.USUAL)
     outcome = run_case(comm, replace(case, steps=9), Setting(hanging_sheet(10), False, Scope.QUICK))
-    assert any(balance.hinges_jumped for balance in outcome.record.balances)
+    assert any(balance.jumped for balance in outcome.record.balances)
     assert outcome.failures == {}
 
 

@@ -180,9 +180,9 @@ def test_a_fold_spares_an_odd_number_of_cells() -> None:
 
 def test_noise_has_its_size_and_is_always_the_same() -> None:
     x = flat()
-    shift = sheets._with_noise(x, 0.025) - x
+    shift = sheets._noisy(x, 0.025) - x
     assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
-    np.testing.assert_array_equal(sheets._with_noise(x, 0.025), x + shift)
+    np.testing.assert_array_equal(sheets._noisy(x, 0.025), x + shift)
 
 
 def test_a_mirrored_shell_keeps_its_rim() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lyra_petsc.experiments.study.jobs import Result, Timing
-from lyra_petsc.experiments.study.plan import Axis, combinations
+from lyra_petsc.experiments.study.plan import Axis, make_combinations
 from lyra_petsc.experiments.study.study_report import (
     advise,
     choose_recommended,
@@ -19,10 +19,10 @@ from lyra_petsc.experiments.study.study_runner import (
     Chain,
     Estimate,
     StudyRow,
-    joined,
+    estimate_chain,
     mark_unresolved,
-    of_chain,
     richardson,
+    sum_estimates,
 )
 
 AXES = [
@@ -31,10 +31,10 @@ AXES = [
 ]
 
 
-def made_up(own: float = 0.0) -> list[StudyRow]:
+def made_up(own_errors: float = 0.0) -> list[StudyRow]:
     """Backward Euler errs by Δt, in 1 s/(100 Δt); BDF2 by 25 Δt², half as fast."""
     rows = []
-    for combination in combinations(AXES):
+    for combination in make_combinations(AXES):
         integrator, dt = combination.values
         assert isinstance(dt, float)
         first = integrator == "beuler"
@@ -42,7 +42,7 @@ def made_up(own: float = 0.0) -> list[StudyRow]:
         timings = [Timing(0.5, seconds * factor) for factor in (1.0, 0.95, 1.3)]
         result = Result("", integrator=str(integrator), steps=round(1.0 / dt), end=1.0, timings=timings)
         row = StudyRow(combination, result=result, errors={"position_max": dt if first else 25.0 * dt * dt})
-        row.own = {"position_max": own}
+        row.own_errors = {"position_max": own_errors}
         mark_unresolved(row)
         rows.append(row)
     return rows
@@ -69,8 +69,8 @@ def test_orders_are_those_of_the_steps_really_taken() -> None:
 
 def test_median_and_spread() -> None:
     row = made_up()[0]
-    assert row.run == pytest.approx(0.25)
-    assert row.total == pytest.approx(0.75)
+    assert row.run_time == pytest.approx(0.25)
+    assert row.total_time == pytest.approx(0.75)
 
 
 def test_the_front() -> None:
@@ -84,15 +84,15 @@ def test_advice_names_the_fastest_and_the_others() -> None:
     rows = made_up()
     advice = advise(rows, "position_max", AXES[1])
     assert [one.target for one in advice] == [0.1, 0.01, 0.001]
-    assert advice[0].words == (
+    assert advice[0].text == (
         "For 10 % choose beuler, Δt 40 ms: 250 ms (error 4 %, the coarsest that ran); "
         "bdf2 needs 500 ms (Δt 40 ms)."
     )
     assert advice[1].row is not None
-    assert advice[1].row.run == pytest.approx(1.0)
+    assert advice[1].row.run_time == pytest.approx(1.0)
     assert advice[2].row is None
-    assert "nothing that ran is accurate enough" in advice[2].words
-    assert "bdf2, Δt 10 ms, error 0.25 %, in 2 s" in advice[2].words
+    assert "nothing that ran is accurate enough" in advice[2].text
+    assert "bdf2, Δt 10 ms, error 0.25 %, in 2 s" in advice[2].text
     star = choose_recommended(advice)
     assert star is advice[1].row
     assert star.recommended
@@ -103,7 +103,7 @@ def test_no_setting_is_starred_where_none_keeps_1_percent() -> None:
     for row in rows:
         row.errors["position_max"] *= 10.0
     advice = advise(rows, "position_max")
-    assert "nothing that ran is accurate enough" in advice[1].words
+    assert "nothing that ran is accurate enough" in advice[1].text
     assert choose_recommended(advice) is None
     assert not any(row.recommended for row in rows)
 
@@ -118,31 +118,31 @@ def test_advice_goes_as_far_as_the_errors_and_no_further() -> None:
 
 def test_what_others_could_not_reach_is_said() -> None:
     rows = made_up()
-    words = advise(rows, "position_max")[1].words
+    words = advise(rows, "position_max")[1].text
     assert "did not reach it" not in words
     rows[2].errors["position_max"] = 0.012
-    words = advise(rows, "position_max")[1].words
+    words = advise(rows, "position_max")[1].text
     assert "choose bdf2, Δt 20 ms" in words
     assert "beuler did not reach it (Δt 10 ms: error 1.2 %, 1 s)" in words
 
 
 def test_an_error_below_the_references_own_is_no_number() -> None:
-    rows = made_up(own=1.5e-3)
+    rows = made_up(own_errors=1.5e-3)
     assert rows[5].unresolved == {"position_max"}  # 0.0025 < 2 · 0.0015
-    assert math.isnan(rows[5].shown("position_max"))
+    assert math.isnan(rows[5].resolved("position_max"))
     assert rows[4].unresolved == set()
-    assert rows[4].at_most("position_max") == pytest.approx(0.0115)
-    assert rows[5].at_most("position_max") == pytest.approx(0.0045)
+    assert rows[4].error_bound("position_max") == pytest.approx(0.0115)
+    assert rows[5].error_bound("position_max") == pytest.approx(0.0045)
     orders = observed_orders(rows, AXES, ["position_max"])
     assert len(orders[1].neighbours) == 1
     mark_front(rows, "position_max")
     assert rows[5].on_front  # it is more accurate than all others, however much
-    words = advise(rows, "position_max")[1].words
+    words = advise(rows, "position_max")[1].text
     assert "choose bdf2, Δt 10 ms: 2 s (error below 0.45 %)" in words
 
 
 def test_the_references_own_error_counts_against_a_target() -> None:
-    rows = made_up(own=2e-4)
+    rows = made_up(own_errors=2e-4)
     assert rows[4].errors["position_max"] == pytest.approx(0.01)
     winner = advise(rows, "position_max")[1].row
     assert winner is rows[5]  # 0.01 ± 0.0002 is not surely within 1 %
@@ -152,16 +152,16 @@ def test_the_largest_error_is_told_beside_the_mean() -> None:
     rows = made_up()
     for row in rows:
         row.errors["position_l2"] = row.errors["position_max"] / 4.0
-    words = advise(rows, "position_l2")[1].words
+    words = advise(rows, "position_l2")[1].text
     assert "For 1 % choose beuler, Δt 40 ms: 250 ms (error 1 %, at most 4 % anywhere)" in words
     for row in rows:
-        row.own = {"position_l2": 0.0, "position_max": 0.002}
-    words = advise(rows, "position_l2")[1].words
+        row.own_errors = {"position_l2": 0.0, "position_max": 0.002}
+    words = advise(rows, "position_l2")[1].text
     assert "at most 4.2 % anywhere" in words, "the reference's own largest error is left out"
     for row in rows:
-        row.own["position_max"] = 0.03
+        row.own_errors["position_max"] = 0.03
         mark_unresolved(row)
-    assert "at most 9 % anywhere" in advise(rows, "position_l2")[1].words
+    assert "at most 9 % anywhere" in advise(rows, "position_l2")[1].text
 
 
 def test_failed_rows_are_left_out() -> None:
@@ -170,7 +170,7 @@ def test_failed_rows_are_left_out() -> None:
         row.result.problem, row.result.timings, row.errors = "no", [], {}
     mark_front(rows, "position_max")
     assert not any(row.on_front for row in rows[:3])
-    assert "beuler" not in advise(rows, "position_max")[0].words
+    assert "beuler" not in advise(rows, "position_max")[0].text
     assert advise(rows[:3], "position_max") == []
 
 
@@ -195,10 +195,10 @@ def test_richardson_trusts_no_higher_order_than_expected_and_no_divergence() -> 
 
 
 def test_errors_in_time_and_space_add_up() -> None:
-    both = joined([{"a": Estimate(1.0, 2.0, True)}, {"a": Estimate(0.5, 2.0, False)}])
+    both = sum_estimates([{"a": Estimate(1.0, 2.0, True)}, {"a": Estimate(0.5, 2.0, False)}])
     assert both["a"].error == 1.5
     assert not both["a"].trusted
-    two = of_chain([{"a": np.array([0.1, 0.2])}], Chain((), 0))
+    two = estimate_chain([{"a": np.array([0.1, 0.2])}], Chain((), 0))
     assert two["a"].error == 0.2
 
 
@@ -206,8 +206,8 @@ def test_a_largest_error_that_wanders_is_not_understated() -> None:
     """Two places take turns: between the coarser pair one leads, between the finer the other."""
     first, second = np.array([0.75, 0.45]), np.array([6.0, 1.2])  # at two samples
     chain = Chain((), 2)
-    found = of_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error
+    found = estimate_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error
     slowest = first[1] / (second[1] / first[1] - 1.0)  # the second sample converges slowly
     assert found >= 1.25 * slowest
-    whole = of_chain([{"position_l2": first}, {"position_l2": second}], chain)["position_l2"].error
+    whole = estimate_chain([{"position_l2": first}, {"position_l2": second}], chain)["position_l2"].error
     assert whole < found

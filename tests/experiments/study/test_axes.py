@@ -7,7 +7,12 @@ import re
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.plan import chosen, combinations, described, parse_axes
+from lyra_petsc.experiments.study.plan import (
+    describe_setting,
+    make_combinations,
+    parse_axes,
+    parse_quantities,
+)
 
 MANY = ",".join(str(k + 1) for k in range(101))
 
@@ -64,7 +69,7 @@ def test_refusals(texts: list[str], words: str) -> None:
 
 
 def test_all_combinations_with_the_last_axis_fastest() -> None:
-    found = combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
+    found = make_combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
     assert [c.name for c in found] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
     assert found[3].title == "bdf2, Δt 10 ms"
     assert found[3].settings == {"integrator": "bdf2", "dt": 0.01}
@@ -72,25 +77,25 @@ def test_all_combinations_with_the_last_axis_fastest() -> None:
 
 def test_names_are_file_names_and_never_the_same() -> None:
     texts = ["gravity=[0,0,-9.81],[0 0 -9.81]", "dt=0.0166666666,0.0166666667", "pc_type=lu,gamg"]
-    names = [c.name for c in combinations(parse_axes(texts))]
+    names = [c.name for c in make_combinations(parse_axes(texts))]
     assert len(set(names)) == 8
     assert all(re.fullmatch(r"[\w.+-]{1,120}", name) for name in names)
     assert names[0].startswith("gravity-_0_0_-9.81_-dt0.0166666666-pc_type-lu")
 
 
 def test_settings_in_words() -> None:
-    assert described("mesh", 0.05) == "h 0.05 m"
-    assert described("ksp_rtol", 1e-4) == "ksp_rtol 1e-4"
-    assert described("pc_type", "gamg") == "pc_type gamg"
+    assert describe_setting("mesh", 0.05) == "h 0.05 m"
+    assert describe_setting("ksp_rtol", 1e-4) == "ksp_rtol 1e-4"
+    assert describe_setting("pc_type", "gamg") == "pc_type gamg"
 
 
 def test_quantities() -> None:
     names = ["tip", "edge"]
-    assert [q.name for q in chosen("", names)] == [
+    assert [q.name for q in parse_quantities("", names)] == [
         "position_l2", "position_max", "energy", "probe_tip", "probe_edge"
     ]  # fmt: skip
-    assert [q.name for q in chosen("", [])] == ["position_l2", "position_max", "energy"]
-    assert [q.name for q in chosen("edge,energy", names)] == ["probe_edge", "energy"]
+    assert [q.name for q in parse_quantities("", [])] == ["position_l2", "position_max", "energy"]
+    assert [q.name for q in parse_quantities("edge,energy", names)] == ["probe_edge", "energy"]
 
 
 @pytest.mark.parametrize(
@@ -105,9 +110,9 @@ def test_quantities() -> None:
 )
 def test_unknown_quantities(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        chosen(text, ["tip"])
+        parse_quantities(text, ["tip"])
 
 
 def test_probes_of_a_scene_without() -> None:
     with pytest.raises(InputError, match="the scene has no probes"):
-        chosen("probes", [])
+        parse_quantities("probes", [])

@@ -17,13 +17,13 @@ from lyra_petsc.experiments.exact_motions import Energies, ExactMotion
 from lyra_petsc.experiments.study import comparison
 from lyra_petsc.experiments.study.comparison import (
     RestSurface,
-    against_motion,
-    against_run,
     barycentric,
-    make_transfer,
-    read_here,
+    make_interpolation,
+    motion_errors,
+    read_local,
     read_samples,
     read_surface,
+    run_errors,
 )
 from lyra_petsc.experiments.study.plan import ENERGY, POSITION, probe_quantity
 from lyra_petsc.mesh.build import build_mesh
@@ -31,7 +31,7 @@ from lyra_petsc.mesh.mesh import Mesh
 
 pytest.importorskip("scipy")
 
-TIMES = (0.0, 0.1, 0.2)
+TIME_KEYS = (0.0, 0.1, 0.2)
 QUANTITIES = [*POSITION, ENERGY, probe_quantity("tip")]
 SHEET = grid(0.3, 0.4, 3, 4)  # diagonal 0.5 m
 
@@ -48,15 +48,15 @@ def write_run(
     with h5py.File(folder / "mesh.h5", "w") as file:
         file["mesh/rest"], file["mesh/triangles"] = mesh.rest, mesh.triangles
         file["mesh/corner_uv"] = mesh.triangle_uv
-    for number, (time, x) in enumerate(zip(TIMES, states, strict=True)):
+    for number, (time, x) in enumerate(zip(TIME_KEYS, states, strict=True)):
         with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
             file[f"states/{number:06d}/position"] = x
             file[f"states/{number:06d}"].attrs["time"] = time
             file[f"states/{number:06d}"].attrs["step"] = number
     names = "kinetic_energy,membrane_energy,bending_energy,potential_energy"
-    rows = [f"{n},{TIMES[n]!r},{','.join(map(repr, row))}" for n, row in enumerate(energies)]
+    rows = [f"{n},{TIME_KEYS[n]!r},{','.join(map(repr, row))}" for n, row in enumerate(energies)]
     (folder / "history.csv").write_text("\n".join([f"step,time,{names}", *rows]) + "\n")
-    rows = [f"{n},{TIMES[n]!r},{','.join(map(repr, row.tolist()))}" for n, row in enumerate(tip)]
+    rows = [f"{n},{TIME_KEYS[n]!r},{','.join(map(repr, row.tolist()))}" for n, row in enumerate(tip)]
     (folder / "probes.csv").write_text("\n".join(["step,time,tip_x,tip_y,tip_z", *rows]) + "\n")
 
 
@@ -70,7 +70,7 @@ def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
     one, two = shared_tmp / "one", shared_tmp / "two"
     if comm.rank == 0:
         mesh = mesh_of(SHEET)
-        states = [mesh.rest + [0, 0, -t] for t in TIMES]
+        states = [mesh.rest + [0, 0, -t] for t in TIME_KEYS]
         off = [x.copy() for x in states]
         off[1][0] += [0.03, 0.0, 0.04]
         energies = [[0.0, 0.0, 0.0, 5.0], [1.2, 0.5, 0.0, 3.5], [2.0, 0.0, 0.0, 3.0]]
@@ -83,15 +83,15 @@ def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
 
 @pytest.mark.parallel(2)
 def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
-    errors = against_run(comm, two, one, QUANTITIES)
+    one, two = (read_samples(comm, folder, TIME_KEYS, 0.1, [20]) for folder in pair)
+    errors = run_errors(comm, two, one, QUANTITIES)
     assert errors["position_max"] == pytest.approx(0.05 / 0.5)
     # the corner of a diagonal grid that both triangles of its cell meet in: two thirds of 0.005 m²
     share = (2.0 * 0.005 / 3.0) / 0.12
     assert errors["position_l2"] == pytest.approx(math.sqrt(share * 0.05**2 / 2.0) / 0.5)
     assert errors["energy"] == pytest.approx(0.2 / 2.0)
     assert errors["probe_tip"] == pytest.approx(0.005 / 0.5)
-    assert against_run(comm, one, one, QUANTITIES) == dict.fromkeys(errors, 0.0)
+    assert run_errors(comm, one, one, QUANTITIES) == dict.fromkeys(errors, 0.0)
 
 
 class Falling(ExactMotion):
@@ -107,11 +107,11 @@ class Falling(ExactMotion):
 
 @pytest.mark.parallel(2)
 def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
-    exact = against_motion(comm, one, Falling(), QUANTITIES)
+    one, two = (read_samples(comm, folder, TIME_KEYS, 0.1, [20]) for folder in pair)
+    exact = motion_errors(comm, one, Falling(), QUANTITIES)
     assert max(exact.values()) < 1e-15
-    errors = against_motion(comm, two, Falling(), QUANTITIES)
-    assert errors == pytest.approx(against_run(comm, two, one, QUANTITIES))
+    errors = motion_errors(comm, two, Falling(), QUANTITIES)
+    assert errors == pytest.approx(run_errors(comm, two, one, QUANTITIES))
 
 
 def linear(rest: Array, t: float) -> Array:
@@ -129,15 +129,15 @@ def test_errors_across_meshes(
     if comm.rank == 0:
         for name, source in folders.items():
             mesh = mesh_of(source)
-            write_run(shared_tmp / name, mesh, [linear(mesh.rest, t) for t in TIMES], ENERGIES, TIP)
+            write_run(shared_tmp / name, mesh, [linear(mesh.rest, t) for t in TIME_KEYS], ENERGIES, TIP)
     comm.Barrier()
     coarse, fine = (
-        read_samples(comm, shared_tmp / name, TIMES, 0.1, [count])
+        read_samples(comm, shared_tmp / name, TIME_KEYS, 0.1, [count])
         for name, count in (("coarse", 12), ("fine", 143))
     )
     for errors in (
-        against_run(comm, coarse, fine, QUANTITIES),
-        against_run(comm, fine, coarse, QUANTITIES),
+        run_errors(comm, coarse, fine, QUANTITIES),
+        run_errors(comm, fine, coarse, QUANTITIES),
     ):
         assert errors["position_max"] < 1e-14
         assert errors["energy"] == 0.0
@@ -152,7 +152,7 @@ def test_sheets_that_lie_on_each_other_are_kept_apart(comm: MPI.Comm, shared_tmp
     two = [grid(1.0, 1.0, 2, 2), grid(1.0, 1.0, 2, 2)]
     finer = [grid(1.0, 1.0, 4, 4), grid(1.0, 1.0, 4, 4)]
     coarse, fine = mesh_of(*two), mesh_of(*finer)
-    transfer = make_transfer(comm, surface(coarse), [9, 9], surface(fine), [25, 25])
+    transfer = make_interpolation(comm, surface(coarse), [9, 9], surface(fine), [25, 25])
     first, last = comm.rank * 18 // comm.size, (comm.rank + 1) * 18 // comm.size
     numbers = transfer.wanted[transfer.corner]
     for row, point in enumerate(range(first, last)):
@@ -168,7 +168,7 @@ def test_curved_surfaces_are_projected() -> None:
         return mesh
 
     coarse, fine = cylinder(5), cylinder(23)
-    transfer = make_transfer(MPI.COMM_SELF, surface(coarse), [36], surface(fine), [576])
+    transfer = make_interpolation(MPI.COMM_SELF, surface(coarse), [36], surface(fine), [576])
     found = np.einsum("nc,nci->ni", transfer.weight, fine.rest[transfer.wanted[transfer.corner]])
     assert np.linalg.norm(found - coarse.rest, axis=1).max() < (1.0 / 23.0) ** 2 / 8.0
     assert transfer.weight.min() >= 0.0
@@ -177,9 +177,9 @@ def test_curved_surfaces_are_projected() -> None:
 
 def test_weights_of_the_nearest_place() -> None:
     corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 4)
-    places = np.array([[0.25, 0.25, 0.3], [0.5, -1.0, 0.0], [2.0, 2.0, 0.0], [-1.0, -1.0, 0.5]])
+    points = np.array([[0.25, 0.25, 0.3], [0.5, -1.0, 0.0], [2.0, 2.0, 0.0], [-1.0, -1.0, 0.5]])
     expected = [[0.5, 0.25, 0.25], [0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]
-    assert np.allclose(barycentric(places, corners), expected)
+    assert np.allclose(barycentric(points, corners), expected)
 
 
 def test_other_meshes_are_told_apart(tmp_path: Path) -> None:
@@ -193,14 +193,14 @@ def test_other_meshes_are_told_apart(tmp_path: Path) -> None:
 
 def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:
     with pytest.raises(InputError, match=r"no state at t = 0.05 s, .* output.every = 0.05"):
-        read_here(pair[0], [0.0, 0.05, 0.1], 0.05)
+        read_local(pair[0], [0.0, 0.05, 0.1], 0.05)
     with pytest.raises(InputError, match="holds no states"):
-        read_here(pair[0] / "nowhere", TIMES, 0.1)
+        read_local(pair[0] / "nowhere", TIME_KEYS, 0.1)
     (pair[0] / "mesh.h5").write_bytes(b"no HDF5")
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
         read_surface(pair[0])
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
-        read_here(pair[0], TIMES, 0.1)
+        read_local(pair[0], TIME_KEYS, 0.1)
 
 
 def test_areas_are_thirds_of_rest_areas(pair: tuple[Path, Path]) -> None:

@@ -12,7 +12,7 @@ from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.study.plan import Plan, Request, make_plan
 from lyra_petsc.experiments.study.study_runner import (
     choose_references,
-    make_family,
+    make_chains,
     physical_overrides,
     refines_time,
 )
@@ -62,7 +62,7 @@ def test_sample_times(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + "time: {end: 0.05, step: 0.01}\noutput: {every: 0.02}\n", "dt=0.01")
     assert plan.sample_times() == pytest.approx([0.0, 0.02, 0.04, 0.05])
     plan = plan_of(tmp_path, HELD + "time: {end: 0.1, step: 0.01}\noutput: {every: null}\n", "dt=0.02,0.01")
-    assert plan.every == 0.02
+    assert plan.interval == 0.02
     assert any("every 20 ms instead" in note for note in plan.notes)
 
 
@@ -122,7 +122,7 @@ def test_the_reference_is_exact_where_that_holds(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, SCENE + MOVING, "dt=0.01")
     (chosen,) = choose_references(plan).values()
     assert chosen.kind == "exact"
-    assert "free-fall" in chosen.words
+    assert "free-fall" in chosen.description
     plan = plan_of(tmp_path, HELD + MOVING, "dt=0.01")
     (chosen,) = choose_references(plan).values()
     assert chosen.kind == "finer"
@@ -152,25 +152,25 @@ def test_references_that_are_none(tmp_path: Path, reference: str) -> None:
 def test_the_finer_run_is_finer_in_what_varies(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "dt=0.02,0.01")
     assert refines_time(plan)
-    family = make_family(plan, [], 0.01, "bdf2")
-    assert "time.step=0.0025" in family[0].levels[0].overrides
-    assert "time.integrator=bdf2" in family[0].levels[0].overrides
-    assert "solver.force_tolerance=1e-08" in family[0].levels[0].overrides
-    (chain,) = family
+    chains = make_chains(plan, [], 0.01, "bdf2")
+    assert "time.step=0.0025" in chains[0].levels[0].overrides
+    assert "time.integrator=bdf2" in chains[0].levels[0].overrides
+    assert "solver.force_tolerance=1e-08" in chains[0].levels[0].overrides
+    (chain,) = chains
     assert [level.name for level in chain.levels] == [
         "reference-bdf2-dt0.0025", "reference-bdf2-dt0.005", "reference-bdf2-dt0.01"
     ]  # fmt: skip
     # 30 ms would not divide the 20 ms between samples: the quarter of it is rounded to what does
-    assert "time.step=0.005" in make_family(plan, [], 0.03, "bdf2")[0].levels[0].overrides
+    assert "time.step=0.005" in make_chains(plan, [], 0.03, "bdf2")[0].levels[0].overrides
 
 
 def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125")
     assert not refines_time(plan)
-    family = make_family(plan, [], None, "")
-    assert "mesh[0].grid.nx=16" in family[0].levels[0].overrides
-    assert not any(text.startswith("time.") for text in family[0].levels[0].overrides)
-    assert [level.name for level in family[0].levels] == [
+    chains = make_chains(plan, [], None, "")
+    assert "mesh[0].grid.nx=16" in chains[0].levels[0].overrides
+    assert not any(text.startswith("time.") for text in chains[0].levels[0].overrides)
+    assert [level.name for level in chains[0].levels] == [
         "reference-h0.0625", "reference-h0.125", "reference-h0.25"
     ]  # fmt: skip
 
@@ -178,16 +178,16 @@ def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> No
 def test_one_integrator_beside_meshes_is_the_references_too(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "integrator=alpha2", "dt=0.005")
     assert not refines_time(plan)
-    family = make_family(plan, [], None, "")
-    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(family[0].levels[0].overrides)
+    chains = make_chains(plan, [], None, "")
+    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(chains[0].levels[0].overrides)
 
 
 def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "dt=0.02,0.01", "ksp_rtol=1e-2,1e-4")
-    family = make_family(plan, [], 0.01, "alpha2")
-    assert family[0].levels[0].name == "reference-alpha2-dt0.0025-h0.0625"
-    assert len({level.name for chain in family for level in chain.levels}) == 5
-    assert "petsc.ksp_rtol=1e-06" in family[0].levels[0].overrides
+    chains = make_chains(plan, [], 0.01, "alpha2")
+    assert chains[0].levels[0].name == "reference-alpha2-dt0.0025-h0.0625"
+    assert len({level.name for chain in chains for level in chain.levels}) == 5
+    assert "petsc.ksp_rtol=1e-06" in chains[0].levels[0].overrides
 
 
 def test_requests_survive_their_file(tmp_path: Path) -> None:
@@ -206,5 +206,5 @@ def test_a_busy_machine_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)
     monkeypatch.setattr(conduct.os, "getloadavg", lambda: (2.1, 0.0, 0.0))
-    assert conduct.busy(2) == []
-    assert "load 2.1 on 4 cores" in conduct.busy(3)[0]
+    assert conduct.note_load(2) == []
+    assert "load 2.1 on 4 cores" in conduct.note_load(3)[0]

@@ -16,7 +16,7 @@ from lyra_petsc.experiments.verification.cases.hanging import middle, of_chain, 
 from lyra_petsc.experiments.verification.cases.membranes import answer
 from lyra_petsc.experiments.verification.cases.motions import level_fall
 from lyra_petsc.experiments.verification.flat_plates import arc
-from lyra_petsc.experiments.verification.verification_case import data
+from lyra_petsc.experiments.verification.verification_case import load_data
 
 
 def test_the_level_fall_is_the_tabulated_one() -> None:
@@ -45,7 +45,7 @@ def test_stress_and_energy_are_the_tabulated_ones() -> None:
         assert stored == pytest.approx(energy, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("row", data("catenary")["unequal_heights"]["rows"])
+@pytest.mark.parametrize("row", load_data("catenary")["unequal_heights"]["rows"])
 def test_the_middle_of_a_catenary_halves_its_length(row: list[float]) -> None:
     dx, dz, a, lowest = row[:4]
     x, z = middle(a, lowest)

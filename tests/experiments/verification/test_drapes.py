@@ -52,7 +52,7 @@ def starts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array,
         seen.append((start, faces, rest))
         return start
 
-    monkeypatch.setattr(contacts, "draped", begins)
+    monkeypatch.setattr(contacts, "drape_cloth", begins)
     monkeypatch.setattr(contacts, "PIXELS", 8)
     with Bench(comm) as bench:
         list(contacts.cusick.measure(bench, contacts.cusick.resolutions[-1]))

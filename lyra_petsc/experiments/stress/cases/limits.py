@@ -105,23 +105,23 @@ def step_inextensible_chain(x: Array, v: Array, dt: float, length: float) -> tup
     return x_new, (x_new - x) / dt
 
 
-def _judge_stiff_limit(
+def _judge_limit(
     setting: Setting, bench: Bench, record: RunRecord, stiffness: float
 ) -> Mapping[str, Verdict]:
     x, v = np.asarray(record.observed[0]), np.zeros((LINKS + 1, 2))
-    deviation = 0.0
+    off = 0.0
     for observed_x in record.observed[1:]:
         x, v = step_inextensible_chain(x, v, STEP, LENGTH / LINKS)
-        deviation = max(deviation, float(np.linalg.norm(observed_x - x, axis=1).max()))
-    allowed_stretch = BOUND * DENSITY * G * LENGTH / stiffness * LENGTH
+        off = max(off, float(np.linalg.norm(observed_x - x, axis=1).max()))
+    allowed = BOUND * DENSITY * G * LENGTH / stiffness * LENGTH
     # the residual of a step acts as an impulse, which moves the joints in all following steps
     displacements = [b.residual * (STEPS - k) for k, b in enumerate(record.balances)]
-    residual_displacement = sum(displacements) * STEP**2 / JOINT_MASS
+    unsolved = sum(displacements) * STEP**2 / JOINT_MASS
     message = (
-        f"{deviation:.2e} m from the inextensible chain, {allowed_stretch:.2e} m allowed for its stretch "
-        f"and {residual_displacement:.2e} m for what was left unsolved"
+        f"{off:.2e} m from the inextensible chain, {allowed:.2e} m allowed for its stretch "
+        f"and {unsolved:.2e} m for what was left unsolved"
     )
-    return {"stiff limit": Verdict(deviation <= allowed_stretch + residual_displacement, message)}
+    return {"stiff limit": Verdict(off <= allowed + unsolved, message)}
 
 
 chain = family(
@@ -131,7 +131,7 @@ chain = family(
         StressCase(
             f"chain-{stiffness}", f"C {stiffness} N/m, swinging", partial(_strip, stiffness=float(stiffness)),
             steps=STEPS, step=STEP, level=level, own_scene=True, observe=_edge_positions,
-            judge=partial(_judge_stiff_limit, stiffness=float(stiffness)),
+            judge=partial(_judge_limit, stiffness=float(stiffness)),
         )
         for stiffness, level in (("1e4", USUAL), ("1e6", QUICK), ("1e8", USUAL), ("1e10", USUAL))
     ),

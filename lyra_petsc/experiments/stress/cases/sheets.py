@@ -45,7 +45,7 @@ from lyra_petsc.experiments.verification.verification_case import grid
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 
-def _scaled_cases(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
+def _scaled(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
     """One case per factor on a parameter of `scale`."""
     for factor, level in levels.items():
         scene = base_with(scale, **{parameter: float(factor)})
@@ -69,15 +69,13 @@ stiff_steps = family(
 membrane = family(
     "membrane",
     "membrane stiffness × 1e-3 to 1e9",
-    *_scaled_cases(
-        "membrane", "stretching", {"1e-3": QUICK, "1": USUAL, "1e3": USUAL, "1e6": USUAL, "1e9": QUICK}
-    ),
+    *_scaled("membrane", "stretching", {"1e-3": QUICK, "1": USUAL, "1e3": USUAL, "1e6": USUAL, "1e9": QUICK}),
 )
 
 bending = family(
     "bending",
     "bending stiffness × 0 to 1e6",
-    *_scaled_cases("bending", "bending", {"0": QUICK, "1": FULL, "1e3": USUAL, "1e6": QUICK}),
+    *_scaled("bending", "bending", {"0": QUICK, "1": FULL, "1e3": USUAL, "1e6": QUICK}),
 )
 
 time_step = family(
@@ -99,7 +97,7 @@ time_step = family(
 density = family(
     "density",
     "density × 1e-3 to 1e3",
-    *_scaled_cases(
+    *_scaled(
         "density",
         "density",
         {"1e-3": QUICK, "1e-2": FULL, "1e-1": FULL, "1e1": FULL, "1e2": FULL, "1e3": USUAL},
@@ -173,7 +171,7 @@ RISE = 0.15
 """Height of the dome [m]."""
 
 
-def _with_noise(x: Array, spacing: float) -> Array:
+def _noisy(x: Array, spacing: float) -> Array:
     return np.asarray(x + NOISE * spacing * np.random.default_rng(1).standard_normal(x.shape))
 
 
@@ -224,9 +222,7 @@ def _dome(setting: Setting, bench: Bench) -> Content:
 start = family(
     "start",
     "start shapes: noise, a crumpled ball, a flat fold, a shell turned inside out",
-    StressCase(
-        "noise", "random noise of 0.3 elements, no handle", base_with(remove_handles), shape=_with_noise
-    ),
+    StressCase("noise", "random noise of 0.3 elements, no handle", base_with(remove_handles), shape=_noisy),
     StressCase("crumpled", "crumpled into a ball", base_with(remove_handles), shape=_crumpled),
     StressCase(
         "folded", "folded flat, a crease of 180°", base_with(remove_handles), shape=_folded, level=QUICK
@@ -300,7 +296,7 @@ SIDES = [{"group": "left"}, {"group": "right"}]
 STEPS = 40
 
 
-def _jumping(setting: Setting, bench: Bench) -> Content:
+def _jump(setting: Setting, bench: Bench) -> Content:
     far = [part * setting.size for part in JUMP]
     still = {"time": 2.0 * setting.step}
     return move_handles(
@@ -317,7 +313,7 @@ def _turning(content: Content) -> Content:
     return move_handles(content, turn)
 
 
-def _move_sides(setting: Setting, bench: Bench, to: float) -> Content:
+def _pull(setting: Setting, bench: Bench, to: float) -> Content:
     """Scale the positions of handles along x; in the default base scene both sides are held."""
     content = setting.content()
     if not setting.given:
@@ -329,12 +325,10 @@ def _move_sides(setting: Setting, bench: Bench, to: float) -> Content:
 handles = family(
     "handles",
     "handles that jump, spin, squeeze and stretch",
-    StressCase("jump", "handles jump by a quarter of the sheet in one step", _jumping, level=QUICK),
+    StressCase("jump", "handles jump by a quarter of the sheet in one step", _jump, level=QUICK),
     StressCase("spin", "handles turn ten times a second", base_with(_turning), steps=STEPS),
-    StressCase("squeeze", "handles come together to a tenth", partial(_move_sides, to=0.1), steps=STEPS),
-    StressCase(
-        "stretch", "handles go apart threefold", partial(_move_sides, to=3.0), steps=STEPS, level=QUICK
-    ),
+    StressCase("squeeze", "handles come together to a tenth", partial(_pull, to=0.1), steps=STEPS),
+    StressCase("stretch", "handles go apart threefold", partial(_pull, to=3.0), steps=STEPS, level=QUICK),
 )
 
 # -- a membrane that cannot buckle, compressed into the softening range of its model ----------------------

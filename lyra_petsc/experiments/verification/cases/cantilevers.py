@@ -1,7 +1,7 @@
-"""Strips that bend without limit: clamped, by a load at the tip, by their weight, by their rest curvature;
-and buckled: columns, at Euler's load and beyond it, and tall cantilevers.
+"""Large deflections of strips: cantilevers with a load at the tip, their weight or a rest curvature;
+buckling of columns, at Euler's load and beyond it, and of tall cantilevers.
 
-By hinges on strips one cell wide, and by directors on edges on every kind of mesh and of any width.
+Strips with hinges are one cell wide; strips with directors on edges have any width and any kind of mesh.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ HINGED = COUNTS | {"resolutions": (16, 32, 64)}
 DIRECTED = COUNTS | {"resolutions": (25, 50, 100), "claim": at_finest(3e-3)}
 
 PATTERNS = ("alternating", "criss-cross")
-"""Those whose bending by hinges does not twist them."""
+"""Mesh patterns on which bending by hinges is not coupled to twist."""
 
 WIDTHS = {"one cell": 0.0, "0.1 L": 0.1, "0.25 L": 0.25}
-"""Of strips that bend by directors."""
+"""Widths of strips that bend by directors, over their length; 0: one cell."""
 
 Loads = Mapping[str, Sequence[float]]
 
@@ -66,30 +66,30 @@ class Strip:
 
     Attributes
     ----------
-    words : str
+    label : str
     width : float
         [m].
     stiffness : float
-        What its mesh makes of B [N·m].
+        Effective B on its mesh [N·m].
     scene : callable (**more) → scene content
         ``more`` are further keys.
     """
 
-    words: str
+    label: str
     width: float
     stiffness: float
     scene: Callable[..., dict[str, Any]]
 
 
 def hinged(n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
-    """Strips of square cells that bend by hinges, with the loads of each pattern."""
+    """Pairs of a strip of square cells with hinges and a load, for the loads of each pattern."""
     for pattern, some in loads.items():
         made = Strip(pattern, 1.0 / n, expected(pattern), partial(strip, pattern, n))
         yield from ((made, load) for load in some)
 
 
 def directed(bench: Bench, n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
-    """Strips that bend by directors on every kind of mesh, with the loads of each width."""
+    """Pairs of a strip with directors and a load, for every kind of mesh and the loads of each width."""
     for kind in KINDS:
         for words, some in loads.items():
             scene = partial(_directed, bench, kind, n, WIDTHS[words])
@@ -107,19 +107,19 @@ def _directed(
 
 
 def _tip(trial: Trial) -> tuple[float, float]:
-    """Mean (x, −z) of the vertices of the free end over L: reach and drop."""
+    """Reach and drop of the free end over L: mean x and −z of its vertices."""
     start = trial.start[:, 0]
     x, _, z = trial.x[np.isclose(start, start.max(), rtol=1e-9)].mean(axis=0) / start.max()
     return float(x), float(-z)
 
 
 def _compared(bench: Bench, scene: dict[str, Any], exact: Cantilever, words: str) -> Iterator[Measured]:
-    """Drop and reach of the tip, both errors relative to the way the tip went."""
+    """Drop and reach of the tip; errors are relative to the displacement of the tip."""
     with bench.simulation(scene) as trial:
         reach, drop = _tip(trial.run())
-    way = float(np.hypot(exact.drop, 1.0 - exact.reach))
-    yield Measured(f"drop / L, {words}", drop, exact.drop, scale=way)
-    yield Measured(f"reach / L, {words}", reach, exact.reach, scale=way)
+    tip_displacement = float(np.hypot(exact.drop, 1.0 - exact.reach))
+    yield Measured(f"drop / L, {words}", drop, exact.drop, scale=tip_displacement)
+    yield Measured(f"reach / L, {words}", reach, exact.reach, scale=tip_displacement)
 
 
 TIP_LOAD = (
@@ -133,12 +133,12 @@ def _tip_loads(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[
         # the scene's force is the total over the width
         force = [{"group": "right", "force": [0, 0, -load * each.stiffness * each.width]}]
         exact = cantilever(0.0, tip_load=load, stretch=each.stiffness / MEMBRANE)
-        yield from _compared(bench, each.scene(loads=force), exact, f"{each.words}, α = {load:g}")
+        yield from _compared(bench, each.scene(loads=force), exact, f"{each.label}, α = {load:g}")
 
 
 @case(
     "Clamped strip with a load at the tip, α = P L²/B_effective: tip against the elastica with the "
-    "strip's stretch; error over the way of the tip",
+    "strip's stretch; error over the displacement of the tip",
     claim=at_finest(2e-3),
     source=TIP_LOAD,
     **HINGED,
@@ -150,7 +150,7 @@ def tip_load(bench: Bench, n: float) -> Sequence[Measured]:
 
 @case(
     "Strip that bends by directors, with a load at the tip, α = P L²/B: tip against the elastica with the "
-    "strip's stretch; error over the way of the tip",
+    "strip's stretch; error over the displacement of the tip",
     source=TIP_LOAD,
     **DIRECTED,
 )
@@ -170,12 +170,12 @@ def _weights(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[Me
     for each, weight in strips:
         exact = cantilever(weight, stretch=each.stiffness / MEMBRANE)
         scene = each.scene(gravity=[0, 0, -weight * each.stiffness / DENSITY])
-        yield from _compared(bench, scene, exact, f"{each.words}, Γ = {weight:g}")
+        yield from _compared(bench, scene, exact, f"{each.label}, Γ = {weight:g}")
 
 
 @case(
     "Clamped strip under its own weight, Γ = w L³/B_effective: tip against the heavy elastica with the "
-    "strip's stretch; error over the way of the tip",
+    "strip's stretch; error over the displacement of the tip",
     claim=at_finest(2e-3),
     source=WEIGHT,
     **HINGED,
@@ -187,7 +187,7 @@ def heavy_cantilever(bench: Bench, n: float) -> Sequence[Measured]:
 
 @case(
     "Strip that bends by directors, under its own weight, Γ = w L³/B: tip against the heavy elastica with "
-    "the strip's stretch; error over the way of the tip",
+    "the strip's stretch; error over the displacement of the tip",
     source=WEIGHT,
     **DIRECTED,
 )
@@ -200,11 +200,11 @@ def elastica_weight(bench: Bench, n: float) -> Iterator[Measured]:
 # -- rolled up -------------------------------------------------------------------------------------------
 
 TURNS = {"diagonal": (0.25, 1.0), "alternating": (0.25, 0.5), "criss-cross": (0.25, 0.5)}
-"""Parts of a full circle for each pattern of mesh."""
+"""Turns (parts of a full circle) for each pattern of mesh."""
 
 
 def _arc(turns: float) -> Cantilever:
-    """Tip of an arc of length 1 that starts horizontally and bends downwards."""
+    """Tip of a circular arc of length 1 that starts horizontally and bends downwards."""
     angle = 2.0 * math.pi * turns
     return Cantilever(math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle, angle, angle)
 
@@ -216,10 +216,10 @@ def _part(pattern: str, turns: float) -> str:
 def _of_arcs() -> dict[str, Claim]:
     claims: dict[str, Claim] = {}
     for turns in TURNS["criss-cross"]:
-        # the arc dimples every cell, which its membrane resists: not free of energy
+        # bending to an arc dimples every cell, which costs membrane energy
         for side in ("drop", "reach"):
             claims[f"{side} / L, {_part('criss-cross', turns)}"] = at_finest(5e-3)
-    # there the polygon that the cells make ends where the arc does
+    # in these cases the polygon of the cells ends exactly at the tip of the arc
     for side, pattern, turns in (
         ("reach", "alternating", 0.5),
         ("drop", "diagonal", 1.0),
@@ -230,7 +230,7 @@ def _of_arcs() -> dict[str, Claim]:
 
 
 @case(
-    "Clamped strip that its rest curvature rolls up: tip against the arc; error over the way of the tip",
+    "Clamped strip that its rest curvature rolls up: tip against the arc; error over its displacement",
     source="closed form; the shape of K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551",
     claim=Converges(2.0, 1e-4),
     claims=_of_arcs(),
@@ -240,17 +240,17 @@ def roll_up(bench: Bench, n: float) -> Sequence[Measured]:
     found: list[Measured] = []
     for each, turns in hinged(n, TURNS):
         curved = {"rest_curvature": [-2.0 * math.pi * turns, 0.0, 0.0]}
-        # without tension or weight the membrane stretches nothing, and a softer one is found sooner
+        # without tension or weight the membrane does not stretch; a softer one needs fewer iterations
         scene = each.scene(membrane=1e4, material=curved)
-        found += _compared(bench, scene, _arc(turns), _part(each.words, turns))
+        found += _compared(bench, scene, _arc(turns), _part(each.label, turns))
     return found
 
 
 @case(
     "Strip that bends by directors, rolled up by the moment 2π f B/L at its end: tip against the arc; "
-    "error over the way of the tip",
+    "error over the displacement of the tip",
     source="closed form; K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551, section 3.2",
-    # facets of criss-cross cells that bend far lie flat only in finer meshes
+    # facets of criss-cross cells are nearly flat only in finer meshes
     claims={
         f"{side} / L, criss-cross, one cell wide, f = 1": Converges(4.0, 3e-3, slack=math.inf)
         for side in ("drop", "reach")
@@ -261,7 +261,7 @@ def elastica_roll_up(bench: Bench, n: float) -> Iterator[Measured]:
     """f = M L/(2π B) for each width: parts of a full circle."""
     for each, turns in directed(bench, n, {"one cell": (0.25, 1.0), "0.1 L": (0.5,), "0.25 L": (0.5,)}):
         scene = each.scene(loads=[{"group": "right", "moment": -2.0 * math.pi * turns}])
-        yield from _compared(bench, scene, _arc(turns), f"{each.words}, f = {turns:g}")
+        yield from _compared(bench, scene, _arc(turns), f"{each.label}, f = {turns:g}")
 
 
 # -- strips that twist -----------------------------------------------------------------------------------
@@ -270,12 +270,12 @@ COILING = (0.1, 1.0, 10.0, 100.0)
 """w L³ / (0.8 B)"""
 
 STIFF = 1e7
-"""C L²/B: high enough that a strip as narrow as 1/64 hardly bends in its own plane."""
+"""C L²/B, so high that a strip of width 1/64 hardly bends in its own plane."""
 
 
 @case(
     "Clamped strip of single diagonals under its own weight, Γ = w L³/(0.8 B): tip against the rod whose "
-    "bending twists it; error over the way of the tip",
+    "bending twists it; error over the displacement of the tip",
     source="Kirchhoff rod with bend-twist coupling, its stiffness by hand from the hinges of a cell",
     claim=at_finest(2e-3),
     **HINGED,
@@ -289,20 +289,20 @@ def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
             x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0)
         exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / STIFF))
         reach, sideways, drop = exact
-        way = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
+        tip_displacement = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
         words = f"Γ = {weight:g}"
         found += [
-            Measured(f"drop / L, {words}", float(-z), drop, scale=way),
-            Measured(f"reach / L, {words}", float(x), reach, scale=way),
-            Measured(f"sideways / L, {words}", float(y) - 0.5 / n, sideways, scale=way),
+            Measured(f"drop / L, {words}", float(-z), drop, scale=tip_displacement),
+            Measured(f"reach / L, {words}", float(x), reach, scale=tip_displacement),
+            Measured(f"sideways / L, {words}", float(y) - 0.5 / n, sideways, scale=tip_displacement),
         ]
     return found
 
 
-# -- the cloth maker's test ------------------------------------------------------------------------------
+# -- cantilever test of cloth ----------------------------------------------------------------------------
 
 BENDING_LENGTH, CLOTH_DENSITY, GRAVITY = 0.02, 0.15, 9.81
-"""c [m], kg/m², m/s²; the cloth's flexural rigidity is w c³ with its weight w [N/m²]."""
+"""Bending length c [m], density [kg/m²], gravity [m/s²]; the rigidity is w c³ with weight w [N/m²]."""
 
 RIGIDITY = CLOTH_DENSITY * GRAVITY * BENDING_LENGTH**3
 
@@ -312,12 +312,12 @@ OVERHANG = "ASTM D1388, option A, and ISO 9073-7 (angle, G = w c³); overhangs f
 def _overhangs(
     bench: Bench, strips: Iterator[tuple[Strip, float]], cloth: Callable[[Strip, float], dict[str, Any]]
 ) -> Iterator[Measured]:
-    """Angles of the chord from the clamp to the tip, degrees below the horizontal; 41.5 is the standard's."""
+    """Angles [°] of the chord from clamp to tip below the horizontal; the standard prescribes 41.5°."""
     for each, angle in strips:
         with bench.simulation(cloth(each, BENDING_LENGTH * overhang_weight(angle) ** (1.0 / 3.0))) as trial:
             reach, drop = _tip(trial.run())
         reached = math.degrees(math.atan2(drop, reach))
-        yield Measured(f"angle of the chord, {each.words}, overhang for {angle:g}°", reached, angle, "°")
+        yield Measured(f"angle of the chord, {each.label}, overhang for {angle:g}°", reached, angle, "°")
 
 
 @case(
@@ -332,7 +332,7 @@ def cloth_overhang(bench: Bench, n: float) -> Sequence[Measured]:
         material = {
             "density": CLOTH_DENSITY,
             "membrane": isotropic(MEMBRANE * RIGIDITY / overhang**2),
-            # what the mesh makes of B is known, hence corrected
+            # corrects the known effective stiffness of the mesh
             "bending": RIGIDITY / each.stiffness,
         }
         scene = each.scene(material=material, gravity=[0, 0, -GRAVITY])
@@ -362,19 +362,20 @@ COLUMNS: dict[str, tuple[list[dict[str, Any]], float]] = {
     "clamped": ([{"group": "left", "clamp": True}, {"group": "right", "clamp": True}], 4.0 * math.pi**2),
     "clamped and free": ([{"group": "left", "clamp": True}], 0.25 * math.pi**2),
 }
-"""What holds the ends, and P L²/B at which the column buckles"""
+"""Supports of the ends, and the buckling load P L²/B"""
 
 COLUMN, COLUMN_MEMBRANE = 0.1, 1e7
-"""Over the length; C L²/B, so large that the stretch counts for less than 1e-5"""
+"""Width over length; C L²/B, so large that the effect of stretch is below 1e-5"""
 
 SHIFT = 100.0
-"""1/s², of the size of the lowest square: it stays positive with it also beyond the critical load"""
+"""Shift [1/s²] of the eigenvalue problem, as large as the lowest square, so that K + shift · M is positive
+definite also beyond the critical load"""
 
 IN_PLANE = ["x", "y"]
 
 
 def critical(lowest: Callable[[float], float], first: float, second: float) -> float:
-    """The load at which the lowest square changes its sign, by the secant method."""
+    """The load at which the lowest squared frequency changes its sign, by the secant method."""
     from scipy.optimize import newton
 
     return float(newton(lowest, first, x1=second, tol=1e-300, rtol=1e-5))
@@ -409,16 +410,16 @@ def column(bench: Bench, n: float) -> Iterator[Measured]:
 # -- beyond the critical load ----------------------------------------------------------------------------
 
 SHORTENINGS = (0.4, 0.1)
-"""Over the length, one after the other: the second is reached from above."""
+"""Shortenings over the length, in this order: the second is reached from above."""
 
 SOFTER = 1e5
-"""C L²/B: as of a thickness of 0.011 L; the stretch counts for 5e-4"""
+"""C L²/B, as of a thickness of 0.011 L; the effect of stretch is 5e-4"""
 
 ASIDE = 20.0
-"""N/m²: a load across that makes the column leave the straight shape, and is gone at a tenth of the way"""
+"""Transverse load [N/m²] by which the column leaves the straight shape; removed at load factor 0.1"""
 
 LOADS = {"below": 0.95, "above": 1.2}
-"""Over the critical load"""
+"""Loads over the critical load"""
 
 
 @case(
@@ -465,7 +466,7 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 def _push(trial: Trial) -> float:
-    """Force of the right end on the column, per width, towards it."""
+    """Compressive force per width at the right end."""
     end = trial.start[:, 0] > 1.0 - 1e-9
     return -float(trial.gather(trial.simulation.ledger.reaction)[end, 0].sum()) / COLUMN
 
@@ -477,12 +478,12 @@ def _height(trial: Trial) -> float:
 # -- lateral buckling ------------------------------------------------------------------------------------
 
 DEPTHS = (1.0 / 20.0, 1.0 / 50.0)
-"""Over the length"""
+"""Depths over the length"""
 
 POISSON = (0.0, 0.3)
 
 TALL = 1e8
-"""C L²/D: a strip so deep hardly bends in its plane"""
+"""C L²/D, so high that the strip hardly bends in its plane"""
 
 
 @case(
@@ -509,16 +510,16 @@ def lateral_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                 load, shape = _tipping(bench, kind, n, depth, poisson, factor * unit)
                 name = f"L/b = {1.0 / depth:g}, {kind}, ν = {poisson:g}"
                 yield Measured(f"P L²/√(EI GJ), {name}", load / unit, factor)
-                yield Measured(f"turn of the tip over deflection / L, {name}", shape, ratio)
+                yield Measured(f"rotation of the tip over deflection / L, {name}", shape, ratio)
 
 
 def _tipping(
     bench: Bench, kind: str, n: float, depth: float, poisson: float, about: float
 ) -> tuple[float, float]:
-    """Critical load [N], near ``about``, and of the mode the tip's turn over its deflection over L."""
+    """Critical load [N], near ``about``, and rotation of the tip over its deflection over L in the mode."""
     strip = partial(scene, strip_mesh(bench, kind, n / depth, depth), plate_material(TALL, poisson=poisson))
     clamp = {"group": "left", "clamp": True}
-    # in the plane the sheet is in equilibrium; to leave it, it need not move in it
+    # the equilibrium in the plane comes first; buckling needs displacements out of the plane only
     plane = strip(STATIC | {"step": 1.0}, handles=[clamp, {"group": "sheet", "axes": ["z"]}])
     across = strip(ASSEMBLED, handles=[clamp, {"group": "sheet", "axes": IN_PLANE}])
     mode = np.empty(0)

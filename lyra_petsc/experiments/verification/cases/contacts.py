@@ -1,5 +1,5 @@
-"""Sheets in contact: at rest, with friction on a slope and over a cylinder, thrown; and sheets that bend over
-obstacles: rucks, strips at a pole and a table's edge, drapes.
+"""Contact: sheets at rest, with friction on slopes and over a cylinder, colliding; and sheets that bend over
+obstacles: rucks, strips at a pole and at the edge of a table, drapes.
 """
 
 from __future__ import annotations
@@ -13,14 +13,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.drape import (
-    CLOTH,
-    DISC,
-    STARTS,
-    drape_cloth,
-    drape_coefficient,
-    shadow,
-)
+from lyra_petsc.experiments.drape import CLOTH, DISC, STARTS, drape_cloth, drape_coefficient, shadow
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, ring_disc, square_to_disc
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.verification_case import (
@@ -31,12 +24,12 @@ from lyra_petsc.experiments.verification.verification_case import (
     Measured,
     at_finest,
     case,
-    data,
-    farthest,
     grid,
     isotropic,
+    load_data,
     scene,
     worst,
+    worst_value,
 )
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
@@ -46,29 +39,29 @@ from lyra_petsc.terms.term import Elastic
 G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
 SLIDING = (0.99, 0.9, 0.5)
-"""Coefficients of friction over the slope's tangent."""
+"""Coefficients of friction over the tangent of the slope angle, for sliding."""
 
 STICKS = 1.01
 GAP, STEP = 0.01, 0.01
 CLEAR = 0.94
-"""Part of the gap at which the sheet starts, near where its weight holds it."""
+"""Initial distance over the gap, near the equilibrium distance."""
 
 SETTLED, END, SLID = 1.0, 3.0, 1.5
-"""Times [s]: from when a sheet that sticks must stand, its end, that of a sheet that slides."""
+"""Times [s]: when a sticking sheet has settled, end of its simulation, end for a sliding sheet."""
 
 
 def sheet_on_slope(
     degrees: float, friction: float, cells: int, end: float, integrator: str = "beuler"
 ) -> dict[str, Any]:
-    """A free sheet on a slope that falls along x."""
+    """A free sheet on a slope that descends along x."""
     angle = math.radians(degrees)
     normal = [math.sin(angle), 0.0, math.cos(angle)]
     side = 0.4
     grid = {"width": side, "height": side, "nx": cells, "ny": cells, "pattern": "alternating"}
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": degrees}
-    place = [CLEAR * GAP * component for component in normal]
+    shift = [CLEAR * GAP * component for component in normal]
     return {
-        "mesh": {"grid": grid, "transform": {"rotate": turn, "translate": place}},
+        "mesh": {"grid": grid, "transform": {"rotate": turn, "translate": shift}},
         "material": {"cloth": "gray-interlock"},
         "gravity": [0.0, 0.0, -G],
         "contact": {"gap": GAP, "friction": friction, "self": False},
@@ -78,24 +71,24 @@ def sheet_on_slope(
 
 
 def _roof(bench: Bench, degrees: float) -> dict[str, Any]:
-    """The slope as a mesh of triangles that have nothing to do with the sheet's; collective."""
-    angle, way = math.radians(degrees), 14.0
-    flat, faces = rectangle(23, 5, way, 1.5)
+    """The slope as a triangle mesh that does not match the sheet's; collective."""
+    angle = math.radians(degrees)
+    flat, faces = rectangle(23, 5, 14.0, 1.5)
     flat = flat + np.random.default_rng(1).uniform(-0.1, 0.1, flat.shape) * [1.0, 1.0, 0.0]
     x, y = flat[:, 0] - 1.0, flat[:, 1] - 0.5
     return {"mesh": bench.mesh(np.column_stack([math.cos(angle) * x, y, -math.sin(angle) * x]), faces)}
 
 
 def _creep(trial: Trial, down: Array) -> float:
-    """Farthest way [m] of a vertex down a slope from when it has settled to the end; collective."""
+    """Largest displacement [m] of a vertex down a slope after the sheet has settled; collective."""
     settled = trial.run_to(SETTLED).x
     return float(np.abs((trial.run().x - settled) @ down).max())
 
 
 @case(
-    "Sheet on a slope of 5, 30 and 60°: stands at 1.01 of the friction that holds it, on 5° under the "
-    "midpoint rule, too, slides with g (sin α − μ cos α) at 0.99, 0.9 and 0.5 of it; on one of triangles, "
-    "too; friction over the weight",
+    "Sheet on a slope of 5, 30 and 60°: sticks with 1.01 of the critical friction tan α, on 5° also with "
+    "midpoint, slides with g (sin α − μ cos α) at 0.99, 0.9 and 0.5 of it; also on a slope of triangles; "
+    "friction over the weight",
     source="Coulomb's law",
     resolutions=(2, 4),
     claim=Exact(1e-6),
@@ -104,7 +97,7 @@ def _creep(trial: Trial, down: Array) -> float:
     quick=1,
 )
 def incline(bench: Bench, n: float) -> Sequence[Measured]:
-    creep, accelerations, rubs = 0.0, [], 0.0
+    creep, accelerations, friction_error = 0.0, [], 0.0
     for degrees, triangles in (*((degrees, False) for degrees in SLOPES), (SLOPES[1], True)):
         angle = math.radians(degrees)
         down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
@@ -120,7 +113,8 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
                 while not trial.simulation.finished:
                     trial.step()
                     along = float(trial.simulation.ledger.obstacle_forces(1)[0, :3] @ down)
-                    rubs = max(rubs, abs(along / weight - friction * math.cos(angle)))
+                    error = abs(along / weight - friction * math.cos(angle))
+                    friction_error = max(friction_error, error)
                 change = (trial.v - before) @ down
             exact = G * (1.0 - part) * math.sin(angle)
             found = float(change.mean()) / (0.5 * SLID)
@@ -128,7 +122,7 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
     return [
         Measured("creep", creep, 0.0, "m", scale=1.0),
         *worst(accelerations),
-        Measured("friction", rubs, 0.0, scale=1.0),
+        Measured("friction", friction_error, 0.0, scale=1.0),
     ]
 
 
@@ -142,7 +136,7 @@ FLOORS: dict[str, tuple[dict[str, Any], float, float]] = {
     "sphere": ({"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}, 0.0, 1e-3),
     "box": ({"box": {"min": [-0.18, -0.22, 0.0], "max": [0.18, 0.22, 1.0]}, "inside": True}, 30.0, 1e-3),
 }
-"""What a sheet comes to rest on or in; by how many degrees it is tilted at first; the gap [m]."""
+"""The obstacle on or in which a sheet comes to rest, the initial tilt of the sheet [°], the gap [m]."""
 
 
 @case(
@@ -161,14 +155,14 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
     for words, (floor, tilt, gap) in FLOORS.items():
         turn = {"axis": [0.0, 1.0, 0.0], "degrees": tilt}
         middle = half * math.cos(math.radians(tilt))
-        place = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
+        shift = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
         content = {
-            "mesh": bench.mesh(flat, faces) | {"transform": {"rotate": turn, "translate": place}},
+            "mesh": bench.mesh(flat, faces) | {"transform": {"rotate": turn, "translate": shift}},
             "material": {"cloth": "gray-interlock"},
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": gap, "friction": 0.3, "self": False},
             "obstacles": {words: floor},
-            # long steps of backward Euler damp all motion
+            # long steps of backward Euler damp the motion
             "time": {"end": 4.0, "step": 0.1},
         }
         pressure = np.empty(0)
@@ -178,41 +172,41 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
             if words == "plane":
                 compute = FIELDS["contact_pressure"].compute
                 pressure = trial.gather(compute(trial.simulation.problem))
-        off = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
-        yield Measured(f"force on the {words} besides the weight", off, 0.0, scale=1.0)
+        error = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
+        yield Measured(f"force on the {words} besides the weight", error, 0.0, scale=1.0)
         if words == "plane":
             exact = weight / SIDE**2
-            yield Measured("pressure on the plane", farthest(pressure, exact), exact, "Pa")
+            yield Measured("pressure on the plane", worst_value(pressure, exact), exact, "Pa")
 
 
 # -- belt over a cylinder --------------------------------------------------------------------------------
 
 DRUM, BELT_GAP = 0.1, 5e-4
-"""Radius and gap [m]"""
+"""Radius of the drum and contact gap [m]"""
 
 WRAPS = ((0.5, 0.1), (0.5, 0.5), (1.0, 0.3), (1.5, 0.1), (1.5, 0.5))
 """Angle of wrap over π, and μ"""
 
 PULLED, PULL, TURN = 0.2, 0.01, 10.0
-"""Load factor at which the belt is stretched, by how much, and by how many degrees the drum then turns"""
+"""Load factor at which the belt is stretched, its relative elongation, later rotation of the drum [°]"""
 
 
 def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str, Any], list[list[int]]]:
-    """The belt, n cells to a quarter of the drum, and the vertices of slack and tight end; collective.
+    """The belt, n cells per quarter of the drum, and the vertices of its slack and tight ends; collective.
 
-    At first its edges are as far from the drum as the gap.
+    The initial distance of its edges from the drum is the gap.
     """
     quarter = 0.5 * math.pi / n
     radius, wrapped, tail = (DRUM + BELT_GAP) / math.cos(0.5 * quarter), round(angle / quarter), n // 2
     cells, size = wrapped + 2 * tail, 2.0 * radius * math.sin(0.5 * quarter)
     flat, faces = rectangle(cells, 1, cells * size, size)
-    along = np.tile(np.arange(cells + 1.0) - tail, 2)
-    on = np.clip(along, 0.0, wrapped)
-    cos, sin, beyond = np.cos(on * quarter), np.sin(on * quarter), size * (along - on)
+    index = np.tile(np.arange(cells + 1.0) - tail, 2)
+    on_drum = np.clip(index, 0.0, wrapped)
+    cos, sin, beyond = np.cos(on_drum * quarter), np.sin(on_drum * quarter), size * (index - on_drum)
     start = np.column_stack([radius * sin + beyond * cos, flat[:, 1], radius * cos - beyond * sin])
     ends = [[0, cells + 1], [cells, 2 * cells + 1]]
-    way = PULL * cells * size
-    pull = [way * math.cos(angle), 0.0, -way * math.sin(angle)]
+    elongation = PULL * cells * size
+    pull = [elongation * math.cos(angle), 0.0, -elongation * math.sin(angle)]
     axis = [0.0, 1.0, 0.0]
     drum = {
         "capsule": {"from": [0.0, -1.0, 0.0], "to": axis, "radius": DRUM},
@@ -264,35 +258,44 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
 # -- sheets thrown at each other -------------------------------------------------------------------------
 
 SPEED, FLIGHT, THROWN = 2.0, 0.1, 8
-"""[m/s], [s], cells a side"""
+"""Speed [m/s], duration [s], cells along a side"""
 
 THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("midpoint", 0.3))
-"""Integrators and friction"""
+"""Integrators and coefficients of friction"""
 
 
 @dataclass
 class Balance:
-    """Largest resultant and moment of a step's contact forces over the sums of their sizes, and of those of
-    friction, with moments at the start of the step, whose pairs rub; largest change of momentum and angular
-    momentum, and rise of the energy, over what they are at the start.
+    """Largest violations of balances over all steps of a collision.
+
+    Attributes
+    ----------
+    force, moment : float
+        Resultant and moment of the contact forces of a step, over the sums of their sizes.
+    friction_force, friction_moment : float
+        The same for friction, whose moments refer to the start of the step.
+    momentum, angular : float
+        Changes of momentum and angular momentum over their sizes at the start.
+    energy : float
+        Increase of the energy over its value at the start.
     """
 
     force: float = 0.0
     moment: float = 0.0
-    rubs: float = 0.0
-    turns: float = 0.0
+    friction_force: float = 0.0
+    friction_moment: float = 0.0
     momentum: float = 0.0
     angular: float = 0.0
     energy: float = 0.0
 
-    def take(self, **found: float) -> None:
-        """Let each be no less than what is given."""
+    def update(self, **found: float) -> None:
+        """Raise each value to at least the given one."""
         for name, value in found.items():
             setattr(self, name, max(getattr(self, name), value))
 
 
 def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance:
-    """A sheet and a smaller one, tilted above it, that fly towards each other; collective."""
+    """Simulate a sheet and a smaller, tilted one above it that fly towards each other; collective."""
     side, small = 0.3, 0.24
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 50.0}
     upper = {"transform": {"rotate": turn, "translate": [0.05, 0.05, 0.25]}}
@@ -309,8 +312,8 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
     with bench.simulation(content) as trial:
         system, contact = trial.simulation.problem.system, trial.simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)
-        rubbing = trial.simulation.problem.terms.get("friction", contact)
-        assert isinstance(rubbing, Elastic)
+        friction_term = trial.simulation.problem.terms.get("friction", contact)
+        assert isinstance(friction_term, Elastic)
         below = (np.arange(len(trial.start)) < (THROWN + 1) ** 2)[:, None]
         trial.set_state(v=np.where(below, [0.2 * SPEED, 0.0, SPEED], [0.0, 0.0, -SPEED]))
         mass = trial.mass[:, None]
@@ -319,11 +322,11 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
             momentum = mass * trial.v
             return np.stack([momentum, np.cross(trial.x, momentum)])
 
-        def off(term: Elastic, x: Array, places: Array) -> Array:
-            pull = np.zeros((system.points.n_local, 3))
-            term.add_gradient(x, system.active.frozen[term], pull)
-            forces = trial.gather(pull)
-            each = np.stack([forces, np.cross(places, forces)])
+        def imbalance(term: Elastic, x: Array, points: Array) -> Array:
+            gradient = np.zeros((system.points.n_local, 3))
+            term.add_gradient(x, system.active.frozen[term], gradient)
+            forces = trial.gather(gradient)
+            each = np.stack([forces, np.cross(points, forces)])
             resultant = np.abs(each.sum(axis=1)).max(axis=1)
             return np.asarray(resultant / np.maximum(np.abs(each).sum(axis=(1, 2)), 1e-300))
 
@@ -333,12 +336,12 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
             begin = trial.x
             trial.step()
             x = system.stage_positions
-            force, moment = off(contact, x, trial.gather(x))
+            force, moment = imbalance(contact, x, trial.gather(x))
             if friction:
-                rubs, turns = off(rubbing, x, begin)
-                found.take(rubs=float(rubs), turns=float(turns))
+                friction_force, friction_moment = map(float, imbalance(friction_term, x, begin))
+                found.update(friction_force=friction_force, friction_moment=friction_moment)
             changed = np.abs(momenta().sum(axis=1) - before).max(axis=1) / sizes
-            found.take(
+            found.update(
                 force=float(force),
                 moment=float(moment),
                 momentum=float(changed[0]),
@@ -349,8 +352,8 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
 
 
 @case(
-    "Two sheets thrown at each other: resultant and moment of each step's contact forces, of friction where "
-    "the step begins; momentum, angular momentum, and by how much the energy rises above that at the start",
+    "Two colliding sheets: resultant and moment of the contact forces of each step, and of friction, about "
+    "positions at the start of the step; changes of momentum and angular momentum; increase of the energy",
     source="balance of momentum",
     resolutions=(250, 500, 1000, 2000),
     claim=Exact(1e-12),
@@ -371,8 +374,8 @@ def collision(bench: Bench, n: float) -> Iterator[Measured]:
         yield Measured(f"resultant, {words}", found.force, 0.0, scale=1.0)
         yield Measured(f"moment, {words}", found.moment, 0.0, scale=1.0)
         if friction:
-            yield Measured(f"resultant of friction, {integrator}", found.rubs, 0.0, scale=1.0)
-            yield Measured(f"moment of friction, {integrator}", found.turns, 0.0, scale=1.0)
+            yield Measured(f"resultant of friction, {integrator}", found.friction_force, 0.0, scale=1.0)
+            yield Measured(f"moment of friction, {integrator}", found.friction_moment, 0.0, scale=1.0)
         yield Measured(f"angular momentum, {words}", found.angular, 0.0, scale=1.0)
         yield Measured(f"momentum, {words}", found.momentum, 0.0, scale=1.0)
         yield Measured(f"energy, {words}", found.energy, 0.0, scale=1.0)
@@ -381,33 +384,33 @@ def collision(bench: Bench, n: float) -> Iterator[Measured]:
 # -- a block of layers -----------------------------------------------------------------------------------
 
 LAYERS, WIDE, NARROW, LAYER_GAP = 3, 0.4, 0.3, 0.002
-"""Sheets below, their side, that of the one on top, and the gap [m]"""
+"""Number of lower sheets, their side, the side of the top sheet, the gap [m]"""
 
 WIDE_CELLS, NARROW_CELLS = 6, 5
-"""Along a side, so that vertices do not lie on vertices"""
+"""Cells along a side, different so that vertices do not lie on vertices"""
 
-RUBS, PUSH, SETTLE = 0.3, 0.8, 0.4
-"""μ between sheets, speed of the one on top [m/s], and how long the block settles before [s]"""
+FRICTION, PUSH, SETTLE = 0.3, 0.8, 0.4
+"""μ between sheets, initial speed of the top sheet [m/s], time for settling before [s]"""
 
 
 @case(
-    "Block of four layers on a plane without friction; the top one, smaller, is pushed along it: its way on "
-    "the others, which go together, the velocities of all in the end, and the work of friction",
-    source="Coulomb: v = v₀ m/M, way v₀² (1 − m/M) / (2 μ g), work ½ m v₀² (1 − m/M)",
+    "Block of four layers on a plane without friction; the top layer, which is smaller, gets a velocity: its "
+    "sliding distance on the others, the final velocities of all layers, and the work of friction",
+    source="Coulomb: v = v₀ m/M, distance v₀² (1 − m/M) / (2 μ g), work ½ m v₀² (1 − m/M)",
     resolutions=(125, 250),
     claim=Converges(1.0, 2.5e-2, slack=0.5),
-    # sheets that still tremble in their planes
-    claims={"velocity in the end": Exact(3e-3)},
+    # the sheets still vibrate in their planes
+    claims={"final velocity": Exact(3e-3)},
     counts="steps per second",
     quick=1,
 )
 def layers(bench: Bench, n: float) -> Iterator[Measured]:
     def sheet(side: float, cells: int, number: int) -> dict[str, Any]:
-        place = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
-        return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": place}}
+        shift = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
+        return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": shift}}
 
     part = NARROW**2 / (NARROW**2 + LAYERS * WIDE**2)
-    slows = RUBS * G / (1.0 - part)
+    deceleration = FRICTION * G / (1.0 - part)
     content = {
         "mesh": [
             *(sheet(WIDE, WIDE_CELLS, number) for number in range(LAYERS)),
@@ -415,9 +418,9 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
         ],
         "material": {"cloth": "gray-interlock"},
         "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": LAYER_GAP, "friction": RUBS},
+        "contact": {"gap": LAYER_GAP, "friction": FRICTION},
         "obstacles": {"floor": FLOOR | {"friction": 0.0}},
-        "time": {"end": SETTLE + 1.4 * PUSH / slows, "step": 1.0 / n},
+        "time": {"end": SETTLE + 1.4 * PUSH / deceleration, "step": 1.0 / n},
     }
     with bench.simulation(content) as trial:
         trial.run_to(SETTLE)
@@ -428,28 +431,28 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
         moved, v = trial.run().x[:, 0] - before, trial.v[:, 0]
         work -= trial.simulation.budget.external_work
     means = np.bincount(number, mass * v) / np.bincount(number, mass)
-    way = float(np.average(moved[top], weights=mass[top]) - np.average(moved[~top], weights=mass[~top]))
-    yield Measured("velocity in the end", farthest(means, part * PUSH), part * PUSH, "m/s")
-    yield Measured("way on the others", way, 0.5 * PUSH**2 / slows, "m")
+    distance = float(np.average(moved[top], weights=mass[top]) - np.average(moved[~top], weights=mass[~top]))
+    yield Measured("final velocity", worst_value(means, part * PUSH), part * PUSH, "m/s")
+    yield Measured("sliding distance", distance, 0.5 * PUSH**2 / deceleration, "m")
     yield Measured("work of friction", work, 0.5 * float(mass[top].sum()) * PUSH**2 * (1.0 - part), "J")
 
 
 # -- ruck ------------------------------------------------------------------------------------------------
 
-RUCK = data("ruck")
+RUCK = load_data("ruck")
 
 HALF, RUCK_GAP, MEMBRANE = 3.0, 1e-4, 1e4
-"""Half of the sheet's length over l, gap over l, C l²/B."""
+"""Half the length of the sheet over l, gap over l, C l²/B."""
 
 LONG_STEP, STEPS = 1.0, 8
-"""Over √(l/g), of backward Euler, which damps all motion; how many of them the end moves, and then rests."""
+"""Δt over √(l/g), long so that backward Euler damps the motion; steps in which the end moves, then rests."""
 
 FOOT = (0.1, 0.45)
-"""Where (height over that of the ruck)^(1/3) is straight along the sheet."""
+"""Range of (height over that of the ruck)^(1/3) in which it is linear along the sheet."""
 
 
 def _small_ruck(s: Array, half_length: float, height: float) -> Array:
-    """Places (n, 2) of a ruck of small slopes at distances s from its middle: w'''' + (k/a)² w'' = −1."""
+    """Positions (n, 2) of a ruck with small slopes at arc length s from its middle: w'''' + k² w'' = −1."""
     k = 4.493409457909064 / half_length  # tan z = z
     x = np.linspace(0.0, half_length, 2001)
     edge = np.cos(k * half_length)
@@ -478,11 +481,11 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
     start = _small_ruck(along, half_length, height)
     frames: list[dict[str, Any]] = [{"time": 0.0}]
     for force, _, shortening, _ in rows:
-        # what the force shortens the sheet by, which stretches, comes on top
-        way = HALF * (1.0 - force / MEMBRANE) - 0.5 * shortening - float(start[:, 0].max())
+        # includes the elastic shortening by the force
+        displacement = HALF * (1.0 - force / MEMBRANE) - 0.5 * shortening - float(start[:, 0].max())
         begin = frames[-1]["time"]
         for time in (begin + STEPS * LONG_STEP, begin + 2 * STEPS * LONG_STEP):
-            frames.append({"time": time, "translate": [way, 0.0, 0.0]})
+            frames.append({"time": time, "translate": [displacement, 0.0, 0.0]})
     ends = [[0, cells + 1], [cells, 2 * cells + 1]]
     content = scene(
         bench.mesh(
@@ -525,12 +528,12 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
 # -- against a pole, over an edge ------------------------------------------------------------------------
 
 LENGTH, CELLS, STRIP_STEP, STRIP_GAP = 0.3, 12, 0.004, 0.002
-"""Of a strip [m]; cells along, Δt [s] and gap [m], of which one is refined at a time"""
+"""Length of a strip [m]; cells along it, Δt [s] and gap [m], of which one at a time is refined"""
 
 FABRIC = {"density": 0.2, "membrane": isotropic(200.0), "bending": 2e-4}
 
 ALONG_Y = [-1.0, 1.0]
-"""Ends of what strips meet, which are one cell wide and stay in the xz plane"""
+"""Extent of the obstacles along y; the strips are one cell wide and stay in the xz plane"""
 
 
 def _refined(
@@ -542,20 +545,22 @@ def _refined(
     obstacles: dict[str, Any],
     friction: float = 0.0,
 ) -> Iterator[Measured]:
-    """By how much the ends of a strip that falls until ``end`` [s] move when Δt, cells or gap go from 2/n to
-    1/n of the coarsest; ``transform`` places it by the gap [m].
+    """Change of the ends of a strip at ``end`` [s] when Δt, h or gap are refined from 2/n to 1/n of the
+    coarsest.
+
+    ``transform`` places the strip as a function of the gap [m].
     """
     falls = {
         "gravity": [0, 0, -9.81],
         "handles": [*held, {"group": "sheet", "axes": ["y"]}],
         "obstacles": obstacles,
-        # tighter than needed, and not as tight as without impacts
+        # looser than the default of cases because of the impacts
         "solver": {"force_tolerance": 1e-8, "step_tolerance": 1e-8},
     }
     for words in ("Δt", "h", "gap"):
         ends: list[Array] = []
         for part in (0.5 * n, n):
-            # friction of what bounces between long steps would hide what a smaller gap changes
+            # with long steps the friction of bouncing parts would hide the effect of the gap
             step = STRIP_STEP / {"Δt": part, "h": 1.0, "gap": 4.0}[words]
             gap = STRIP_GAP / part if words == "gap" else STRIP_GAP
             cells = round(CELLS * part) if words == "h" else CELLS
@@ -576,7 +581,7 @@ REFINED: dict[str, Any] = {
     "source": "order of backward Euler, and of the distance at which the barrier holds",
     "resolutions": (2, 4, 8),
     "claim": Converges(1.0, 1e-2, slack=0.4),
-    # corners of the polygon that a strip is arrive one by one
+    # no order: the corners of the polygonal strip touch the obstacle one by one
     "claims": {"change of the ends, h halved": Converges(1.0, 5e-3, slack=math.inf)},
     "counts": "refinements",
     "quick": 1,
@@ -607,25 +612,25 @@ def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
 MESHES = ("diagonal", "alternating", "irregular", "rings")
 PIXELS = 240
 RIM, WAVES = 1e-3, range(2, 10)
-"""Amplitude [m] of each wave along the rim that a drape starts with, and how many of them go around.
+"""Amplitude [m] of each initial wave along the rim, and numbers of waves around it.
 
-With 4 mm cloths are stretched so much where they are lifted that they may leap off the disc.
+With 4 mm cloths are stretched so much where they are lifted that they may jump off the disc.
 """
 
 SHORT, AT_REST = 1e-3, 1e-3
-"""Gap [m], less than the shortest edge of the finest mesh; speed [m/s] at which a cloth is at rest"""
+"""Gap [m], below the shortest edge of the finest mesh; speed [m/s] below which a cloth counts as at rest"""
 
 OF_DENIMS = 0.8
-"""The middle of 70 to 90 % that are published"""
+"""Middle of the published range of 70 to 90 %"""
 
 IN_TABLE = 4.0
-"""The table's stiffness over that with which the program it belongs to bends (`theory.md`)"""
+"""Bending stiffness of the table over the one that the program it belongs to uses (`theory.md`)"""
 
 
 def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
-    """A disc of radius 1, turned at random: rings, or a square of n × n cells mapped smoothly.
+    """A randomly rotated disc of radius 1: rings, or a square of n × n cells mapped smoothly.
 
-    Folds of coarse meshes follow edges, which would have a fixed direction to warp and weft.
+    Rotated, since folds of coarse meshes follow edges, which would have a fixed direction to warp and weft.
     """
     if kind == "rings":
         flat, faces = ring_disc(round(n / math.sqrt(3.0)))  # as many triangles as the others
@@ -641,16 +646,16 @@ def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
 
 
 def _wavy(flat: Array, random: np.random.Generator) -> Array:
-    """Positions [m] of a cloth that is lifted beside the disc in random waves, which decide on its folds."""
+    """Positions [m] of a cloth with random waves outside the disc, which determine its folds."""
     radius, angle = CLOTH * np.hypot(flat[:, 0], flat[:, 1]), np.arctan2(flat[:, 1], flat[:, 0])
-    beside = np.maximum(0.0, (radius - DISC) / (CLOTH - DISC)) ** 2
+    outside = np.maximum(0.0, (radius - DISC) / (CLOTH - DISC)) ** 2
     parts = random.normal(size=(len(WAVES), 2))
     waves = sum(a * np.cos(m * angle) + b * np.sin(m * angle) for m, (a, b) in zip(WAVES, parts, strict=True))
-    return CLOTH * flat + np.outer(RIM * beside * (waves - np.min(waves)), [0.0, 0.0, 1.0])
+    return CLOTH * flat + np.outer(RIM * outside * (waves - np.min(waves)), [0.0, 0.0, 1.0])
 
 
 def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
-    """A drape coefficient. No two kinds or starts have waves in common; collective."""
+    """Drape coefficient of one simulation; kinds and starts have independent waves; collective."""
     material = {"cloth": "11oz-black-denim", "bending_model": "midedge", "bending_scale": IN_TABLE}
     random = np.random.default_rng([MESHES.index(kind), start])
     flat, faces = _disc(kind, n, random)
@@ -660,16 +665,15 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
 
 
 def differences(samples: Sequence[Sequence[float]]) -> list[float]:
-    """How far each sample's mean is from the mean of the others' means, over twice its standard error.
+    """Distance of the mean of each sample from the mean of the others' means, over twice its standard error.
 
-    Each has a scatter of its own, and at least two values. A mean's distance to the mean of all means
-    is the same number of its standard errors.
+    Samples have their own variances and at least two values.
     """
     means = np.array([np.mean(sample) for sample in samples])
     squares = np.array([np.var(sample, ddof=1) / len(sample) for sample in samples])
     others = len(samples) - 1
-    off = np.abs(means - (means.sum() - means) / others)
-    return (off / (2.0 * np.sqrt(squares + (squares.sum() - squares) / others**2))).tolist()
+    distance = np.abs(means - (means.sum() - means) / others)
+    return (distance / (2.0 * np.sqrt(squares + (squares.sum() - squares) / others**2))).tolist()
 
 
 @case(
@@ -698,17 +702,17 @@ def cusick(bench: Bench, n: float) -> Iterator[Measured]:
 
 SLIDERS = ("beuler", "bdf2", "alpha2", "midpoint")
 LEAN, BED, BEGIN, RAN = 30.0, (1.6, 0.6), 0.2, 0.5
-"""Slope, size of the lower sheet [m], times [s] between which the upper one's acceleration is measured"""
+"""Slope [°], size of the lower sheet [m], times [s] between which the acceleration is measured"""
 
 
 def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tuple[dict[str, Any], int]:
-    """A sheet of n cells a side on a larger one of other triangles, which is held; vertices of that."""
+    """A sheet of n cells a side on a larger, fixed one with another mesh; number of vertices of that one."""
     angle, cells = math.radians(LEAN), (round(2.3 * n), round(0.87 * n))
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": LEAN}
     x, y, z = 0.1, 0.5 * (BED[1] - SIDE), CLEAR * LAYER_GAP
-    place = [x * math.cos(angle) + z * math.sin(angle), y, z * math.cos(angle) - x * math.sin(angle)]
+    shift = [x * math.cos(angle) + z * math.sin(angle), y, z * math.cos(angle) - x * math.sin(angle)]
     lower = grid(*BED, *cells, "diagonal") | {"transform": {"rotate": turn}}
-    upper = grid(SIDE, SIDE, n, n, "alternating") | {"transform": {"rotate": turn, "translate": place}}
+    upper = grid(SIDE, SIDE, n, n, "alternating") | {"transform": {"rotate": turn, "translate": shift}}
     count = (cells[0] + 1) * (cells[1] + 1)
     return {
         "mesh": [lower, upper],
@@ -721,8 +725,8 @@ def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tup
 
 
 @case(
-    "Sheet on a larger one of other triangles that is held on a slope of 30°: stands at 1.01 of the friction "
-    "that holds it, slides with g (sin α − μ cos α) at 0.5 and 0.9 of it; four integrators",
+    "Sheet on a larger, fixed sheet with another mesh on a slope of 30°: sticks with 1.01 of the critical "
+    "friction tan α, slides with g (sin α − μ cos α) at 0.5 and 0.9 of it; four integrators",
     source="Coulomb's law",
     resolutions=(8, 12),
     claim=Exact(5e-3),
@@ -742,7 +746,7 @@ def sheets(bench: Bench, n: float) -> Iterator[Measured]:
                 before, begin = trial.run_to(BEGIN).v[count:] @ down, trial.simulation.time
                 change = trial.run().v[count:] @ down - before
             exact = G * (1.0 - part) * math.sin(angle)
-            found = float(mass @ change) / mass.sum() / (RAN - begin)  # steps may have been shortened
+            found = float(mass @ change) / mass.sum() / (RAN - begin)  # steps may have been cut
             accelerations.append([Measured(f"acceleration, {integrator}", found, exact, "m/s²")])
         yield from worst(accelerations)
         content, count = _sheet_on_sheet(round(n), STICKS * math.tan(angle), integrator, 2.0 * SETTLED)

@@ -1,4 +1,4 @@
-"""Strips that hang: by one end, and between two supports as catenaries."""
+"""Hanging strips: by one end, and between two supports as catenaries."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lyra_petsc.experiments.verification.verification_case import (
     Exact,
     Measured,
     case,
-    data,
-    farthest,
     grid,
     isotropic,
+    load_data,
     scene,
+    worst_value,
 )
 
 ALONG = "cells along the strip"
@@ -43,14 +43,14 @@ def _by_one_end(n: int, density: float, held: dict[str, Any], **more: Any) -> di
 
 
 def of_chain(e: float, bars: int) -> float:
-    """Elongation over the length, half of each bar's weight being at its ends; e is the whole over c11."""
+    """Elongation over length of a chain of bars with half of each weight at both ends; e: weight over c11."""
     return float(stretches(e * (np.arange(bars) + 0.5) / bars, 1.0).mean() - 1.0)
 
 
 def of_strip(e: float) -> float:
-    """Elongation over the length of a strip; e is its weight over c11."""
-    [most] = stretches(np.array([e]), 1.0)
-    return float((0.75 * (most**4 - 1.0) - 0.5 * (most**2 - 1.0)) / (2.0 * e) - 1.0)
+    """Elongation over length of a strip; e is its weight over c11."""
+    [largest] = stretches(np.array([e]), 1.0)
+    return float((0.75 * (largest**4 - 1.0) - 0.5 * (largest**2 - 1.0)) / (2.0 * e) - 1.0)
 
 
 @case(
@@ -68,13 +68,13 @@ def hanging_strip_chain(bench: Bench, n: float) -> Iterator[Measured]:
     shares[[0, -1]] *= 0.5
     for e in (0.01, 0.1, 1.0):
         weight, exact = e * STIFFNESS * WIDTH, of_chain(e, bars) * LENGTH
-        # not by gravity: the two corners of a strip's end differ in mass, its rows must not
+        # loads instead of gravity, as all rows need the same weight and grid vertices differ in mass
         loads = [
             row | {"force": [weight * share, 0, 0]} for row, share in zip(rows, shares.tolist(), strict=True)
         ]
         with bench.simulation(_by_one_end(bars, 0.1, rows[0], loads=loads)) as trial:
             x = trial.run().x
-        end = farthest(x[[bars, 2 * bars + 1], 0] - LENGTH, exact)
+        end = worst_value(x[[bars, 2 * bars + 1], 0] - LENGTH, exact)
         yield Measured(f"elongation, weight {e:g} of c11", end, exact, "m", LENGTH)
 
 
@@ -97,20 +97,20 @@ def hanging_strip(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- catenaries ------------------------------------------------------------------------------------------
 
-CATENARY = data("catenary")
+CATENARY = load_data("catenary")
 CONVERGING: dict[str, Any] = {
     "resolutions": (8, 16, 32, 64), "claim": Converges(2.0, 1e-3), "counts": ALONG,
 }  # fmt: skip
 
 STRETCHES = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
-"""Weight over c11, by span: the strip stretches by no more, and the less it sags, the more that counts."""
+"""Weight over c11 by span, which bounds the stretch; its effect is larger the less the strip sags."""
 
 UNEQUAL = 2e-6
-"""of c11: the strip stretches by no more than that"""
+"""Weight over c11, which bounds the stretch"""
 
 
 def _middle(bench: Bench, n: float, e: float, dx: float, dz: float = 0.0) -> tuple[float, float]:
-    """Where the middle of a strip hangs [m], x and z from its left support; supports (dx, dz) L apart."""
+    """x and z [m] of the middle of a strip from its left support; supports at distance (dx, dz) L."""
     with bench.simulation(hung(bench, int(n), e, dx * LENGTH, dz * LENGTH)) as trial:
         x, _, z = trial.run().x[int(n) // 2]
     return float(x), float(z)
@@ -142,9 +142,9 @@ def catenary_unequal(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 def middle(a: float, lowest: float) -> tuple[float, float]:
-    """Where half the length of a catenary has been run through from its left end [both over L].
+    """Coordinates over L of the point at half the length of a catenary, from its left end.
 
-    ``a`` and ``lowest`` are its parameter and the abscissa of its lowest point.
+    ``a`` and ``lowest`` are its parameter and the abscissa of its lowest point, over L.
     """
     x = lowest + a * math.asinh(0.5 / a - math.sinh(lowest / a))
     return x, a * (math.cosh((x - lowest) / a) - math.cosh(lowest / a))

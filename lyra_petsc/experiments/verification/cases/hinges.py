@@ -1,11 +1,11 @@
-"""Flat sheets of hinges: their effective bending stiffness, small deflections and frequencies.
+"""Flat sheets of hinges: effective bending stiffness, small deflections and frequencies.
 
-A flat sheet at rest has no coupling between its plane and the direction across it. Everything here is
-gathered on every rank, in mesh order.
+In a flat sheet at rest deflections are not coupled to displacements in the plane. All data are gathered on
+every rank, in mesh order.
 
-The stiffness of an endless strip or sheet comes from the hinges of one of its periodic cells: the height
-is a quadratic with the mean curvatures plus a periodic part; the energy, least over the periodic part and
-whatever curvature is left free, gives the effective stiffness.
+The stiffness of an infinite strip or sheet follows from the hinges of one periodic cell: the deflection is a
+quadratic function with the mean curvatures plus a periodic part; the minimum of the energy over the periodic
+part, and over curvatures that are free, gives the effective stiffness.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from lyra_petsc.experiments.verification.verification_case import (
     Exact,
     Measured,
     case,
-    data,
     grid,
+    load_data,
     scene,
 )
 from lyra_petsc.terms.bending import Bending
@@ -35,14 +35,14 @@ from lyra_petsc.terms.bending import Bending
 
 @dataclass(frozen=True)
 class Hinges:
-    """The energy ½ (slopes · z)² of every hinge in the heights z [m] of its vertices.
+    """The energy ½ (slopes · z)² of every hinge for the deflections z [m] of its vertices.
 
     Attributes
     ----------
     stencil : (E, 4) int64
-        Vertices of each hinge, numbered as the mesh.
+        Vertices of each hinge in mesh numbering.
     slopes : (E, 4) float64
-        ∂θ/∂z times the root of the stiffness of an angle, [√(N/m)].
+        ∂θ/∂z times the square root of the hinge stiffness, [√(N/m)].
     """
 
     stencil: Ints
@@ -50,7 +50,7 @@ class Hinges:
 
 
 def hinges_of(trial: Trial) -> Hinges:
-    """The hinges of the bending term at the start shape, each once; collective."""
+    """All hinges of the bending term in the start shape; collective."""
     problem = trial.simulation.problem
     term = next(term for term in problem.terms.values() if isinstance(term, Bending))
     n = term.n_owned
@@ -65,8 +65,8 @@ def hinges_of(trial: Trial) -> Hinges:
 def _slopes(corners: Array) -> Array:
     """∂θ/∂z (E, 4) [1/m] of flat hinges with corners (E, 4, 2) [m] as in ``terms.hinge``.
 
-    At the opposite vertices it is −1 over their heights, at the ends of the edge what keeps a tilt free of
-    angle.
+    At the opposite vertices it is −1 over their heights above the edge; the values at the ends of the edge
+    follow from invariance under rigid rotations.
     """
     edge = corners[:, 1] - corners[:, 0]
     length = np.linalg.norm(edge, axis=1)
@@ -82,13 +82,13 @@ def _slopes(corners: Array) -> Array:
 
 
 OFF_THE_LINES = 0.0917
-"""Where a cell begins, as a part of it: no hinge lies on its border."""
+"""Offset of the periodic cell over its size, such that no hinge lies on its border."""
 
 
 def strip_stiffness(hinges: Hinges, points: Array, start: float, period: float, width: float) -> float:
     """B_effective [N·m] of a strip along x with free edges: moment per width over curvature.
 
-    Lateral curvature, twist and the heights of the vertices relax.
+    Lateral curvature, twist and deflections of the vertices are relaxed.
 
     Parameters
     ----------
@@ -96,8 +96,7 @@ def strip_stiffness(hinges: Hinges, points: Array, start: float, period: float, 
     points : (V, 2) float64
         Vertices at rest [m].
     start, period : float [m]
-        The cell begins at ``start``, far enough from the ends of the strip that none of its hinges is
-        missing, and repeats after ``period``.
+        Start and length of the periodic cell, far enough from the ends of the strip.
     width : float [m]
     """
     x, y = points.T
@@ -109,7 +108,7 @@ def strip_stiffness(hinges: Hinges, points: Array, start: float, period: float, 
 
 
 def sheet_stiffness(hinges: Hinges, points: Array, start: Sequence[float], lattice: Array) -> Array:
-    """D (3, 3) [N·m] of an endless sheet: energy per area ½ κᵀ D κ with κ = (κ11, κ22, 2 κ12).
+    """D (3, 3) [N·m] of an infinite sheet: energy per area ½ κᵀ D κ with κ = (κ11, κ22, 2 κ12).
 
     Parameters
     ----------
@@ -117,7 +116,7 @@ def sheet_stiffness(hinges: Hinges, points: Array, start: Sequence[float], latti
     points : (V, 2) float64
         Vertices at rest [m].
     start : (2,)
-        Where the cell begins, in lattice coordinates.
+        Start of the cell in lattice coordinates.
     lattice : (2, 2) float64
         The two periods [m], as columns.
     """
@@ -128,7 +127,7 @@ def sheet_stiffness(hinges: Hinges, points: Array, start: Sequence[float], latti
 
 
 def _relaxed(hinges: Hinges, points: Array, shapes: Array, to_cell: Array, start: Array) -> Array:
-    """Quadratic form (m, m) of a cell's energy in the amplitudes of ``shapes`` (V, m).
+    """Quadratic form (m, m) of the energy of a cell in the amplitudes of ``shapes`` (V, m).
 
     ``to_cell`` (d, 2) maps positions to lattice coordinates.
     """
@@ -160,14 +159,14 @@ def _plate(mesh: dict[str, Any], **more: Any) -> dict[str, Any]:
     return scene(mesh, material, ASSEMBLED, **more)
 
 
-# -- endless strips and sheets ---------------------------------------------------------------------------
+# -- infinite strips and sheets --------------------------------------------------------------------------
 
 RATIOS = {"square cells": 1.0, "cells twice as long as wide": 0.5, "cells twice as wide as long": 2.0}
 """Width of a cell over its length along the strip."""
 
 
 def expected(pattern: str, ratio: float = 1.0) -> float:
-    """B_effective / B of a strip with free edges, by hand from the hinges of one cell.
+    """B_effective / B of a strip with free edges, derived from the hinges of one cell.
 
     Single diagonals and alternating: (1 + r²)² / ((1 + r²)² + r⁴); criss-cross:
     2 / (1 + 4 r⁴ / (1 + r²)²), r the width of a cell over its length.
@@ -190,16 +189,16 @@ def expected(pattern: str, ratio: float = 1.0) -> float:
 )
 def hinge_strip(bench: Bench, n: float) -> Sequence[Measured]:
     found = []
-    for words, ratio in RATIOS.items():
+    for label, ratio in RATIOS.items():
         for pattern in PATTERNS:
             with bench.simulation(_plate(grid(6.0, round(n) * ratio, 6, round(n), pattern))) as trial:
                 hinges, points = hinges_of(trial), trial.x[:, :2]
             value = strip_stiffness(hinges, points, start=2.0, period=2.0, width=n * ratio)
-            found.append(Measured(f"B_effective / B, {pattern}, {words}", value, expected(pattern, ratio)))
+            found.append(Measured(f"B_effective / B, {pattern}, {label}", value, expected(pattern, ratio)))
     return found
 
 
-SHEET = data("hinge_sheet")
+SHEET = load_data("hinge_sheet")
 CELLS = 8
 """Along each side of the meshes."""
 
@@ -207,7 +206,7 @@ ENTRIES = {"D11": (0, 0), "D22": (1, 1), "D12": (0, 1), "D13": (0, 2), "D23": (1
 
 
 def _lattice(mesh: str) -> Array:
-    """Edge vectors [m] of the smallest cell, as columns."""
+    """Edge vectors [m] of the primitive cell, as columns."""
     return np.array([[1.0, -0.5], [0.0, np.sqrt(0.75)]]) if mesh == "equilateral" else np.eye(2)
 
 
@@ -219,7 +218,7 @@ def _equilateral(bench: Bench) -> dict[str, Any]:
 
 
 @case(
-    "Bending stiffness of endless sheets, energy per area ½ κᵀDκ, κ = (κ11, κ22, 2κ12), over k = B/6",
+    "Bending stiffness of infinite sheets, energy per area ½ κᵀDκ, κ = (κ11, κ22, 2κ12), over k = B/6",
     source=SHEET["source"],
     resolutions=(2, 4, 6),
     claim=Exact(1e-10),
@@ -245,7 +244,7 @@ def hinge_sheet(bench: Bench, n: float) -> Sequence[Measured]:
 
 
 def heights(trial: Trial, force: Array) -> Array:
-    """Heights (V,) [m] under small forces (V,) [N] across a flat sheet, by its stiffness; collective."""
+    """Deflections (V,) [m] of a flat sheet under small transverse forces (V,) [N]; collective."""
     return small_motions(trial).displacements(force[:, None] * [0.0, 0.0, 1.0])[:, 2]
 
 
@@ -258,13 +257,13 @@ def _wide(pattern: str, across: int) -> str:
     "against the beam's with B_effective",
     source="Euler-Bernoulli beam, closed form: w = q L⁴/(8 B)",
     resolutions=(32, 64, 128),
-    # near the clamp, over about the strip's width, curvature across is missing
+    # near the clamp, over about the width of the strip, lateral curvature is suppressed
     claim=Converges(1.0, 1.3e-2),
     claims={_wide("alternating", 2): Converges(2.0, 1e-4)},
     counts="cells along the strip",
 )
 def wide_strip(bench: Bench, n: float) -> Sequence[Measured]:
-    """The clamp keeps the strip from curving across, which hinges want to."""
+    """The clamp suppresses the lateral curvature that bending by hinges causes."""
     found = []
     along = round(n)
     for across in (2, 4):
@@ -278,7 +277,7 @@ def wide_strip(bench: Bench, n: float) -> Sequence[Measured]:
     return found
 
 
-PLATES, EXACT = data("hinge_plate"), data("linear_plate")["deflection"]
+PLATES, EXACT = load_data("hinge_plate"), load_data("linear_plate")["deflection"]
 
 
 def square_plate(edges: str, pattern: str, n: int) -> dict[str, Any]:
@@ -287,8 +286,8 @@ def square_plate(edges: str, pattern: str, n: int) -> dict[str, Any]:
 
 
 @case(
-    "Linear plates (C clamped, S supported, F free edges) under uniform load: how far hinges are off "
-    "the exact deflection, against what is predicted for the mesh",
+    "Linear plates (C clamped, S supported, F free edges) with hinges under uniform load: error of the "
+    "deflection against the error that is predicted for the mesh",
     source=PLATES["source"],
     resolutions=(8, 16, 32, 64),
     claim=Exact(1e-7),  # round-off: the condition number grows with n⁴
@@ -298,7 +297,7 @@ def hinge_plate(bench: Bench, n: float) -> Sequence[Measured]:
     for edges, pattern, *errors in PLATES["rows"]:
         with bench.simulation(square_plate(edges, pattern, round(n))) as trial:
             height, points = heights(trial, trial.mass), trial.x[:, :2]
-        # of plates that are held all round the same for each ν
+        # the deflection of plates that are supported all round does not depend on ν
         exact = EXACT.get(f"{edges} 0") or EXACT[f"{edges} 0.3"]
         at = int(np.argmin(np.linalg.norm(points - exact["place"], axis=1)))
         error = height[at] / exact["at"] - 1.0

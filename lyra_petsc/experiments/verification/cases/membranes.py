@@ -1,5 +1,5 @@
-"""Membranes: homogeneous deformations, a round one under a dead load, and small vibrations of stretched and
-of hanging ones.
+"""Membranes: homogeneous deformations, a round membrane under its weight, small vibrations of stretched and
+hanging membranes.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from lyra_petsc.experiments.verification.verification_case import (
     Exact,
     Measured,
     case,
-    data,
-    farthest,
     grid,
     isotropic,
+    load_data,
     scene,
     worst,
+    worst_value,
 )
 
 MATERIALS = {
@@ -36,7 +36,7 @@ MATERIALS = {
     "orthotropic": {"c11": 1200.0, "c12": 300.0, "c22": 800.0, "c33": 250.0},
     "nu = 0": {"c11": 1000.0, "c12": 0.0, "c22": 1000.0, "c33": 500.0},
 }
-"""N/m"""
+"""Membrane stiffnesses [N/m]"""
 
 TURN = math.radians(30.0)
 GRADIENTS = [
@@ -45,19 +45,19 @@ GRADIENTS = [
 ]
 GRADIENTS += [np.array([[1.0, 0.3], [0.0, 1.0]]), np.array([[1.07, 0.11], [-0.05, 0.93]])]
 GRADIENTS += [np.array([[math.cos(TURN), -math.sin(TURN)], [math.sin(TURN), math.cos(TURN)]]) @ GRADIENTS[3]]
-"""Plane deformation gradients F: stretches, simple shear, one in general, a turn of stretches."""
+"""Plane deformation gradients F: stretches, simple shear, a general one, a rotation of stretches."""
 
 PULLS = {"isotropic": (1.01, 1.1, 1.5, 2.0), "orthotropic": (1.01, 1.1, 1.5), "nu = 0": (1.01, 1.1, 1.5, 2.0)}
-"""Stretches along the pull."""
+"""Stretches in the direction of the pull"""
 
 BASE, HEIGHT = 1.0, 0.7
-"""m"""
+"""Sides of the sheet [m]"""
 
 NEAR = 1e-6
-"""m from the edge"""
+"""Distance [m] from an edge within which vertices count as on it"""
 
 TILT = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
-"""Rotation in which the deformed sheet lies in space: no answer may depend on it."""
+"""Rotation of the deformed sheet in space, on which no result may depend."""
 
 
 def _scene(mesh: dict[str, Any], material: str, **more: Any) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
     inner = (x > NEAR) & (x < BASE - NEAR) & (y > NEAR) & (y < HEIGHT - NEAR)
     residual = np.abs(trial.gather(force)[inner]).max(initial=0.0)
     scale = float(max(stiffness, *np.abs(exact)))
-    # [N] that one triangle of the mean size puts on a vertex
+    # force [N] of one triangle of mean size on a vertex
     nodal = scale * float(np.sqrt(area / problem.outline.n_triangles))
     mine = membrane.strain_and_stress(problem.system.x)[1][: membrane.n_owned]
     stress = np.concatenate(points.comm.allgather(mine))
@@ -112,7 +112,7 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
         Measured("largest force on an inner vertex", float(residual), 0.0, "N", nodal),
     ]
     for k, name in enumerate(("S11", "S22", "S12")):
-        value, known = farthest(stress[:, k], exact[k]), float(exact[k])
+        value, known = worst_value(stress[:, k], exact[k]), float(exact[k])
         measured.append(Measured(f"{name} of the triangle farthest off", value, known, "N/m", scale))
     return measured
 
@@ -154,13 +154,13 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 G = 9.81
-"""m/s²"""
+"""Gravity [m/s²]"""
 
 # -- a round membrane ------------------------------------------------------------------------------------
 
-ROUND = data("circular_membrane")
+ROUND = load_data("circular_membrane")
 RADIUS, STIFFNESS = 1.0, 1000.0
-"""m, N/m"""
+"""Radius [m], membrane stiffness [N/m]"""
 
 
 @case(
@@ -187,14 +187,14 @@ def circular_membrane(bench: Bench, n: float) -> Iterator[Measured]:
 # -- a stretched one -------------------------------------------------------------------------------------
 
 LONG, SHORT, AREAL = 1.0, 0.5, 0.2
-"""m, m, kg/m²"""
+"""Sides [m] and density [kg/m²]"""
 
 TENSE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
 """N/m"""
 
 STRETCHES = np.diag([1.02, 1.01])
 MODES = ((1, 1), (2, 1), (3, 1), (1, 2))
-"""Half waves along and across, by ascending frequency."""
+"""Numbers of half waves along and across, by ascending frequency."""
 
 
 def omega_of(along: int, across: int) -> float:
@@ -204,7 +204,7 @@ def omega_of(along: int, across: int) -> float:
 
 
 def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """The scene of the membrane in its stretched state, all edges held there; n × n/2 cells."""
+    """The scene of the stretched membrane with fixed edges; n × n/2 cells."""
     vertices, triangles = rectangle(n, n // 2, LONG, SHORT)
     number = np.arange(len(vertices)).reshape(n // 2 + 1, n + 1)
     edge = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
@@ -234,7 +234,7 @@ def stretched_membrane(bench: Bench, n: float) -> Sequence[Measured]:
 
 CELLS = 16
 AMPLITUDE = 1e-5
-"""m: small enough for a linear motion, large enough for its forces to stand above round-off"""
+"""Amplitude [m], small enough for a linear motion, large enough for forces above round-off"""
 
 PERIOD = 2.0 * math.pi / omega_of(1, 1)
 """s"""
@@ -272,9 +272,9 @@ def released_mode(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[np.complex128]]:
-    """The mode's ω from K and M, and q + i q̇/ω of its coordinate q after every step of one period."""
+    """ω of the first mode from K and M, and q + i q̇/ω of its modal coordinate after each step of a period."""
     time = {"end": PERIOD, "step": PERIOD / n, "integrator": integrator}
-    # only the rounding floor ends Newton: the stretched sheet's forces are large, the motion is small
+    # Newton's method must reach round-off: forces of the stretched sheet are large, those of the motion small
     tight = {"force_tolerance": 1e-15, "step_tolerance": 1e-15}
     with bench.simulation(_stretched(bench, CELLS, time, solver=tight)) as trial:
         frequencies, shapes = lowest_modes(trial, 1)
@@ -293,10 +293,10 @@ def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[n
 # -- a hanging one ---------------------------------------------------------------------------------------
 
 LENGTH, WIDTH, DENSITY = 1.0, 0.05, 0.2
-"""m, m, kg/m²"""
+"""Length [m], width [m], density [kg/m²]"""
 
 STIFF = 1e6
-"""N/m; the weight stretches the strip by 1e-6"""
+"""Membrane stiffness [N/m]; the weight stretches the strip by 1e-6"""
 
 
 @case(
@@ -307,8 +307,8 @@ STIFF = 1e6
     counts="cells along the strip",
 )
 def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
-    # a membrane pulled in one direction only does not feel its neighbours on either side: of the three
-    # columns of vertices the middle one, whose masses are those of a wide sheet, is free
+    # under uniaxial tension neighbouring columns of vertices are not coupled: only the middle one of three is
+    # free, whose masses are those of a wide sheet
     kept = {"sheet": "x", "left": "z", "right": "z"}
     held = [{"group": "top"}, *({"group": name, "axes": [axis]} for name, axis in kept.items())]
     mesh, material = grid(WIDTH, LENGTH, 2, int(n)), {"density": DENSITY, "membrane": isotropic(STIFF)}
@@ -326,7 +326,7 @@ def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
 
 
 def _hanging(y: Array, n: float) -> Array:
-    """Heights at which every bar between two rows carries what hangs below its middle."""
+    """Heights at which each bar between two rows carries the weight below its middle."""
     tension = DENSITY * G * LENGTH * (np.arange(int(n)) + 0.5) / n
     heights = np.concatenate([[0.0], np.cumsum(stretches(tension, 1.0 / STIFF)) * LENGTH / n])
     return np.asarray(LENGTH - (heights[-1] - heights)[np.rint(y / LENGTH * n).astype(np.int64)])

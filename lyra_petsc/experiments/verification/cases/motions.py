@@ -1,4 +1,4 @@
-"""Motions of a sheet that backward Euler steps through as a few numbers would: falls, a spring, a spin."""
+"""Motions for which backward Euler reduces to a few scalar equations: falls, a spring, a spin."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lyra_petsc.experiments.verification.verification_case import (
     Exact,
     Measured,
     case,
-    farthest,
     grid,
     isotropic,
     scene,
+    worst_value,
 )
 
 # -- falls -----------------------------------------------------------------------------------------------
@@ -29,7 +29,7 @@ G = 9.81
 
 
 def _sheet(nx: int, n: float, end: float, density: float, **more: Any) -> dict[str, Any]:
-    """A sheet that nothing holds, stepped by 1/n s."""
+    """A free sheet, Δt = 1/n s."""
     material = {"density": density, "membrane": {"c11": 1200, "c22": 800, "c12": 300, "c33": 250}}
     time = {"end": end, "step": 1.0 / n}
     return scene(grid(1.0, 0.6, nx, 3, "alternating"), material, time, **more)
@@ -50,23 +50,23 @@ def free_fall(bench: Bench, n: float) -> Sequence[Measured]:
     steps = round(end * n)
     discrete, exact = -0.5 * G * steps * (steps + 1) / n**2, -0.5 * G * end**2
     return [
-        Measured("z of the vertex farthest off, discrete answer", farthest(z, discrete), discrete, "m"),
+        Measured("z of the vertex farthest off, discrete answer", worst_value(z, discrete), discrete, "m"),
         Measured("mean z, continuous answer", float(z.mean()), exact, "m"),
     ]
 
 
 DENSITY, AIR = 0.2, 1.0
-"""kg/m², kg/m³"""
+"""Densities of sheet [kg/m²] and air [kg/m³]"""
 
 DRAG = 2.0
-"""kg/(m² s), along the sheet"""
+"""Tangential drag coefficient [kg/(m² s)]"""
 
 END = 0.5
-"""s"""
+"""End time [s]"""
 
 
 def level_fall(n: float, end: float) -> tuple[float, float]:
-    """Speed [m/s] and depth [m] after backward Euler's steps of 1/n s; v is the root of its quadratic."""
+    """Speed [m/s] and depth [m] after backward Euler steps of 1/n s; v solves a quadratic equation."""
     dt, v, z = 1.0 / n, 0.0, 0.0
     a = dt * AIR / DENSITY
     for _ in range(round(end * n)):
@@ -77,7 +77,7 @@ def level_fall(n: float, end: float) -> tuple[float, float]:
 
 
 def _edge_on(n: float) -> float:
-    """Speed [m/s] of backward Euler under a force proportional to it."""
+    """Speed [m/s] by backward Euler with a drag proportional to the speed."""
     dt, v = 1.0 / n, 0.0
     for _ in range(round(END * n)):
         v = (v + dt * G) / (1.0 + dt * DRAG / DENSITY)
@@ -107,7 +107,7 @@ def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
     with bench.simulation(scene([0, 0, -G], AIR, 0.0)) as trial:
         start = trial.x[0, 2]
         trial.run()
-        level = farthest(-trial.v[:, 2], speed)
+        level = worst_value(-trial.v[:, 2], speed)
         fallen = float(start - trial.x[0, 2])
     terminal = math.sqrt(DENSITY * G / AIR)
     exact = terminal**2 / G * math.log(math.cosh(G * END / terminal))
@@ -116,7 +116,7 @@ def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
     yield Measured("depth of a level sheet, exact in time", fallen, exact, "m")
     with bench.simulation(scene([0, -G, 0], AIR, DRAG)) as trial:
         slow = _edge_on(n)
-        edge_on = farthest(-trial.run().v[:, 1], slow)
+        edge_on = worst_value(-trial.run().v[:, 1], slow)
     terminal = DENSITY * G / DRAG
     exact = terminal * (1.0 - math.exp(-G * END / terminal))
     yield Measured("speed of a sheet edge-on, backward Euler", edge_on, slow, "m/s")
@@ -134,10 +134,10 @@ SPRING_DENSITY = 0.3
 
 
 def _sprung_sheet(time: dict[str, Any]) -> dict[str, Any]:
-    """One cell of two triangles, set off at 1 m/s along z from where its springs are slack.
+    """One cell of two triangles that starts at 1 m/s along z from the rest position of its springs.
 
-    All vertices feel the springs alike, so that it moves rigidly, as one linear oscillator: a third of a
-    triangle's mass is on each of its corners, and so is a third of its share of stiffness.
+    The sheet moves rigidly as one linear oscillator, as masses and spring stiffnesses of the vertices have
+    the same ratio: both are a third of those of each adjacent triangle.
     """
     third = SPRING_DENSITY * 0.5 / 3.0 * OMEGA**2
     material = {"density": SPRING_DENSITY, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}}
@@ -165,12 +165,12 @@ def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
         for _ in range(SPRING_STEPS):
             before = _states(trial)
             trial.step()
-        # z and v/ω turn and shrink together
+        # z + i v/ω rotates and shrinks in the complex plane
         ratios = _states(trial) / before
     size, turn = np.abs(ratios), -np.angle(ratios)
     return [
-        Measured("amplification per step", farthest(size, amplification), amplification),
-        Measured("phase per step", farthest(turn, phase), phase, "rad"),
+        Measured("amplification per step", worst_value(size, amplification), amplification),
+        Measured("phase per step", worst_value(turn, phase), phase, "rad"),
     ]
 
 
@@ -178,10 +178,10 @@ def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
 
 STEPS = 10
 TRIANGLE_DENSITY, RADIUS, DT = 0.2, 1.0, 1e-2
-"""kg/m², m, s"""
+"""Density [kg/m²], radius [m], Δt [s]"""
 
 STRAIN = 1e-6
-"""ρ ω² R²/c11: how far from rigid the triangle is."""
+"""ρ ω² R²/c11, the size of the strain of the nearly rigid triangle"""
 
 RIGID = "angle of a step, of a rigid body"
 
@@ -191,15 +191,15 @@ def _stiffness(n: float) -> float:
 
 
 def _first_velocity(n: float) -> complex:
-    """Radial and tangential velocity [m/s] that a step of the full angle, 1/n, has left behind."""
+    """Radial and tangential velocity [m/s] after an imagined step that rotated by the angle 1/n."""
     return RADIUS / DT * (1.0 - cmath.exp(-1j / n))
 
 
 def _backward_euler(n: float) -> tuple[float, float]:
-    """Last step's angle [rad] and radius [m] of the triangle as three points with one common radius.
+    """Angle of the last step [rad] and final radius [m] of three points with a common radius.
 
-    The force of a radius r points to the centre: the point x + Δt v turns no further, it only
-    shrinks to the radius at which m (|x + Δt v| − r)/Δt² is the force.
+    The elastic force is radial: a step keeps the angle of x + Δt v and reduces its radius to the r at which
+    m (|x + Δt v| − r)/Δt² equals the force.
     """
     area = 0.75 * math.sqrt(3.0) * RADIUS**2
     mass = TRIANGLE_DENSITY * area / 3.0
@@ -256,7 +256,7 @@ def rigid_rotation(bench: Bench, n: float) -> Sequence[Measured]:
     rigid = 1.0 / n
     for _ in range(STEPS):
         rigid = math.atan(math.sin(rigid) / (2.0 - math.cos(rigid)))
-    angle = farthest(angles, exact)
+    angle = worst_value(angles, exact)
     return [
         Measured("angle of a step, of the elastic triangle", angle, exact, "rad"),
         Measured("radius at the end", float(np.linalg.norm(x, axis=1).max()), radius, "m"),

@@ -1,4 +1,4 @@
-"""Plane walls that meet at an angle, two or more at an edge, by one unknown on every edge: closed forms."""
+"""Plane walls that meet at an angle, two or more at an edge, with directors on edges; closed forms."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ FRAMES: dict[str, tuple[Section, int, float]] = {
     ),
     "three strips": ([(FOOT, TOP), (TOP, END), (SIDE, TOP)], 2, 1.0 / 3.0 + 1.0 / 8.0),
 }
-"""Strips of 1 m, the foot and the side of which are clamped; the direction of a force at the end of the
-second, and how far it goes, over P L³/B."""
+"""Frames of strips of 1 m that are clamped at foot and side: the strips, the direction of a force at the
+end of the second strip, and the displacement of this end over P L³/B."""
 
 
 @case(
-    "Frames of two or three strips that bend by directors, ν = 0, with a small force at an end: its way "
-    "against that of beams",
+    "Frames of two or three strips that bend by directors, ν = 0, with a small force at an end: its "
+    "displacement against that of beams",
     source="theory of beams, closed form",
     resolutions=(8, 16, 32),
     claim=Converges(2.0, 2e-3),
@@ -67,8 +67,8 @@ def frames(bench: Bench, n: float) -> Iterator[Measured]:
                 loads=[{"nodes": end.tolist(), "force": (force * width * np.eye(3)[axis]).tolist()}],
             )
             with bench.simulation(content) as trial:
-                way = float((trial.run().x - vertices)[end, axis].mean()) / force
-            yield Measured(f"way over P L³/B, {words}, {pattern}", way, exact)
+                deflection = float((trial.run().x - vertices)[end, axis].mean()) / force
+            yield Measured(f"displacement over P L³/B, {words}, {pattern}", deflection, exact)
 
 
 def _legs(*degrees: float) -> Section:
@@ -82,15 +82,17 @@ SECTIONS: dict[str, tuple[Section, float, tuple[tuple[float, float], ...]]] = {
     "cross": (_legs(0.0, 90.0, 180.0, 270.0), LENGTH, (FOOT,)),
     "square tube": ([(FOOT, (1, 0)), ((1, 0), END), (END, TOP), (TOP, FOOT)], 1.0, (FOOT, (1, 0), END, TOP)),
 }
-"""Walls of 1 m width, the length of the column [m], and the lines that stay straight."""
+"""Columns of walls 1 m wide: the walls, the length of the column [m], and the edges that stay straight."""
 
 SHIFT = 0.4
-"""Of the lowest square [1/s²] without compression: more than it is ever below 0"""
+"""Shift of the eigenvalue problem over the lowest squared frequency without compression, larger than any
+negative square"""
 
 
 def flange(length: float, poisson: float) -> float:
-    """Compression over π² D/b² at which a plate buckles, three of whose sides are supported, ``length``
-    over its width b, that of the last side which is free.
+    """Buckling load over π² D/b² of a plate of width b with one free and three supported sides.
+
+    ``length`` is the length of the free side over b.
     """
     from scipy.optimize import brentq
 
@@ -102,14 +104,14 @@ def flange(length: float, poisson: float) -> float:
         one, two = a * a - poisson * along**2, b * b + poisson * along**2
         return b * one**2 * math.tanh(a) * math.cos(b) - a * two**2 * math.sin(b)
 
-    least = length**-2
-    return float(brentq(condition, least * (1.0 + 1e-9), least + 1.0))
+    lower = length**-2
+    return float(brentq(condition, lower * (1.0 + 1e-9), lower + 1.0))
 
 
 @case(
     "Columns of thin walls that meet at an angle, two, three or four at an edge, bending_model: midedge: "
-    "compression at which the lowest eigenvalue changes its sign, against that of each wall as a plate which "
-    "the others support",
+    "compression at which the lowest eigenvalue changes its sign, against the buckling load of one wall as a "
+    "plate that is supported by the others",
     source="S. P. Timoshenko, J. M. Gere, Theory of Elastic Stability, 2nd ed. 1961, §§ 9.2, 9.3",
     resolutions=(4, 8, 16),
     claim=Converges(2.0, 5e-3),

@@ -1,4 +1,4 @@
-"""Shells that bend far, and curved ones, by one unknown on every edge: published benchmarks."""
+"""Published benchmarks of shells with large rotations and of curved shells, with directors on edges."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from lyra_petsc.experiments.verification.verification_case import (
     Measured,
     at_finest,
     case,
-    data,
     grid,
-    missed,
+    load_data,
     scene,
+    vector_error,
     worst,
 )
 
-TABLES = data("shells")
+TABLES = load_data("shells")
 LINEAR = TABLES["linear"]
 
 # -- large rotations -----------------------------------------------------------------------------------
 
 INCREMENT = 0.05
-"""Of the load factor; the tables have its multiples."""
+"""Increment of the load factor; the tables have multiples of it."""
 
 LENGTHS = {"shear": 10.0, "moment": 12.0}
 STRIP = {"young": 1.2e6, "poisson": 0.0, "thickness": 0.1, "density": 1.0}
 STIFFNESS = 1.2e6 * 0.1**3 / 12.0
-"""B [N·m]"""
+"""Bending stiffness B [N·m]"""
 
 
 def increments(bench: Bench, content: dict[str, Any], fraction: float) -> Iterator[tuple[float, Trial]]:
-    """Every load factor of a static scene, with these increments, and the equilibrium there; collective."""
+    """Step a static scene by equal load increments; yields load factors and equilibria; collective."""
     solver = {"solver": {"force_tolerance": 1e-6}, "petsc": {"ts_adapt_dt_max": fraction, "ksp_rtol": 1e-6}}
     time = STATIC | {"step": fraction}
     with bench.simulation(content | solver | {"gravity": [0, 0, 0], "time": time}) as trial:
@@ -59,7 +59,7 @@ def sze_strip(kind: str, n: float, loads: list[dict[str, Any]]) -> dict[str, Any
 def _tips(
     bench: Bench, n: float, kind: str, loads: list[dict[str, Any]], rows: Sequence[Sequence[float]]
 ) -> tuple[list[Measured], Array]:
-    """The load of a table at which the tip's way errs most, and the tip (−U, W) at full load."""
+    """Largest error of the tip over the loads of a table, and the displacement (−U, W) at full load."""
     length, tip, found = LENGTHS[kind], np.zeros(2), []
     table = {round(row[0], 6): np.array(row[1:]) for row in rows}
     for factor, trial in increments(bench, sze_strip(kind, n, loads), INCREMENT):
@@ -67,17 +67,17 @@ def _tips(
         tip = np.array([length - end[0], end[2]])
         exact = table.get(round(factor, 6))
         if exact is not None:
-            found.append([missed("way of the tip, worst load of the table", tip, exact)])
+            found.append([vector_error("displacement of the tip, worst load of the table", tip, exact)])
     return worst(found), tip
 
 
 @case(
-    "Cantilever under a shear force at its end, bending_model: midedge: way of the tip at 20 loads against "
-    "the table, and at full load against the elastica with the strip's stretch",
+    "Cantilever under a shear force at its end, bending_model: midedge: displacement of the tip at 20 loads "
+    "against the table, and at full load against the elastica with the strip's stretch",
     source=f"{TABLES['cantilever_end_shear']['source']}; elastica by collocation",
     resolutions=(10, 20, 40, 80),
     claim=at_finest(2e-3),
-    claims={"way of the tip at full load": Converges(2.0, 1e-3, slack=0.5)},
+    claims={"displacement of the tip at full load": Converges(2.0, 1e-3, slack=0.5)},
     counts="cells along the strip",
 )
 def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
@@ -85,13 +85,13 @@ def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
     found, tip = _tips(bench, n, "shear", loads, TABLES["cantilever_end_shear"]["rows"])
     length, membrane = LENGTHS["shear"], 1.2e6 * 0.1
     exact = cantilever(0.0, 4.0 * length**2 / STIFFNESS, STIFFNESS / (membrane * length**2))
-    way = np.array([1.0 - exact.reach, exact.drop]) * length
-    return [*found, missed("way of the tip at full load", tip, way, "m")]
+    u = np.array([1.0 - exact.reach, exact.drop]) * length
+    return [*found, vector_error("displacement of the tip at full load", tip, u, "m")]
 
 
 @case(
-    "Cantilever that a moment at its end rolls up into a full circle, bending_model: midedge: way of the tip "
-    "at 20 loads against the table, and at full load against the circle",
+    "Cantilever that a moment at its end rolls up into a full circle, bending_model: midedge: displacement "
+    "of the tip at 20 loads against the table, and at full load against the circle",
     source=f"{TABLES['cantilever_end_moment']['source']}; closed form",
     resolutions=(12, 24, 48, 96),
     claim=at_finest(1e-2),
@@ -106,11 +106,11 @@ def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
 
 
 PRESSURES = (6.0, 30.0)
-"""q L³/B; under the second it is bent by more than half a circle."""
+"""Pressures q L³/B; the second one bends the strip by more than half a circle."""
 
 
 @case(
-    "Cantilever under a pressure that follows it, bending_model: midedge: way of the tip against the rod",
+    "Cantilever under a follower pressure, bending_model: midedge: displacement of the tip against the rod",
     source="equations of an inextensible rod, integrated from the tip",
     resolutions=(20, 40, 80),
     claim=Converges(2.0, 3e-3, slack=0.3),
@@ -126,13 +126,15 @@ def pressed_strip(bench: Bench, n: float) -> Sequence[Measured]:
         if load is not None:
             end = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
             x, z = pressed_tip(load)
-            way = np.array([1.0 - end[0], end[2]])
-            found.append(missed(f"way of the tip, q L³/B = {load:g}", way, np.array([1.0 - x, z]), "m"))
+            u = np.array([1.0 - end[0], end[2]])
+            found.append(
+                vector_error(f"displacement of the tip, q L³/B = {load:g}", u, np.array([1.0 - x, z]), "m")
+            )
     return found
 
 
 def _line_load(ends: Sequence[int], force: Array) -> list[dict[str, Any]]:
-    """The loads of a force [N] that is spread evenly over a line of vertices."""
+    """Loads that spread a force [N] uniformly over a line of vertices."""
     part = force / (len(ends) - 1)
     return [
         {"nodes": list(ends[1:-1]), "force": (part * (len(ends) - 2)).tolist()},
@@ -141,7 +143,7 @@ def _line_load(ends: Sequence[int], force: Array) -> list[dict[str, Any]]:
 
 
 def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int, int]]:
-    """The plate with n cells across, and the vertices A, B of its loaded edge; collective."""
+    """The plate with n cells across, and the end vertices A and B of its loaded edge; collective."""
     around = round(20 * n / 3)
     flat, faces = rectangle(around, n, 2.0 * math.pi, 1.0)
     radius = 6.0 + 4.0 * flat[:, 1]
@@ -158,12 +160,13 @@ DISC = {"young": 1e7, "poisson": 0.3, "thickness": 0.01, "density": 1.0}
 """Material of round plates of the radius 1 m."""
 
 DEFLECTIONS = {3.0: 0.45884, 15.0: 1.30207}
-"""Over the thickness h, by q a⁴/(E h⁴) of a load q [Pa] on the radius a, for ν = 0.3."""
+"""Deflections over the thickness h, by q a⁴/(E h⁴) of a load q [Pa] on the radius a, for ν = 0.3."""
 
 
 def _disc(bench: Bench, n: float, load: float, step: float, **held: Any) -> float:
-    """Deflection [m] in the middle of a disc of n edges along its radius, whose rim is held, under load times
-    E h⁴; gmsh's mesh.
+    """Deflection [m] at the centre of a disc with n edges along its radius, under ``load`` × E h⁴ [Pa].
+
+    ``held`` are further keys of the handle at its rim; gmsh makes the mesh.
     """
     around = [(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)]
     lines = [f"Point({k}) = {{{x}, {y}, 0, {1.0 / n!r}}};" for k, (x, y) in enumerate(around, 1)]
@@ -183,7 +186,7 @@ def _disc(bench: Bench, n: float, load: float, step: float, **held: Any) -> floa
 
 
 @case(
-    "Round plate with a clamped rim that bends by more than its thickness under an even load, "
+    "Round plate with a clamped rim under a uniform load, whose deflection exceeds its thickness, "
     "bending_model: midedge: deflection in the middle",
     source="von Kármán's equations of round plates, by collocation",
     resolutions=(8, 16, 32),
@@ -198,9 +201,9 @@ def clamped_disc(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 @case(
-    "Round plate on a supported rim under a small even load, bending_model: midedge: deflection in the "
-    "middle. The rim is a polygon; plates with slopes that are continuous tend to another answer, 26 % less, "
-    "as its corners become flat (I. Babuška)",
+    "Round plate on a supported rim under a small uniform load, bending_model: midedge: deflection in the "
+    "middle. The rim is a polygon: elements with continuous slopes would converge to a deflection that is "
+    "26 % smaller (paradox of I. Babuška)",
     source="Kirchhoff's plate, closed form: w = (5 + ν)/(1 + ν) q a⁴/(64 D)",
     resolutions=(8, 16, 32),
     claim=Converges(2.0, 1e-3, slack=0.3),
@@ -250,11 +253,11 @@ def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
 PATTERNS = ("diagonal", "alternating")
 FAR = 1e4
 BESIDE = 1e-6
-"""Of a coordinate at which vertices count as on a plane, over the shell's radius."""
+"""Tolerance of a coordinate over the size of the shell within which vertices count as on a plane."""
 
 
 def plane_box(axis: str, at: float, size: float) -> list[list[float]]:
-    """Opposite corners of a box about the vertices on a plane."""
+    """Opposite corners of a box that contains the vertices on a coordinate plane."""
     return [
         [at - BESIDE * size if each == axis else -FAR for each in "xyz"],
         [at + BESIDE * size if each == axis else FAR for each in "xyz"],
@@ -262,7 +265,7 @@ def plane_box(axis: str, at: float, size: float) -> list[list[float]]:
 
 
 def symmetric(axes: str, size: float) -> list[dict[str, Any]]:
-    """Handles that hold the vertices on planes of symmetry through the origin, normal to these axes."""
+    """Symmetry handles of the vertices on planes through the origin, normal to these axes."""
     return [{"box": plane_box(axis, 0.0, size), "symmetry": axis} for axis in axes]
 
 
@@ -274,7 +277,7 @@ def _curved(
     material: dict[str, Any],
     **more: Any,
 ) -> tuple[Array, Array]:
-    """Places (V, 3) [m] of n × n cells on a surface, and how far they move; collective."""
+    """Positions (V, 3) [m] of n × n cells on a surface, and their displacements [m]; collective."""
     flat, faces = rectangle(n, n, 1.0, 1.0, alternating=pattern == "alternating")
     vertices = np.column_stack(surface(flat[:, 0], flat[:, 1]))
     tight = {"solver": {"force_tolerance": 1e-8}, "petsc": {"ksp_rtol": 1e-8}}
@@ -285,7 +288,7 @@ def _curved(
 
 
 def cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Array], Any]:
-    """Part of a cylinder as a function of s and t in [0, 1], from the crown on, with its axis along y."""
+    """Part of a cylinder with axis y, as a function of s and t in [0, 1]; s = 0 is the crown."""
 
     def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
         return radius * np.sin(angle * s), length * t, radius * np.cos(angle * s)
@@ -302,20 +305,20 @@ def cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Arr
     claims={f"deflection, {pattern}, deep shell": Converges(1.7, 5e-3, slack=0.4) for pattern in PATTERNS},
 )
 def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
-    part, half = 1e-3, 25.0  # of the load, so small that the roof is linear to 1e-5
+    part, half = 1e-3, 25.0  # part of the load, so small that the response is linear to 1e-5
     for pattern in PATTERNS:
         material = {"young": 4.32e8, "poisson": 0.0, "thickness": 0.25, "density": 1.0}
         gravity = [0.0, 0.0, -90.0 * part]
         held = [*symmetric("xy", 25.0), {"box": plane_box("y", half, 25.0), "axes": ["x", "z"]}]
         surface = cylinder(25.0, math.radians(40.0), half)
-        _, way = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
-        found = float(-way[round(n), 2]) / part
+        _, u = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
+        found = float(-u[round(n), 2]) / part
         yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
         yield Measured(f"deflection, {pattern}, deep shell", found, LINEAR["deep_roof"], "m")
 
 
 ORDER = 1.5
-"""Of the deflection under a point load, where curvatures are unbounded."""
+"""Order of the deflection under a point load, where curvatures are unbounded."""
 
 
 @case(
@@ -345,13 +348,13 @@ def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
 
 @case(
     "Hemisphere with a hole of 18°, pulled and pressed at its equator, a quarter of it, bending_model: "
-    "midedge: mean way of the loads",
+    "midedge: mean displacement of the loads",
     source=LINEAR["source"],
     resolutions=(8, 16, 32, 64),
     claim=at_finest(1e-2),
 )
 def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
-    part, cells = 0.02, round(n)  # out and in, what is quadratic in the load cancels
+    part, cells = 0.02, round(n)  # part of the load; quadratic terms cancel in the mean of both loads
     for pattern in PATTERNS:
         material = {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0}
         loads = [{"nodes": [0], "force": [part, 0.0, 0.0]}, {"nodes": [cells], "force": [0.0, -part, 0.0]}]
@@ -365,9 +368,9 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
                 10.0 * np.sin(up),
             )
 
-        _, way = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
-        mean = 0.5 * float(way[0, 0] - way[cells, 1]) / part
-        yield Measured(f"way of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
+        _, u = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
+        mean = 0.5 * float(u[0, 0] - u[cells, 1]) / part
+        yield Measured(f"displacement of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
 
 
 @case(
@@ -378,7 +381,7 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
     claim=at_finest(1e-2),
 )
 def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
-    part, cells = 1e-2, round(n)  # of the load, which alone would bend it far
+    part, cells = 1e-2, round(n)  # part of the load, for a linear response
     for pattern in PATTERNS:
         material = {"young": 2e11, "poisson": 0.3, "thickness": 1e-3, "density": 1.0}
         gravity = [0.0, 0.0, -8.0 * part]
@@ -388,8 +391,8 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
             x, y = s - 0.5, 0.5 * t
             return x, y, x**2 - y**2
 
-        _, way = _curved(bench, cells, pattern, surface, material, gravity=gravity, handles=held)
-        deflection = float(-way[cells, 2]) / part
+        _, u = _curved(bench, cells, pattern, surface, material, gravity=gravity, handles=held)
+        deflection = float(-u[cells, 2]) / part
         yield Measured(
             f"deflection, {pattern}", deflection, TABLES["hyperbolic_paraboloid"]["deflection"], "m"
         )
@@ -397,7 +400,7 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
 
 @case(
     "Beam twisted by a right angle, very thin, with a force at its end in its plane there or across it, "
-    "bending_model: midedge: way of the force",
+    "bending_model: midedge: displacement of the force",
     source=TABLES["twisted_beam"]["source"],
     resolutions=(48, 96, 192),
     claim=at_finest(5e-3),
@@ -423,9 +426,9 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
                 solver={"force_tolerance": 1e-6},
             )
             with bench.simulation(content) as trial:
-                way = float((trial.run().x - vertices)[end[len(end) // 2], axis])
+                u = float((trial.run().x - vertices)[end[len(end) // 2], axis])
             yield Measured(
-                f"way {name.replace('_', ' ')}, {pattern}", way, TABLES["twisted_beam"][name], "in"
+                f"displacement {name.replace('_', ' ')}, {pattern}", u, TABLES["twisted_beam"][name], "in"
             )
 
 
@@ -433,7 +436,7 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, Any], Array, int]:
-    """The eighth with n cells around, its vertices (V, 3), and one in the middle of its side; collective."""
+    """An eighth of the cylinder, n cells around; vertices (V, 3), the middle one of its side; collective."""
     radius, half = 4.953, 5.175
     cells = n, round(n * half / (0.5 * math.pi * radius))
     flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
@@ -448,8 +451,8 @@ def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, A
 
 
 @case(
-    "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: ways of the load (A) "
-    "and of the middle (B) and the end (C) of its side at 20 loads against the table",
+    "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: displacements of the "
+    "load (A) and of the middle (B) and the end (C) of its side at 20 loads against the table",
     source=TABLES["open_cylinder"]["source"],
     resolutions=(16, 32, 64),
     claim=at_finest(1e-2),
@@ -461,25 +464,27 @@ def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
         content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
         found = []
         for factor, trial in increments(bench, content, INCREMENT):
-            way = trial.x - vertices
-            ways = way[0, 2], -way[around, 0], -way[-1, 0]
+            u = trial.x - vertices
+            components = u[0, 2], -u[around, 0], -u[-1, 0]
             found.append(
                 [
-                    Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
-                    for point, value, of in zip("ABC", ways, table[round(factor, 6)], strict=True)
+                    Measured(
+                        f"displacement of {point}, worst load of the table, {pattern}", float(value), of, "in"
+                    )
+                    for point, value, of in zip("ABC", components, table[round(factor, 6)], strict=True)
                 ]
             )
         yield from worst(found)
 
 
 DEFLECTION = 30.0
-"""Of the roof's middle at the end [mm]."""
+"""Final deflection at the centre of the roof [mm]."""
 
 
 @case(
     "Shallow cylindrical roof, hinged at its straight edges, whose middle is pushed through, a quarter, "
-    "bending_model: midedge: how far the table is from the curve of load over deflection, of its extent in "
-    "both, and the largest and the least load",
+    "bending_model: midedge: distance of the table from the computed curve of load over deflection, "
+    "relative to its extent, and the largest and the smallest load",
     source=TABLES["hinged_roof"]["source"],
     resolutions=(8, 16, 32),
     claim=at_finest(1e-2),
@@ -504,19 +509,19 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
         curve = [(0.0, 0.0)]
         for factor, trial in increments(bench, content, INCREMENT / 3.0):
             push = trial.simulation.ledger.handle_forces(4)[3][2]
-            curve.append((factor * DEFLECTION, -4.0 * push / 3000.0))  # of the largest load [N]
+            curve.append((factor * DEFLECTION, -4.0 * push / 3000.0))  # over the largest load [N]
         extent = deflections.max(), loads.max()
-        apart = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
+        distance = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
         found = np.interp(deflections, *np.array(curve).T)
-        up, down = loads[:16], slice(16, 25)  # until it snaps, and beyond
-        yield Measured(f"table beside the curve, {pattern}", 1.0 + float(apart.max()), 1.0)
+        up, down = loads[:16], slice(16, 25)  # before and after snap-through
+        yield Measured(f"distance of the table from the curve, {pattern}", 1.0 + float(distance.max()), 1.0)
         yield Measured(f"largest load, {pattern}", float(found[: len(up)].max()), float(up.max()))
-        yield Measured(f"least load, {pattern}", float(found[down].min()), float(loads[down].min()))
+        yield Measured(f"smallest load, {pattern}", float(found[down].min()), float(loads[down].min()))
 
 
 def _distance(points: Array, line: Array) -> Array:
-    """Of points (n, 2) from a line through others (m, 2)."""
-    start, way = line[:-1], np.diff(line, axis=0)
-    along = np.sum((points[:, None] - start) * way, axis=2) / np.sum(way**2, axis=1)
-    foot = start + np.clip(along, 0.0, 1.0)[:, :, None] * way
+    """Distances (n,) of points (n, 2) from a polyline (m, 2)."""
+    start, side = line[:-1], np.diff(line, axis=0)
+    along = np.sum((points[:, None] - start) * side, axis=2) / np.sum(side**2, axis=1)
+    foot = start + np.clip(along, 0.0, 1.0)[:, :, None] * side
     return np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1)
