@@ -25,8 +25,8 @@ def vertex_scales(system: StageEquations, size: float) -> Array:
 def expected_iterations(system: StageEquations, dt: float) -> float:
     """Iterations of conjugate gradients with block Jacobi in a step of length dt [s]; collective.
 
-    Half the root of the largest ratio of stiffness to inertia: what is left of the spectrum after scaling
-    by the diagonal reaches from the one to the other.
+    It is half the root of the largest ratio of stiffness to inertia: after scaling with the diagonal the
+    spectrum reaches from the inertia to the stiffness.
     """
     n = system.points.n_vertices
     ratio = dt * dt * vertex_scales(system, 1.0)[:n] / system.mass[:n]

@@ -1,4 +1,4 @@
-"""What ``-contact_monitor`` prints: contact and friction at each Newton iterate."""
+"""The monitor ``-contact_monitor``: contact and friction at each Newton iterate."""
 
 from __future__ import annotations
 
@@ -16,44 +16,45 @@ from lyra_petsc.terms.friction import CoulombFriction
 class ContactMonitor:
     """Prints a line for each iterate of one SNES, below those of ``-snes_monitor``.
 
-    Contacts, the smallest gap [m], the stiffness [N/m] of the stiffest contact, and the fraction of the last
-    Newton step that collision detection allowed. With friction: how many pairs stick and slide, and the sum
-    of the normal forces [N] that friction takes, those at the start of the step, and of those at the iterate.
+    It has the number of contacts, the smallest gap [m], the stiffness [N/m] of the stiffest contact, and the
+    fraction of the last Newton step that collision detection allowed. With friction also the numbers of
+    sticking and sliding pairs, and the sums of the normal forces [N] that friction takes (those at the start
+    of the step) and of those at the iterate.
 
     Parameters
     ----------
     equations : StageEquations
-        With contact.
-    allowed : callable
-        The fraction.
+        Those of a scene with contact.
+    step_fraction : callable
+        Returns the fraction of the last Newton step that was allowed.
     """
 
-    def __init__(self, equations: StageEquations, allowed: Callable[[], float]) -> None:
-        self._equations, self._allowed = equations, allowed
+    def __init__(self, equations: StageEquations, step_fraction: Callable[[], float]) -> None:
+        self._equations, self._step_fraction = equations, step_fraction
         near = equations.active.changing
         self._contact = next(term for term in near if isinstance(term, ContactBarrier))
         self._friction = next((term for term in near if isinstance(term, CoulombFriction)), None)
 
     def __call__(self, snes: PETSc.SNES, number: int, norm: float) -> None:
         """For ``SNES.setMonitor``; collective."""
-        of, contact = self._equations, self._contact
+        equations, contact = self._equations, self._contact
         v = snes.getSolution().getArray(readonly=True).reshape(-1, 3)
-        x, _ = of.evaluate_at(v)
-        frozen = of.active.frozen[contact]
+        x, _ = equations.evaluate_at(v)
+        frozen = equations.active.frozen[contact]
         here, stiffest = contact.history(x, frozen), contact.largest_stiffness(x, frozen)
         sums = [here["contacts"]]
         if self._friction is not None:
-            sums += self._friction.count_sticking(x, of.active.frozen[self._friction])
+            sums += self._friction.count_sticking(x, equations.active.frozen[self._friction])
             sums.append(float(contact.find_contacts(x, frozen.stage, contact.n_owned)[2].sum()))
-        sums = of.points.global_sum(*sums).tolist()
+        sums = equations.points.global_sum(*sums).tolist()
         extremes = np.array([stiffest, -here["smallest_gap"]])
-        of.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)
+        equations.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)
         line = f"{number:3d} CONTACT {sums[0]:.0f} contacts, "
         if sums[0] > 0.0:
             line += f"smallest gap {-extremes[1]:.6e} m, stiffest {extremes[0]:.6e} N/m, "
-        line += f"step limit {self._allowed():.4g}"
+        line += f"step limit {self._step_fraction():.4g}"
         if self._friction is not None:
             stick, slide, taken, now = sums[1:]
             line += f"; friction: {stick:.0f} stick, {slide:.0f} slide, "
             line += f"normal forces {taken:.6e} N, now {now:.6e} N"
-        PETSc.Sys.Print(" " * snes.getTabLevel() + line, comm=of.points.comm)
+        PETSc.Sys.Print(" " * snes.getTabLevel() + line, comm=equations.points.comm)

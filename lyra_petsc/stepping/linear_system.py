@@ -227,7 +227,7 @@ class LinearSystem:
             self._interpolations = found
         below = None
         if self._equations.active.coarse and not discretisation.stencils_change:
-            from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
+            from lyra_petsc.stepping.vertex_equations import VertexEquations  # needed with edge unknowns only
 
             below = VertexEquations(self._equations)
         return Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
