@@ -18,17 +18,18 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 def prints(name: str, text: Callable[[click.Context], str], description: str) -> Decorator:
     """An option that prints a text on rank 0 and exits."""
 
-    def callback(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    def show(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value and not ctx.resilient_parsing:
             if ctx.obj.rank == 0:
                 click.echo(text(ctx))
             ctx.exit()
 
-    flags: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False}
-    return click.option(name, callback=callback, help=description, **flags)
+    return click.option(
+        name, is_flag=True, is_eager=True, expose_value=False, callback=show, help=description
+    )
 
 
-with_help = prints("--help", click.Context.get_help, "Show this and exit.")
+add_help = prints("--help", click.Context.get_help, "Show this and exit.")
 
 
 SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
@@ -45,7 +46,7 @@ def verb(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
 
     def declare(function: Callable[..., Any]) -> click.Command:
         command = click.command(context_settings=SETTINGS, epilog=example(*examples))
-        return command(with_help(click.pass_obj(function)))
+        return command(add_help(click.pass_obj(function)))
 
     return declare
 

@@ -13,17 +13,7 @@ import click
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import (
-    SETTINGS,
-    example,
-    out,
-    prints,
-    scene,
-    settings,
-    trust_mesh,
-    verb,
-    with_help,
-)
+from lyra_petsc.cli.options import SETTINGS, add_help, example, out, prints, scene, settings, trust_mesh, verb
 from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, server_options, view
 from lyra_petsc.errors import InputError, nearest
@@ -54,7 +44,7 @@ class _Verbs(click.Group):
     invoke_without_command=True,
     epilog=example("lyra-petsc new kite", "mpirun -n 2 lyra-petsc run kite.yaml"),
 )
-@with_help
+@add_help
 @prints("--version", lambda _: f"lyra-petsc {__version__}", "Show the version and exit.")
 @click.pass_context
 def verbs(ctx: click.Context) -> None:

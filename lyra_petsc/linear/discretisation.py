@@ -235,32 +235,27 @@ class Discretisation:
         self._global_elements |= {term: each for term, each in found.items() if each is not None}
         return part
 
-    def _find_elements(self, term: Elastic, x: Array, displacement: Array) -> tuple[Ints, Ints] | None:
+    def _find_elements(self, term: Elastic, x: Array, u: Array) -> tuple[Ints, Ints] | None:
         """Stencils (E, n) in global numbers, and attributes (E, m), of a term's elements near owned vertices.
 
-        Vertices move by ``displacement`` (n_local, 3); None if that yields too many elements; collective.
+        Vertices move by displacements u (n_local, 3) [m]; None if that yields too many elements; collective.
         """
         layout, n = self.layout, self.layout.n_vertices
         own = layout.start + np.arange(n)
         if layout.comm.size == 1 and term.surface is not None:
             if term not in self._triangles:
                 self._triangles[term] = _with_marks(term.surface.astype(np.int64), term)
-            return term.neighbours(x[:n], displacement[:n], own, self._triangles[term])
+            return term.neighbours(x[:n], u[:n], own, self._triangles[term])
         distance, triangles = term.search_distance, np.empty((0, 3), dtype=np.int64)
         if term.surface is None:
-            theirs, moves = self._gather_near(own, np.arange(n)[:, None], x, displacement, distance, own >= 0)
-            numbers, points, displacements, moves = (
-                np.concatenate([own, theirs]),
-                x[:n],
-                displacement[:n],
-                moves[:, 0],
-            )
+            theirs, moves = self._gather_near(own, np.arange(n)[:, None], x, u, distance, own >= 0)
+            numbers, points, point_u, moves = np.concatenate([own, theirs]), x[:n], u[:n], moves[:, 0]
         else:
             surface, place = term.surface.astype(np.int64), np.arange(layout.n_local)
             corners = _with_marks(layout.global_number[surface], term)
             mine = surface[:, 0] < layout.n_owned  # each triangle is sent once
             # an element of a triangle with ghost corners also acts on the triangle's owned corners
-            corners, moves = self._gather_near(corners, surface, x, displacement, distance, mine)
+            corners, moves = self._gather_near(corners, surface, x, u, distance, mine)
             # triangles with owned corners are local already
             new = ((corners[:, :3] < layout.start) | (corners[:, :3] >= layout.start + n)).all(axis=1)
             corners, moves = corners[new], moves[new].reshape(-1, 2, 3)
@@ -270,18 +265,15 @@ class Discretisation:
             others, first = np.unique(corners[:, :3], return_index=True)
             more = ~np.isin(others, numbers[n:])
             numbers = np.concatenate([numbers, others[more]])
-            points, displacements = (np.concatenate([each[:n], each[ghosts]]) for each in (x, displacement))
+            points, point_u = (np.concatenate([each[:n], each[ghosts]]) for each in (x, u))
             moves = moves[first[more]]
             order = n + np.argsort(numbers[n:])
             at = np.minimum(np.searchsorted(numbers[order], corners[:, :3]), max(len(order) - 1, 0))
             triangles = np.concatenate(
                 [_with_marks(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
             )
-        points, displacements = (
-            np.concatenate([points, moves[:, 0]]),
-            np.concatenate([displacements, moves[:, 1]]),
-        )
-        found = term.neighbours(points, displacements, numbers, triangles)
+        points, point_u = np.concatenate([points, moves[:, 0]]), np.concatenate([point_u, moves[:, 1]])
+        found = term.neighbours(points, point_u, numbers, triangles)
         if found is None:
             return None
         stencil, attributes = found
@@ -289,13 +281,7 @@ class Discretisation:
         return numbers[stencil[touching]], attributes[touching]
 
     def _gather_near(
-        self,
-        numbers: Ints,
-        rows: Ints,
-        x: Array,
-        displacement: Array,
-        distance: float,
-        mine: NDArray[np.bool_],
+        self, numbers: Ints, rows: Ints, x: Array, u: Array, distance: float, mine: NDArray[np.bool_]
     ) -> tuple[Ints, Array]:
         """Vertices or triangles of other ranks near the bounding box of those of this rank; collective.
 
@@ -303,7 +289,7 @@ class Discretisation:
         ----------
         numbers, rows : (n, …), (n, m)
             Global numbers of the vertices or triangles with their marks, and local rows of their points.
-        x, displacement : (n_local, 3)
+        x, u : (n_local, 3)
             Positions and displacements [m].
         distance : float [m]
         mine : (n,)
@@ -317,7 +303,7 @@ class Discretisation:
         comm = self.layout.comm
         received = [(numbers[:0], np.empty((0, rows.shape[1], 2, 3)))]
         if comm.size > 1:
-            low, high = swept_boxes(x, displacement, rows)
+            low, high = swept_boxes(x, u, rows)
             box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
             boxes = np.empty((comm.size, 2, 3))
             comm.Allgather(box, boxes)
@@ -328,7 +314,7 @@ class Discretisation:
                     continue
                 near = mine & ((low <= upper + distance) & (high >= lower - distance)).all(axis=1)
                 some = rows[near]
-                moves = np.stack([x[some], displacement[some]], axis=2)
+                moves = np.stack([x[some], u[some]], axis=2)
                 sent.append((numbers[near], moves) if len(some) else None)
             received += [part for part in comm.alltoall(sent) if part is not None]
         return np.concatenate([part[0] for part in received]), np.concatenate([part[1] for part in received])

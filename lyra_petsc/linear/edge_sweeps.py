@@ -226,11 +226,8 @@ class SweepsWithEdges:
         self._groups = couplings.groups
         self._numbers, self._first = couplings.numbers, 3 * couplings.n_vertices
         n, n_local = couplings.n_vertices, pattern.n_local
-        with_ghosts = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        self._with_ghosts, self._edges_with_ghosts = (
-            with_ghosts[with_ghosts < n],
-            with_ghosts[with_ghosts >= n],
-        )
+        rows = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._with_ghosts, self._edges_with_ghosts = rows[rows < n], rows[rows >= n]
         self._weight = self._translation_weights(pattern, n)
         of_rows, of_vectors = memory_sizes(pattern)
         memory = np.empty(of_rows + of_vectors) if memory is None else memory

@@ -1,4 +1,4 @@
-"""Ranks that wait for processors are told of, with a number of ranks that there are processors for."""
+"""Notes on ranks that wait for processors, and on the number of ranks for which there are enough."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def test_a_note_comes_once_and_not_for_one_rank(monkeypatch: pytest.MonkeyPatch)
         with counted.step():
             time.sleep(0.01)  # as a rank that has no processor
         notes.append(counted.check(last=step == 19))
-    told = [step for step, note in enumerate(notes) if note]
-    assert told == ([] if comm.size == 1 else [7])
+    noted = [step for step, note in enumerate(notes) if note]
+    assert noted == ([] if comm.size == 1 else [7])
     assert comm.allgather(counted.note) == [counted.note] * comm.size
 
 

@@ -31,8 +31,8 @@ class Interpolation:
         row = np.repeat(fine.start + np.arange(fine.n_owned), np.diff(rows.start))
         self._entries, self._first = (row, rows.parents, rows.weights), fine.start
         sizes = (3 * fine.n_owned, 3 * fine.n_global), (3 * points.n_owned, 3 * points.n_global)
-        most = int(np.diff(rows.start).max(initial=0))
-        self.mat = PETSc.Mat().createAIJ(sizes, nnz=(most, most), comm=fine.comm)
+        width = int(np.diff(rows.start).max(initial=0))
+        self.mat = PETSc.Mat().createAIJ(sizes, nnz=(width, width), comm=fine.comm)
 
     def set(self, free: np.ndarray) -> None:
         """Interpolate to coordinates only that are free (n_owned, 3); collective."""

@@ -165,8 +165,8 @@ def test_the_stiffer_bending_the_more_sweeps(
     content["material"] |= {"bending_model": "midedge", "bending_scale": bending}
     iterated(comm, content, 1, "python", ksp_view="")
     if comm.rank == 0:
-        said = capfd.readouterr().out
-        assert [number for number in (2, 3) if f"  {number} of each" in said] == [sweeps] * (sweeps > 1)
+        output = capfd.readouterr().out
+        assert [number for number in (2, 3) if f"  {number} of each" in output] == [sweeps] * (sweeps > 1)
 
 
 def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:

@@ -77,8 +77,8 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
-        told = []
-        ours.observers.append(lambda rows: told.append(rows.copy()))
+        received = []
+        ours.observers.append(lambda rows: received.append(rows.copy()))
         x, y = ours.mat.createVecs()
         z, t = y.duplicate(), y.duplicate()
         x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
@@ -88,7 +88,7 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
                 matrix.rows[:] = symmetric(points, pattern, shift)
                 matrix.set(matrix.rows)
             assert ours.mat.stateGet() > state  # or preconditioners would not be set up again
-            np.testing.assert_array_equal(told[-1], symmetric(points, pattern, shift))
+            np.testing.assert_array_equal(received[-1], symmetric(points, pattern, shift))
             assembled.mat.mult(x, y)
             ours.mat.mult(x, z)
             ours.mat.multTranspose(x, t)
