@@ -285,7 +285,7 @@ def test_each_simulation_has_its_own_rows() -> None:
         original, rows = rng.permutation(12), rng.permutation(12)[:3]
         x = rng.normal(size=(12, 3))
         problem = SimpleNamespace(
-            points=SimpleNamespace(original=original), probes={"tip": rows}, system=SimpleNamespace(x=x)
+            points=SimpleNamespace(mesh_vertices=original), probes={"tip": rows}, system=SimpleNamespace(x=x)
         )
         values = tip.values(tip.sums(problem, None))
         np.testing.assert_allclose(values, [x[rows, 2].mean(), x[original == 7, 0][0]])
