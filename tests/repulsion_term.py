@@ -21,7 +21,7 @@ DISTANCE, STIFFNESS = 0.08, 4.0e3
 
 
 class Repulsion(Elastic):
-    """Springs between vertices nearer than `DISTANCE`, and a count of the steps that each has felt them."""
+    """Springs between vertices nearer than `DISTANCE`, and a count of the steps in which each is repelled."""
 
     skin = 0.02
     search_distance = DISTANCE + skin
@@ -32,11 +32,11 @@ class Repulsion(Elastic):
 
     def _pairs(self, x: Array) -> tuple[Array, Array, Array]:
         """Unit vectors (E, 3) from the second vertex to the first, distances (E,) and d − r, at least 0."""
-        way = x[self.stencil[:, 0]] - x[self.stencil[:, 1]]
-        distance = np.linalg.norm(way, axis=1)
-        return way / distance[:, None], distance, np.maximum(DISTANCE - distance, 0.0)
+        vector = x[self.stencil[:, 0]] - x[self.stencil[:, 1]]
+        distance = np.linalg.norm(vector, axis=1)
+        return vector / distance[:, None], distance, np.maximum(DISTANCE - distance, 0.0)
 
-    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         """Pairs of points, the one with the smaller number first."""
         near = ((x[:, None] - x[None]) ** 2).sum(axis=2) < self.search_distance**2
         one, other = np.nonzero(near & (numbers[:, None] < numbers[None]))
@@ -65,8 +65,8 @@ class Repulsion(Elastic):
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, 2.0 * STIFFNESS * DISTANCE * size)
 
-    def largest_step(self, x: Array, way: Array, frozen: None) -> float:
-        longest = float(np.linalg.norm(way, axis=1).max(initial=0.0))
+    def largest_step(self, x: Array, dx: Array, frozen: None) -> float:
+        longest = float(np.linalg.norm(dx, axis=1).max(initial=0.0))
         return 0.5 * DISTANCE / max(longest, 0.5 * DISTANCE)
 
     def accept(self, x: Array, frozen: None) -> None:

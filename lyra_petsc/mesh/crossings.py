@@ -1,17 +1,17 @@
-"""Pairs of triangles that cross: which do is decided exactly, independently of how contact is solved.
+"""Pairs of triangles that cross, decided exactly and independently of the contact solver.
 
-Two triangles cross where their relative interiors intersect and they are not in one plane. So what touches
-does not cross: a vertex or an edge that lies on the other triangle, triangles that overlap in one plane (a
-sheet that is folded flat onto itself), triangles without area, which have no interior. Triangles with a
-common edge meet there alone, or lie in one plane; those with a common vertex may cross elsewhere.
+Two triangles cross if their relative interiors intersect and they are not coplanar. So triangles that touch
+do not cross: if a vertex or an edge lies on the other triangle, if they overlap in one plane (a sheet folded
+flat onto itself), or if one has no area and hence no interior. Triangles with a common edge intersect only
+there or are coplanar; those with a common vertex may cross elsewhere.
 
-Candidates come from a tree of boxes of its own, so that what the solver's search misses is not missed here,
-too. The decision comes from signs of determinants alone (Guigue & Devillers, Fast and Robust
-Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics Tools 8 (2003) 25-42, with
-open instead of closed triangles). These are exact for floating-point coordinates: the determinant in floating
-point with a bound of its error, and where that does not decide, as an expansion, an unevaluated sum of
-numbers without overlap (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
-Predicates, Discrete & Computational Geometry 18 (1997) 305-363).
+Candidates come from a tree of boxes of its own, so that an error in the solver's search is found. The
+decision uses only signs of determinants (Guigue & Devillers, Fast and Robust Triangle-Triangle Overlap Test
+Using Orientation Predicates, Journal of Graphics Tools 8 (2003) 25-42, with open instead of closed
+triangles). These are exact for floating-point coordinates: a determinant is computed in floating point with
+an error bound, and if that does not decide, as an expansion, an unevaluated sum of non-overlapping numbers
+(Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, Discrete &
+Computational Geometry 18 (1997) 305-363).
 """
 
 from __future__ import annotations
@@ -27,26 +27,28 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.kernels.cache import cached
 
 UNDECIDED = 2
-"""Where products of the coordinates overflow or underflow, so that expansions are not exact."""
+"""Result where products of coordinates overflow or underflow, so that expansions are not exact."""
 
 _HALF_ULP = 2.0**-53
 _RELATIVE = (7.0 + 56.0 * _HALF_ULP) * _HALF_ULP
-"""Bound of the determinant's error over the sum of its terms' magnitudes (Shewchuk 1997, figure 21)."""
+"""Bound of the determinant's error over the sum of the magnitudes of its terms (Shewchuk 1997, figure 21)."""
 
 _UNDERFLOW = 1e-290
-"""Far above what underflow adds to the error of a term whose other factor is at most 1."""
+"""Far above the error by underflow of a term whose other factor is at most 1."""
 
-_LEAST, _MOST = 2.0**-300, 2.0**300
-"""Between them, products of three numbers and the rounding errors of these are exact."""
+_SMALLEST, _LARGEST = 2.0**-300, 2.0**300
+"""Between these bounds products of three numbers and their rounding errors are exact."""
 
 _SPLITTER = 2.0**27 + 1.0
 _PARTS = 6 * 2**3 * 4
-"""Most numbers in the expansion: six products of three differences of two parts, each of four numbers."""
+"""Largest number of terms of the expansion: six products of three differences of two parts, each of four
+numbers."""
 
 
 @cached()
 def side(points: Any, a: int, b: int, c: int, d: int) -> int:
-    """Sign of (b − a) × (c − a) · (d − a): 1 where d is where the normal of the triangle a, b, c points.
+    """Sign of (b − a) × (c − a) · (d − a): 1 if d is on the side to which the normal of the triangle a, b, c
+    points.
 
     Parameters
     ----------
@@ -58,14 +60,14 @@ def side(points: Any, a: int, b: int, c: int, d: int) -> int:
     Returns
     -------
     int
-        1, −1, 0 for points in one plane, or `UNDECIDED`; `rational_side` decides then.
+        1, −1, 0 for coplanar points, or `UNDECIDED`, where `rational_side` must be used.
     """
     if a in (b, c, d) or b in (c, d) or c == d:
         return 0
     bx, by, bz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
     cx, cy, cz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
     dx, dy, dz = points[d, 0] - points[a, 0], points[d, 1] - points[a, 1], points[d, 2] - points[a, 2]
-    # a plane of constant x, y or z, which flat sheets are
+    # points in a plane of constant x, y or z, frequent in flat sheets
     if bx == cx == dx == 0.0 or by == cy == dy == 0.0 or bz == cz == dz == 0.0:
         return 0
     determinant = dx * (by * cz - bz * cy) + dy * (bz * cx - bx * cz) + dz * (bx * cy - by * cx)
@@ -88,10 +90,10 @@ def _exact_side(points: Any, a: int, b: int, c: int, d: int) -> int:
     parts = np.empty((3, 3, 2))
     for row, vertex in enumerate((b, c, d)):
         for axis in range(3):
-            high, low = _sum(points[vertex, axis], -points[a, axis])
+            high, low = _two_sum(points[vertex, axis], -points[a, axis])
             parts[row, axis, 0], parts[row, axis, 1] = high, low
             for part in (abs(high), abs(low)):
-                if part != 0.0 and not _LEAST < part < _MOST:
+                if part != 0.0 and not _SMALLEST < part < _LARGEST:
                     return UNDECIDED
     expansion, size = np.empty(_PARTS), 0
     for x in range(3):
@@ -103,15 +105,15 @@ def _exact_side(points: Any, a: int, b: int, c: int, d: int) -> int:
                 third = parts[2, z, choice >> 2]
                 if first == 0.0 or second == 0.0 or third == 0.0:
                     continue
-                for half in _product(first, second):
-                    for part in _product(half, third):
-                        size = _add(expansion, size, part if turn == 1 else -part)
+                for half in _two_product(first, second):
+                    for part in _two_product(half, third):
+                        size = _grow_expansion(expansion, size, part if turn == 1 else -part)
     # the parts ascend, and none overlaps the next: the last one is larger than the sum of the others
     return int(np.sign(expansion[size - 1])) if size else 0
 
 
 @cached()
-def _sum(a: float, b: float) -> tuple[float, float]:
+def _two_sum(a: float, b: float) -> tuple[float, float]:
     """a + b rounded, and the rounding error (Knuth's two-sum)."""
     total = a + b
     virtual = total - a
@@ -119,7 +121,7 @@ def _sum(a: float, b: float) -> tuple[float, float]:
 
 
 @cached()
-def _product(a: float, b: float) -> tuple[float, float]:
+def _two_product(a: float, b: float) -> tuple[float, float]:
     """a b rounded, and the rounding error (Dekker's product with Veltkamp's splitting)."""
     total = a * b
     scaled = _SPLITTER * a
@@ -131,11 +133,13 @@ def _product(a: float, b: float) -> tuple[float, float]:
 
 
 @cached()
-def _add(expansion: Any, size: int, number: float) -> int:
-    """Add a number to the expansion in the first ``size`` entries, in place; its new size without zeros."""
+def _grow_expansion(expansion: Any, size: int, number: float) -> int:
+    """Add a number to the expansion in the first ``size`` entries, in place; returns its new size without
+    zeros.
+    """
     kept = 0
     for i in range(size):
-        number, error = _sum(number, expansion[i])
+        number, error = _two_sum(number, expansion[i])
         if error != 0.0:
             expansion[kept] = error
             kept += 1
@@ -170,19 +174,19 @@ def self_crossings(points: Array, triangles: Ints) -> Ints:
     Returns
     -------
     (n, 2) int64
-        Triangles, the smaller first, in lexicographic order. `have_common_vertex` tells those pairs apart.
+        Triangles, the lower number first, in lexicographic order; also pairs for which `have_common_vertex`.
     """
     found = _search(points, triangles, triangles, *_tree(points, triangles), True)
-    return _certain(points, triangles, triangles, *found)
+    return _decide_exactly(points, triangles, triangles, *found)
 
 
 def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triangles: Ints) -> Ints:
-    """The pairs of triangles of two surfaces, as a sheet and an obstacle, that cross.
+    """The pairs of triangles of two surfaces that cross, such as a sheet and an obstacle.
 
     Parameters
     ----------
     points, others : (V, 3) and (W, 3) float64
-        Finite [m]. The surfaces have no vertex in common, also not where two lie at one place.
+        Finite [m]. Vertices of the two surfaces at the same position still count as different.
     triangles, other_triangles : (F, 3) and (G, 3) int64
         Rows of ``points`` and of ``others``.
 
@@ -194,17 +198,17 @@ def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triang
     every = np.concatenate([points, others])
     theirs = other_triangles + len(points)
     found = _search(every, triangles, theirs, *_tree(every, theirs), False)
-    return _certain(every, triangles, theirs, *found)
+    return _decide_exactly(every, triangles, theirs, *found)
 
 
 def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
-    """(n,) whether the triangles of each of the ``pairs`` (n, 2) have a vertex in common."""
+    """Whether the triangles of each of the ``pairs`` (n, 2) have a vertex in common, (n,)."""
     first, second = triangles[pairs[:, 0]], triangles[pairs[:, 1]]
     return np.asarray((first[:, :, None] == second[:, None, :]).any(axis=(1, 2)))
 
 
-def _certain(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: Mask) -> Ints:
-    """The pairs found without those among the undecided that do not cross, in lexicographic order."""
+def _decide_exactly(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: Mask) -> Ints:
+    """The pairs that cross, in lexicographic order: those decided, and others by rational numbers."""
     kept = decided.copy()
     for n in np.flatnonzero(~decided):
         vertices = [*triangles[pairs[n, 0]].tolist(), *others[pairs[n, 1]].tolist()]
@@ -220,15 +224,15 @@ def _tree(points: Array, triangles: Ints) -> tuple[Ints, Array, Array, Array, Ar
     Returns
     -------
     order : (F,) int64
-        Triangles in the order of the leaves, `LEAF` to each: along a space-filling curve.
+        Triangles in the order of the leaves, `LEAF` each, along a space-filling curve.
     low, high : (F, 3) float64
         Boxes of the triangles, in this order [m].
     node_low, node_high : (2 n, 3) float64
-        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
+        Boxes of the nodes, of which the last n are the leaves; low > high for empty ones [m].
     """
     corners = points[triangles]
     low, high = corners.min(axis=1), corners.max(axis=1)
-    order = np.argsort(_curve(low, high), kind="stable")
+    order = np.argsort(_morton_codes(low, high), kind="stable")
     low, high = low[order], high[order]
     leaves = 1 << max(0, -(-len(triangles) // LEAF) - 1).bit_length()
     node_low, node_high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
@@ -244,9 +248,9 @@ def _tree(points: Array, triangles: Ints) -> tuple[Ints, Array, Array, Array, Ar
     return order, low, high, node_low, node_high
 
 
-def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
-    """(F,) places along Morton's curve of the centres of boxes, with 21 bits an axis."""
-    # a quarter each: coordinates may be as large as numbers go
+def _morton_codes(low: Array, high: Array) -> NDArray[np.uint64]:
+    """Morton codes (F,) of the centres of boxes, with 21 bits per axis."""
+    # a quarter each: sums of very large coordinates would overflow
     centres = 0.25 * low + 0.25 * high
     if not len(centres):
         return np.empty(0, np.uint64)
@@ -264,14 +268,14 @@ def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
     return np.asarray(bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2))
 
 
-def _decides_crossing(side: Any) -> Callable[..., int]:
+def _crossing_predicate(side: Any) -> Callable[..., int]:
     """A function that decides whether two triangles cross, by an orientation predicate such as `side`."""
 
     def crossing(points: Any, a: int, b: int, c: int, d: int, e: int, f: int) -> int:
         """1 where the triangles a, b, c and d, e, f cross, 0 where not, or `UNDECIDED`."""
         first, second = (a, b, c), (d, e, f)
-        # each must have corners on both sides of the other's plane: its interior meets the planes' common
-        # line in an open interval then, and else does not meet the other's plane, or lies in it
+        # each must have corners on both sides of the other's plane: then its interior intersects the planes'
+        # common line in an open interval; otherwise it does not intersect the other's plane, or lies in it
         x, y, z = side(points, d, e, f, a), side(points, d, e, f, b), side(points, d, e, f, c)
         if max(x, y, z) == UNDECIDED:
             return UNDECIDED
@@ -282,7 +286,7 @@ def _decides_crossing(side: Any) -> Callable[..., int]:
             return UNDECIDED
         if max(u, v, w) < 1 or min(u, v, w) > -1:
             return 0
-        # turned so that p is alone on its side, where the normal of the other triangle points
+        # rotated so that p is alone on its side of the other triangle, to which the other's normal points
         k = 0 if x not in (0, y, z) else 1 if y not in (0, x, z) else 2
         m = 0 if u not in (0, v, w) else 1 if v not in (0, u, w) else 2
         p, q, r = first[k], first[(k + 1) % 3], first[(k + 2) % 3]
@@ -292,16 +296,16 @@ def _decides_crossing(side: Any) -> Callable[..., int]:
         if (u, v, w)[m] < 0:
             q, r = r, q
         # the intervals overlap if each begins before the other one ends
-        mine, others = side(points, p, q, s, t), side(points, p, r, o, s)
-        if max(mine, others) == UNDECIDED:
+        first_begins, second_begins = side(points, p, q, s, t), side(points, p, r, o, s)
+        if max(first_begins, second_begins) == UNDECIDED:
             return UNDECIDED
-        return int(mine < 0 and others < 0)
+        return int(first_begins < 0 and second_begins < 0)
 
     return crossing
 
 
-_crossing = cached()(_decides_crossing(side))
-_rational_crossing = _decides_crossing(rational_side)
+_crossing = cached()(_crossing_predicate(side))
+_rational_crossing = _crossing_predicate(rational_side)
 
 
 @cached()
@@ -316,9 +320,10 @@ def _search(
     node_high: Any,
     within: bool,
 ) -> tuple[Any, Any]:
-    """The pairs of a query and a triangle of the tree that cross or are undecided, and which are decided.
+    """The pairs of a query and a triangle of the tree that cross or are undecided, and whether they are
+    decided.
 
-    ``within``: queries and triangles are the same; each pair is looked at once.
+    With ``within``, queries and triangles are the same, and each pair is examined once.
     """
     pairs, decided, count = np.empty((64, 2), np.int64), np.empty(64, np.bool_), 0
     leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
@@ -330,7 +335,7 @@ def _search(
         while top > 0:
             top -= 1
             node = stack[top]
-            if _apart(least, most, node_low[node], node_high[node]):
+            if _are_disjoint(least, most, node_low[node], node_high[node]):
                 continue
             if node < leaves:
                 stack[top], stack[top + 1] = 2 * node, 2 * node + 1
@@ -339,7 +344,7 @@ def _search(
             first = (node - leaves) * LEAF
             for place in range(first, min(first + LEAF, len(order))):
                 j = order[place]
-                if (within and j <= i) or _apart(least, most, low[place], high[place]):
+                if (within and j <= i) or _are_disjoint(least, most, low[place], high[place]):
                     continue
                 d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
                 found = _crossing(points, a, b, c, d, e, f)
@@ -353,7 +358,7 @@ def _search(
 
 
 @cached()
-def _apart(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
+def _are_disjoint(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
     """Whether two boxes have no point in common."""
     return bool(
         (low[0] > other_high[0] or high[0] < other_low[0])

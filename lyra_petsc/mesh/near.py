@@ -1,4 +1,4 @@
-"""Which boxes are near each other: the broad phase of searches for contacts."""
+"""Pairs of axis-parallel boxes near each other: the broad phase of searches for contacts."""
 
 from __future__ import annotations
 
@@ -7,38 +7,41 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 
-MOST_CELLS = 1 << 22
+MAX_CELLS = 1 << 22
+"""Cells of the grid, at most."""
 
 
 @cached()
-def _cell(place, origin, size, n):  # type: ignore[no-untyped-def]
-    """The number of the cell that holds a coordinate, or of the nearest one of n."""
-    # of a plane that is one but for rounding, farther cells than whole numbers can count
-    return int(min(max((place - origin) / size, 0.0), n - 1.0))
+def _cell(coordinate, origin, size, n):  # type: ignore[no-untyped-def]
+    """Number of the cell that contains a coordinate, or of the nearest one of n."""
+    # in a box that is flat except for rounding, cell numbers may exceed the range of integers
+    return int(min(max((coordinate - origin) / size, 0.0), n - 1.0))
 
 
 @cached()
-def _swept(x, way, simplices, low, high):  # type: ignore[no-untyped-def]
+def _swept(x, dx, simplices, low, high):  # type: ignore[no-untyped-def]
     for s in range(len(simplices)):
         for k in range(3):
-            least = most = x[simplices[s, 0], k]
+            smallest = largest = x[simplices[s, 0], k]
             for i in range(simplices.shape[1]):
-                at = x[simplices[s, i], k]
-                to = at + way[simplices[s, i], k]
-                least, most = min(least, at, to), max(most, at, to)
-            low[s, k], high[s, k] = least, most
+                start = x[simplices[s, i], k]
+                end = start + dx[simplices[s, i], k]
+                smallest, largest = min(smallest, start, end), max(largest, start, end)
+            low[s, k], high[s, k] = smallest, largest
 
 
-def swept_boxes(x: Array, way: Array, simplices: Ints) -> tuple[Array, Array]:
-    """Low and high corners (n, 3) [m] of what simplices (n, m) of points x pass on their ways (N, 3) [m]."""
+def swept_boxes(x: Array, dx: Array, simplices: Ints) -> tuple[Array, Array]:
+    """Low and high corners (n, 3) [m] of the boxes around simplices (n, m) on displacements dx (N, 3) [m] of
+    points x.
+    """
     low, high = np.empty((len(simplices), 3)), np.empty((len(simplices), 3))
-    _swept(x, way, simplices, low, high)
+    _swept(x, dx, simplices, low, high)
     return low, high
 
 
 @cached()
-def _of_boxes(low, high, origin, size, n):  # type: ignore[no-untyped-def]
-    """The first and the last cell (k, 2, 3) that boxes reach into."""
+def _cell_ranges(low, high, origin, size, n):  # type: ignore[no-untyped-def]
+    """First and last cell (k, 2, 3) that each box overlaps."""
     out = np.empty((len(low), 2, 3), np.int32)
     for b in range(len(low)):
         for k in range(3):
@@ -48,8 +51,10 @@ def _of_boxes(low, high, origin, size, n):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
-    """Count the boxes of each cell into first (cells + 1,), or put them into ``items`` from there on."""
+def _fill_cells(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
+    """Count the boxes of each cell in first (cells + 1,); with ``fill`` write their numbers to ``items``,
+    from first on.
+    """
     for b in range(len(cells)):
         for i in range(cells[b, 0, 0], cells[b, 1, 0] + 1):
             for j in range(cells[b, 0, 1], cells[b, 1, 1] + 1):
@@ -63,13 +68,13 @@ def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
-    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
+def _find_pairs(low, high, others, radius, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
+    """Write near pairs to out (m, 2), as many as fit; returns their number.
 
-    The others, low and high corners (2, k, 3), stand in cells of a grid: ``first`` (cells + 1,) and
-    ``items``. A pair is found in the first cell that both have.
+    The others, low and high corners (2, k, 3), are in cells of a grid: ``first`` (cells + 1,) and ``items``.
+    A pair is found in the first cell that both overlap.
     """
-    found, square = 0, reach * reach
+    n_found, square = 0, radius * radius
     for a in range(len(low)):
         for i in range(cells[a, 0, 0], cells[a, 1, 0] + 1):
             for j in range(cells[a, 0, 1], cells[a, 1, 1] + 1):
@@ -84,27 +89,27 @@ def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, 
                             or k != max(cells[a, 0, 2], other_cells[b, 0, 2])
                         ):
                             continue
-                        left = square
+                        margin = square
                         for m in range(3):
-                            apart = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
-                            left -= apart * apart
-                        if left < 0.0:
+                            distance = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
+                            margin -= distance * distance
+                        if margin < 0.0:
                             continue
-                        if found < len(out):
-                            out[found, 0], out[found, 1] = a, b
-                        found += 1
-    return found
+                        if n_found < len(out):
+                            out[n_found, 0], out[n_found, 1] = a, b
+                        n_found += 1
+    return n_found
 
 
-def near(
-    boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, reach: float = 0.0
+def near_pairs(
+    boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, radius: float = 0.0
 ) -> Ints:
-    """Pairs (m, 2) of boxes and other boxes at most ``reach`` [m] apart.
+    """Pairs (m, 2) of boxes and other boxes at most ``radius`` [m] apart, by a grid.
 
     Parameters
     ----------
     boxes, others : pairs of (n, 3), (k, 3)
-        Their low and high corners [m]. Without others the boxes themselves; the lesser number is first.
+        Their low and high corners [m]. Without others: pairs of the boxes, the lower number first.
     """
     same = others is None
     low, high = boxes
@@ -113,37 +118,38 @@ def near(
         return np.empty((0, 2), dtype=np.int64)
     origin, end = other_low.min(axis=0), other_high.max(axis=0)
     extent = np.maximum(end - origin, 1e-300)
-    size = np.maximum((other_high - other_low).mean(axis=0) + reach, extent * 1e-6)
+    size = np.maximum((other_high - other_low).mean(axis=0) + radius, extent * 1e-6)
     n = np.maximum(extent / size, 1.0)
-    while np.prod(np.floor(n)) > min(MOST_CELLS, 8 * len(other_low) + 64):
+    while np.prod(np.floor(n)) > min(MAX_CELLS, 8 * len(other_low) + 64):
         n[np.argmax(n)] *= 0.5
     n = np.floor(n).astype(np.int64)
     size = extent / n
-    other_cells = _of_boxes(other_low, other_high, origin, size, n)
-    cells = _of_boxes(low - reach, high + reach, origin, size, n)
+    other_cells = _cell_ranges(other_low, other_high, origin, size, n)
+    cells = _cell_ranges(low - radius, high + radius, origin, size, n)
     first = np.zeros(int(np.prod(n)) + 1, dtype=np.int64)
-    _sort(other_cells, n, first, np.empty(0, dtype=np.int64), False)
+    _fill_cells(other_cells, n, first, np.empty(0, dtype=np.int64), False)
     np.cumsum(first, out=first)
     items = np.empty(first[-1], dtype=np.int64)
-    at = first[:-1].copy()
-    _sort(other_cells, n, at, items, True)
+    next_item = first[:-1].copy()
+    _fill_cells(other_cells, n, next_item, items, True)
     out = np.empty((4 * len(low) + 64, 2), dtype=np.int64)
     stacked = np.stack([other_low, other_high])
-    given = low, high, stacked, reach, cells, other_cells, n, same, first, items
-    found = _pairs(*given, out)
-    if found > len(out):
-        out = np.empty((found, 2), dtype=np.int64)
-        _pairs(*given, out)
-    return out[:found]
+    arguments = low, high, stacked, radius, cells, other_cells, n, same, first, items
+    n_found = _find_pairs(*arguments, out)
+    if n_found > len(out):
+        out = np.empty((n_found, 2), dtype=np.int64)
+        _find_pairs(*arguments, out)
+    return out[:n_found]
 
 
 @cached()
-def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
-    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
+def _find_pairs_by_tree(low, high, radius, tree, out):  # type: ignore[no-untyped-def]
+    """Write near pairs to out (m, 2), as many as fit; returns their number.
 
-    ``tree`` (2 k, 2, 3), k a power of 2 from len(low) on, takes boxes around pairs of boxes, pairs of these …
+    ``tree`` (2 k, 2, 3), with k a power of 2 not below len(low), is overwritten by the boxes around pairs of
+    boxes, around pairs of these, and so on.
     """
-    leaves, found, square = len(tree) // 2, 0, reach * reach
+    leaves, n_found, square = len(tree) // 2, 0, radius * radius
     for b in range(leaves):
         for k in range(3):
             tree[leaves + b, 0, k] = low[b, k] if b < len(low) else np.inf
@@ -158,34 +164,34 @@ def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
         open_pairs -= 1
         i, j = stack[open_pairs]
         if i != j:
-            left = square
+            margin = square
             for k in range(3):
-                apart = max(tree[i, 0, k] - tree[j, 1, k], tree[j, 0, k] - tree[i, 1, k], 0.0)
-                left -= apart * apart
-            if not left >= 0.0:
+                distance = max(tree[i, 0, k] - tree[j, 1, k], tree[j, 0, k] - tree[i, 1, k], 0.0)
+                margin -= distance * distance
+            if not margin >= 0.0:
                 continue
         if i >= leaves:
             if i != j:
-                if found < len(out):
-                    out[found, 0], out[found, 1] = i - leaves, j - leaves
-                found += 1
+                if n_found < len(out):
+                    out[n_found, 0], out[n_found, 1] = i - leaves, j - leaves
+                n_found += 1
             continue
         for one in range(2):
             for other in range(one if i == j else 0, 2):
                 stack[open_pairs, 0], stack[open_pairs, 1] = 2 * i + one, 2 * j + other
                 open_pairs += 1
-    return found
+    return n_found
 
 
-def near_in_order(low: Array, high: Array, reach: float) -> Ints:
-    """Pairs (m, 2) of boxes with corners (n, 3) [m] at most ``reach`` [m] apart, the lesser number first.
+def near_pairs_by_tree(low: Array, high: Array, radius: float) -> Ints:
+    """Pairs (m, 2) of boxes with corners (n, 3) [m] at most ``radius`` [m] apart, the lower number first.
 
-    Fast where boxes with neighbouring numbers are neighbours in space.
+    Fast if boxes with neighbouring numbers are neighbours in space.
     """
     tree = np.empty((2 << max(len(low) - 1, 0).bit_length(), 2, 3))
     out = np.empty((8 * len(low), 2), dtype=np.int64)
     while True:
-        found = _of_tree(low, high, reach, tree, out)
-        if found <= len(out):
-            return out[:found]
-        out = np.empty((found, 2), dtype=np.int64)
+        n_found = _find_pairs_by_tree(low, high, radius, tree, out)
+        if n_found <= len(out):
+            return out[:n_found]
+        out = np.empty((n_found, 2), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Obstacles of a scene: bodies that sheets stay out of and containers that they stay in, at any time."""
+"""Obstacles of a scene: bodies that sheets stay outside of, and containers that they stay inside of."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 
-# corner i + 2 j + 4 k of a box stands at its upper end in x, y, z where i, j, k are 1
+# corner i + 2 j + 4 k of a box is at its upper end in x, y, z where i, j, k are 1
 _CORNERS = np.array([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)], dtype=np.float64)
 _SIDES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
 BOX_TRIANGLES: Ints = _SIDES[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np.int64)
@@ -29,35 +29,35 @@ _BOX_EDGES = np.array([[i, i + s] for s in (1, 2, 4) for i in range(8) if not i 
 RigidMotion: TypeAlias = Callable[[float], tuple[Array, Array]]
 """Rotation (3, 3) and translation (3,) [m] at a time [s]."""
 
-MakesMotion: TypeAlias = Callable[..., Any]
-"""`terms.motion.Motion`, which this package does not know."""
+MotionFactory: TypeAlias = Callable[..., Any]
+"""`terms.motion.Motion`, which this package must not import."""
 
 
-class _Carried:
-    """A body that a rigid motion T moves from its place at t = 0: by T(t) T(0)⁻¹."""
+class _RigidBody:
+    """A body that moves rigidly from its position at t = 0: by T(t) T(0)⁻¹ for a rigid motion T."""
 
     points: Array
     motion: RigidMotion | None
 
-    def displacement(self, time: float) -> tuple[Array, Array]:
-        """Rotation (3, 3) and translation (3,) [m] that lead from t = 0 to a time [s]."""
-        if self.motion is None or time == 0.0:  # where rounding would move it
+    def rigid_motion(self, time: float) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) [m] from t = 0 to a time [s]."""
+        if self.motion is None or time == 0.0:  # without rounding errors
             return np.eye(3), np.zeros(3)
-        (start, from_), (turn, to) = self.motion(0.0), self.motion(time)
-        rotation = turn @ start.T
-        return rotation, to - rotation @ from_
+        (start_rotation, offset), (end_rotation, end_offset) = self.motion(0.0), self.motion(time)
+        rotation = end_rotation @ start_rotation.T
+        return rotation, end_offset - rotation @ offset
 
     def positions(self, time: float) -> Array:
-        """Its points (n, 3) [m] at a time [s]; of what stands still ``points`` itself."""
+        """Its points (n, 3) [m] at a time [s]; ``points`` itself if it does not move."""
         if self.motion is None:
             return self.points
-        rotation, translation = self.displacement(time)
+        rotation, translation = self.rigid_motion(time)
         return self.points @ rotation.T + translation
 
 
 @dataclass(frozen=True, eq=False)
-class Solid(_Carried):
-    """An obstacle that sheets stay out of.
+class Solid(_RigidBody):
+    """An obstacle that sheets stay outside of.
 
     Attributes
     ----------
@@ -65,16 +65,16 @@ class Solid(_Carried):
     points : (n, 3) float64
         At t = 0 [m].
     edges : (m, 2) int64
-        Each once; of a box without the diagonals of its sides.
+        Each once; for a box without the diagonals of its sides.
     triangles : (k, 3) int64
-        Of a box anticlockwise seen from outside, of a mesh as in its file.
+        For a box anticlockwise seen from outside, for a mesh as in its file.
     radius : float
-        Distance [m] from points, edges and triangles at which its surface is: of a sphere (one point) and a
-        capsule (two points, one edge), else 0.
+        Distance [m] of the surface from points, edges and triangles: of a sphere (one point) and a capsule
+        (two points, one edge); otherwise 0.
     friction : (float, float)
         Static and kinetic coefficient.
     motion : RigidMotion or None
-        None: it stands still.
+        None: it does not move.
     """
 
     name: str
@@ -87,25 +87,25 @@ class Solid(_Carried):
 
 
 @dataclass(frozen=True, eq=False)
-class Container(_Carried):
-    """An obstacle that all vertices are to stay on one side of, which is convex.
+class Container(_RigidBody):
+    """A convex region that all vertices stay inside of.
 
     Attributes
     ----------
     name : str
     kind : str
-        ``planes``: on the side to which the normals of all planes point; ``ball``: at most ``radius`` from
-        the segment between the first and the last point (of a sphere there is only one).
+        ``planes``: the side of all planes to which their normals point; ``ball``: at most ``radius`` from the
+        segment between the first and the last point (for a sphere there is only one).
     points : (n, 3) float64
         At t = 0 [m]: one on each plane, or the ends of the segment.
     normals : (n, 3) float64
-        At t = 0, unit vectors; (0, 3) of a ball.
+        At t = 0, unit vectors; (0, 3) for a ball.
     radius : float
-        Of a ball [m], else 0.
+        Of a ball [m], otherwise 0.
     friction : (float, float)
         Static and kinetic coefficient.
     motion : RigidMotion or None
-        None: it stands still.
+        None: it does not move.
     """
 
     name: str
@@ -117,14 +117,14 @@ class Container(_Carried):
     motion: RigidMotion | None = None
 
     def normals_at(self, time: float) -> Array:
-        """Its normals (n, 3) at a time [s]; of what stands still ``normals`` itself."""
+        """Its normals (n, 3) at a time [s]; ``normals`` itself if it does not move."""
         if self.motion is None:
             return self.normals
-        return self.normals @ self.displacement(time)[0].T
+        return self.normals @ self.rigid_motion(time)[0].T
 
 
-def obstacles_of(
-    comm: MPI.Comm, scene: Scene, mesh: Mesh | None, motion: MakesMotion
+def build_scene_obstacles(
+    comm: MPI.Comm, scene: Scene, mesh: Mesh | None, motion: MotionFactory
 ) -> list[Solid | Container]:
     """The obstacles of a scene in its order, the same on all ranks; collective.
 
@@ -133,23 +133,23 @@ def obstacles_of(
     comm : MPI.Comm
     scene : Scene
     mesh : Mesh or None
-        Of `build.build_scene_mesh`; needed on rank 0 only, and there only for obstacles that are meshes.
+        From `build.build_scene_mesh`; needed on rank 0 only, and only for obstacles that are meshes.
     motion : callable
         `terms.motion.Motion`.
 
     Raises
     ------
     InputError
-        For motions that cannot be, on all ranks alike.
+        For invalid motions, on all ranks.
     """
     surfaces: Mapping[str, TriangleSurface] = {}
     if any(obstacle.mesh is not None for obstacle in (scene.obstacles or {}).values()):
         surfaces = on_root(comm, lambda: mesh.obstacles if mesh is not None else {})
-    return made(scene, surfaces, motion)
+    return build_obstacles(scene, surfaces, motion)
 
 
-def made(
-    scene: Scene, surfaces: Mapping[str, TriangleSurface], motion: MakesMotion
+def build_obstacles(
+    scene: Scene, surfaces: Mapping[str, TriangleSurface], motion: MotionFactory
 ) -> list[Solid | Container]:
     """The obstacles of a scene in its order.
 
@@ -161,47 +161,45 @@ def made(
     motion : callable
         `terms.motion.Motion`.
     """
-    return [_made(scene, name, surfaces, motion) for name in scene.obstacles or {}]
+    return [_build_obstacle(scene, name, surfaces, motion) for name in scene.obstacles or {}]
 
 
-def _made(
-    scene: Scene, name: str, surfaces: Mapping[str, TriangleSurface], motion: MakesMotion
+def _build_obstacle(
+    scene: Scene, name: str, surfaces: Mapping[str, TriangleSurface], motion: MotionFactory
 ) -> Solid | Container:
     assert scene.obstacles is not None
     assert scene.contact is not None
     obstacle = scene.obstacles[name]
     friction = coefficients(scene.contact.friction if obstacle.friction is None else obstacle.friction)
-    carried: RigidMotion | None = None
+    rigid_motion: RigidMotion | None = None
     if keyframes := scene.keyframes(obstacle):
-        named = (
-            f"motions.{obstacle.motion}" if isinstance(obstacle.motion, str) else f"obstacles.{name}.motion"
-        )
-        carried = motion(keyframes, obstacle.interpolation, key=named, file=scene.source).transform
+        key = f"motions.{obstacle.motion}" if isinstance(obstacle.motion, str) else f"obstacles.{name}.motion"
+        rigid_motion = motion(keyframes, obstacle.interpolation, key=key, file=scene.source).transform
     if obstacle.plane is not None:
         normal = np.array(obstacle.plane.normal)
-        normal /= np.abs(normal).max()  # squares of what is very large or small are no numbers
+        normal /= np.abs(normal).max()  # squares of very large or small components would overflow
         normal /= np.linalg.norm(normal)
         point = np.array([obstacle.plane.point])
-        return Container(name, "planes", point, normal[None], 0.0, friction, carried)
+        return Container(name, "planes", point, normal[None], 0.0, friction, rigid_motion)
     if obstacle.box is not None and obstacle.inside:
         low, high = np.array(obstacle.box.min), np.array(obstacle.box.max)
         points, normals = np.array([low] * 3 + [high] * 3), np.concatenate([np.eye(3), -np.eye(3)])
-        return Container(name, "planes", points, normals, 0.0, friction, carried)
+        return Container(name, "planes", points, normals, 0.0, friction, rigid_motion)
     if obstacle.box is not None:
         corners = box_corners(obstacle.box)
-        return Solid(name, corners, _BOX_EDGES.copy(), BOX_TRIANGLES.copy(), 0.0, friction, carried)
+        return Solid(name, corners, _BOX_EDGES.copy(), BOX_TRIANGLES.copy(), 0.0, friction, rigid_motion)
     if obstacle.mesh is not None:
         points, triangles = surfaces[name]
-        return Solid(name, points, unique_edges(triangles), triangles, 0.0, friction, carried)
-    axis, radius = axis_of(obstacle)
+        return Solid(name, points, unique_edges(triangles), triangles, 0.0, friction, rigid_motion)
+    axis, radius = axis_and_radius(obstacle)
     if obstacle.inside:
-        return Container(name, "ball", axis, np.empty((0, 3)), radius, friction, carried)
+        return Container(name, "ball", axis, np.empty((0, 3)), radius, friction, rigid_motion)
     edges = np.array([[0, 1]] * (len(axis) - 1), dtype=np.int64).reshape(-1, 2)
-    return Solid(name, axis, edges, np.empty((0, 3), dtype=np.int64), radius, friction, carried)
+    return Solid(name, axis, edges, np.empty((0, 3), dtype=np.int64), radius, friction, rigid_motion)
 
 
-def axis_of(obstacle: Obstacle) -> tuple[Array, float]:
-    """Of a sphere its centre (1, 3), of a capsule the ends of its axis (2, 3), and the radius, all [m]."""
+def axis_and_radius(obstacle: Obstacle) -> tuple[Array, float]:
+    """Centre (1, 3) of a sphere, or ends of the axis (2, 3) of a capsule, and the radius, all [m]."""
     if obstacle.sphere is not None:
         return np.array([obstacle.sphere.center]), obstacle.sphere.radius
     assert obstacle.capsule is not None
@@ -209,6 +207,6 @@ def axis_of(obstacle: Obstacle) -> tuple[Array, float]:
 
 
 def box_corners(box: Cuboid) -> Array:
-    """(8, 3) corners [m], numbered as in `BOX_TRIANGLES`."""
+    """Corners (8, 3) [m], numbered as in `BOX_TRIANGLES`."""
     low, high = np.array(box.min), np.array(box.max)
     return np.where(_CORNERS > 0.5, high, low)

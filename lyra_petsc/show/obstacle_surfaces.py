@@ -11,7 +11,14 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import TriangleSurface
-from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Container, Solid, axis_of, box_corners, made
+from lyra_petsc.mesh.obstacles import (
+    BOX_TRIANGLES,
+    Container,
+    Solid,
+    axis_and_radius,
+    box_corners,
+    build_obstacles,
+)
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.scene.schema import Obstacle
@@ -31,7 +38,7 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     stored = run.mesh.obstacles if meshes else {}
     if missing := meshes - stored.keys():
         raise InputError(f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE)
-    return made(run.scene, stored, Motion)
+    return build_obstacles(run.scene, stored, Motion)
 
 
 AROUND = 48
@@ -113,7 +120,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
 
 
 def _carried(obstacle: Solid | Container, points: Array, time: float) -> Array:
-    rotation, translation = obstacle.displacement(time)
+    rotation, translation = obstacle.rigid_motion(time)
     return points @ rotation.T + translation
 
 
@@ -121,7 +128,7 @@ def _square(plane: Container, tangents: Array, middle: Array, half: float, time:
     """(4, 3) corners of a square in a plane at a time [s], whose centre is nearest to ``middle``."""
     normal, place = plane.normals_at(time)[0], plane.positions(time)[0]
     centre = middle - ((middle - place) @ normal) * normal
-    first, second = half * tangents @ plane.displacement(time)[0].T
+    first, second = half * tangents @ plane.rigid_motion(time)[0].T
     return np.array(
         [centre - first - second, centre + first - second, centre + first + second, centre - first + second]
     )
@@ -138,7 +145,7 @@ def shape_surface(obstacle: Obstacle) -> TriangleSurface:
     """A sphere, capsule or box at t = 0; triangles are anticlockwise seen from outside."""
     if obstacle.box is not None:
         return TriangleSurface(box_corners(obstacle.box), BOX_TRIANGLES)
-    axis, radius = axis_of(obstacle)
+    axis, radius = axis_and_radius(obstacle)
     along = axis[-1] - axis[0]
     length = float(np.linalg.norm(along))
     up = along / length if length > 0.0 else _AXES[2]

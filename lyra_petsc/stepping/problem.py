@@ -227,11 +227,11 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
     places = None
     if scene.contact is not None:
-        from lyra_petsc.mesh.obstacles import made as made_obstacles
+        from lyra_petsc.mesh.obstacles import build_obstacles
         from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
         places = data.get("start", mesh.positions)
-        refuse_crossings(scene, mesh, places, made_obstacles(scene, mesh.obstacles, Motion))
+        refuse_crossings(scene, mesh, places, build_obstacles(scene, mesh.obstacles, Motion))
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     outline = Outline(
@@ -321,10 +321,10 @@ def _set_up_contact(
     """Tell contact of the obstacles; collective."""
     if outline.barrier is None or scene.contact is None:
         return
-    from lyra_petsc.mesh.obstacles import obstacles_of
+    from lyra_petsc.mesh.obstacles import build_scene_obstacles
     from lyra_petsc.terms.contact import ContactBarrier
 
-    obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
+    obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
     self_contact, static = scene.contact.self, scene.time.static
     contact.set_up(outline.barrier, obstacles, self_contact=self_contact, static=static)

@@ -22,7 +22,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
-from lyra_petsc.mesh.near import near, swept_boxes
+from lyra_petsc.mesh.near import near_pairs, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs, surface_shares
@@ -165,11 +165,8 @@ class ActivePairs(NamedTuple):
 
 
 _EMPTY = np.empty(0)
-NO_PAIRS = ActivePairs(
-    *unwritable(
-        _EMPTY, np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 5))
-    )
-)
+_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 5))
+NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
 
 
 class Obstacles:
@@ -282,7 +279,7 @@ class Obstacles:
             return self._at_rest
         motions = []
         for each in self.each:
-            (r0, t0), (r1, t1) = each.displacement(start), each.displacement(end)
+            (r0, t0), (r1, t1) = each.rigid_motion(start), each.rigid_motion(end)
             rotation = r1 @ r0.T
             motions.append((rotation, t1 - rotation @ t0))
         return motions
@@ -377,11 +374,8 @@ class ContactBarrier(Elastic):
         edges = np.flatnonzero((self.kind == EDGE_EDGE) & (self.obstacle >= 0))
         ends = np.sort(~points[edges, 2:], axis=1)
         keys = ends[:, 0] * obstacles.n_points + ends[:, 1]
-        rows = (
-            np.searchsorted(obstacles.smooth_edges, keys),
-            np.searchsorted(obstacles.smooth_edges, keys, side="right"),
-        )
-        out[edges] = rows[0] < rows[1]
+        first, last = (np.searchsorted(obstacles.smooth_edges, keys, side=s) for s in ("left", "right"))
+        out[edges] = first < last
         return out
 
     # -- obstacles ---------------------------------------------------------------------------------
@@ -406,20 +400,16 @@ class ContactBarrier(Elastic):
 
     # -- search ------------------------------------------------------------------------------------
 
-    def neighbours(
-        self, x: Array, displacement: Array, numbers: Ints, triangles: Ints
-    ) -> tuple[Ints, Ints] | None:
+    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         if self.moving:
             self._obstacle_x, self._obstacle_boxes = self._next_obstacle_x, None
         self.stale = False
         if triangles is not self._searched:
-            self._sheet_search.take(x, numbers, triangles[:, :3], triangles[:, 3])
-            self._vertex_units = np.full(
-                len(x) + 1, AREA_UNITS
-            )  # the last one for pairs without such a vertex
+            self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
+            self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
             self._vertex_units[triangles[:, :3]] = triangles[:, 4:]
             self._searched = triangles
-        dx, limit = displacement, np.inf
+        limit = np.inf
         if dx.any() and not self.static:
             limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
         boxes = self._sheet_search.boxes(x, dx)
@@ -490,11 +480,11 @@ class ContactBarrier(Elastic):
             boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
             kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
             others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
-            near_patches = near(patches, boxes)
+            near_patches = near_pairs(patches, boxes)
             if not len(near_patches):
                 return
-            corners = sheet.of(np.unique(near_patches[:, 0]))
-            pairs = near(swept_boxes(x, dx, corners), boxes)
+            corners = sheet.corners_of(np.unique(near_patches[:, 0]))
+            pairs = near_pairs(swept_boxes(x, dx, corners), boxes)
             own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
             rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
@@ -524,9 +514,9 @@ class ContactBarrier(Elastic):
                 if not len(others):
                     break
             else:
-                single = self._sheet_search.vertices.of(np.flatnonzero(close.any(axis=1)))[:, 0]
+                single = self._sheet_search.vertices.corners_of(np.flatnonzero(close.any(axis=1)))[:, 0]
                 close = np.zeros((len(single), len(others)), dtype=np.bool_)
-                for end in (x, x + dx):  # along straight ways these distances are lower end an end
+                for end in (x, x + dx):  # on straight paths the distance is lowest at an end
                     close |= self._is_close(end[single], kind, others, obstacle_x, radius)
                 number, plane = np.nonzero(close)
                 points = np.column_stack([single[number], ~others[plane, :3]])
@@ -634,25 +624,24 @@ class ContactBarrier(Elastic):
 
     # -- limits and corrections of Newton's increments ---------------------------------------------
 
-    def largest_step(self, x: Array, increment: Array, frozen: ObstaclePositions) -> float:
+    def largest_step(self, x: Array, dx: Array, frozen: ObstaclePositions) -> float:
         if not self.n_elements:
             return 1.0
         at_rest = np.zeros_like(frozen.stage)
-        approach = contact_pairs.largest_approach(increment, at_rest)
-        near = np.flatnonzero(
-            approach > (1.0 - KEPT_FRACTION) * self.active_pairs(x, frozen.stage).lower_bound
-        )
+        approach = contact_pairs.largest_approach(dx, at_rest)
+        bound = self.active_pairs(x, frozen.stage).lower_bound
+        near = np.flatnonzero(approach > (1.0 - KEPT_FRACTION) * bound)
         pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
-        return float(contact_pairs.free_fraction(x, frozen.stage, increment, at_rest, *pairs))
+        return float(contact_pairs.free_fraction(x, frozen.stage, dx, at_rest, *pairs))
 
-    def springs(self, x: Array, increment: Array, frozen: ObstaclePositions) -> Springs:
+    def springs(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Springs:
         active, capacity = self.active_pairs(x, frozen.stage), self._capacity
         given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
             integers = np.empty(capacity, dtype=np.int64)
             found = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
             pairs = *self._pair_data, given, self.n_owned
-            n_active, n = contact_pairs.find_springs(x, frozen.stage, increment, *pairs, found)
+            n_active, n = contact_pairs.find_springs(x, frozen.stage, dx, *pairs, found)
             if n <= capacity:
                 break
             capacity = n
@@ -667,37 +656,35 @@ class ContactBarrier(Elastic):
             self._expected[self._springs.pair] = self._springs.law(length)[0] / self._springs.scale
         self._springs = None
 
-    def target_distances(
-        self, x: Array, increment: Array, frozen: ObstaclePositions
-    ) -> tuple[NDArray[Any], ...]:
+    def target_distances(self, x: Array, dx: Array, frozen: ObstaclePositions) -> tuple[NDArray[Any], ...]:
         n, pairs = self.n_elements, (*self._geometry, TARGET_FRACTION, self._expected)
         targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
-        contact_pairs.target_distances(x, frozen.stage, increment, *pairs, *targets)
+        contact_pairs.target_distances(x, frozen.stage, dx, *pairs, *targets)
         return targets
 
     def add_corrections(
         self,
         x: Array,
-        increment: Array,
+        dx: Array,
         frozen: ObstaclePositions,
         targets: tuple[NDArray[Any], ...],
         out: Array,
         weight: Array,
     ) -> bool:
         pairs = *self._geometry, *targets, TARGET_TOLERANCE
-        return bool(contact_pairs.add_corrections(x, frozen.stage, increment, *pairs, out, weight))
+        return bool(contact_pairs.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
 
     # -- collisions --------------------------------------------------------------------------------
 
     def is_collision_free(
-        self, x: Array, displacement: Array, frozen: ObstaclePositions, interval: StepInterval
+        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
     ) -> bool:
         if not self.n_elements:
             return True
         curved = np.flatnonzero(self._deviations > MAX_DEVIATION * self.barrier.gap)
         if len(curved) and np.isin(self.obstacle, curved).any():
             return False
-        motion = _displacements(frozen, interval, displacement)
+        motion = _displacements(frozen, interval, dx)
         return bool(contact_pairs.free_fraction(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
 
     def distances(self, x: Array, obstacle_x: Array) -> Array:
@@ -709,22 +696,19 @@ class ContactBarrier(Elastic):
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
         return self.distances(x, frozen.stage)[: self.n_owned]
 
-    def _free_fractions(
-        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval, n: int
-    ) -> Array:
-        """The collision-free fractions (n,) of the first pairs alone."""
+    def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
+        """The collision-free fractions (n,) of the first n pairs, with a motion from `_displacements`."""
         out = np.empty(n)
-        motion = _displacements(frozen, interval, dx)
         contact_pairs.free_fractions(x, *motion, *self._geometry, KEPT_FRACTION, out)
         return out
 
     def collision_free_fractions(
-        self, x: Array, displacement: Array, frozen: ObstaclePositions, interval: StepInterval
+        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
     ) -> Array:
-        return self._free_fractions(x, displacement, frozen, interval, self.n_owned)
+        return self._free_fractions(x, _displacements(frozen, interval, dx), self.n_owned)
 
-    def may_collide(self, x: Array, displacement: Array, frozen: ObstaclePositions, threshold: float) -> bool:
-        motion = _displacements(frozen, TO_STAGE, displacement)
+    def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
+        motion = _displacements(frozen, TO_STAGE, dx)
         return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
 
     def pair(self, element: int) -> Pair:
@@ -766,17 +750,18 @@ class ContactBarrier(Elastic):
             work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
         return work
 
-    def moved_with_obstacles(self, x: Array, displacement: Array, frozen: ObstaclePositions) -> Array:
+    def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
         if not self.moving:
-            return displacement
-        blocked = self._free_fractions(x, displacement, frozen, TO_STAGE, self.n_elements) < 1.0
-        moved = displacement.copy()
+            return dx
+        motion = _displacements(frozen, TO_STAGE, dx)
+        blocked = self._free_fractions(x, motion, self.n_elements) < 1.0
+        moved = dx.copy()
         for number, (rotation, translation) in enumerate(frozen.stage_motions):
             points = self.points[blocked & (self.obstacle == number)]
             points = np.unique(points[points >= 0])
             moved[points] = (x @ rotation.T + translation - x)[points]
         for points in self.points[blocked & (self.obstacle < 0)]:  # a moved sheet moves the next one
-            changed = (moved[points] != displacement[points]).any(axis=1)
+            changed = (moved[points] != dx[points]).any(axis=1)
             if changed.any():
                 moved[points[~changed]] = moved[points[changed]][0]
         return moved
@@ -864,7 +849,7 @@ def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
 
 
 def _displacements(
-    frozen: ObstaclePositions, interval: StepInterval, displacement: Array
+    frozen: ObstaclePositions, interval: StepInterval, dx: Array
 ) -> tuple[Array, Array, Array]:
     """Positions of obstacles' points at the start of an interval of the step, and the displacements of sheets
     and of obstacles in it.
@@ -872,9 +857,9 @@ def _displacements(
     begin, end = interval
     if begin >= 1.0:
         moved = frozen.end - frozen.stage
-        return frozen.stage + (begin - 1.0) * moved, displacement, (end - begin) * moved
+        return frozen.stage + (begin - 1.0) * moved, dx, (end - begin) * moved
     moved = frozen.stage - frozen.start
-    return frozen.start + begin * moved, displacement, (end - begin) * moved
+    return frozen.start + begin * moved, dx, (end - begin) * moved
 
 
 def elements(rest: RestShape) -> Elements:
@@ -893,7 +878,7 @@ def area_factors(triangles: Ints, area: Array) -> Ints:
     mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
     and friction would oscillate.
     """
-    sheet = np.unique(patches.connected(triangles), return_inverse=True)[1]
+    sheet = np.unique(patches.connected_pieces(triangles), return_inverse=True)[1]
     mean = np.bincount(sheet, area) / np.bincount(sheet)
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
     factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)

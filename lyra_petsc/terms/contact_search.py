@@ -1,4 +1,6 @@
-"""Which vertices, edges and triangles of the sheets may come near each other: first patches, then parts."""
+"""Search for near vertices, edges and triangles of the sheets: first pairs of patches, then of their
+simplices.
+"""
 
 from __future__ import annotations
 
@@ -10,33 +12,35 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.mesh import patches
-from lyra_petsc.mesh.near import near_in_order
+from lyra_petsc.mesh.near import near_pairs_by_tree
 from lyra_petsc.mesh.topology import edge_table
-from lyra_petsc.terms.contact_margins import Margins
+from lyra_petsc.terms.contact_margins import DistanceBounds
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
 
-SPARE = 0.7
-"""Over the reach, how much farther simplices of neighbouring patches are looked for: as long as they do not
-come nearer by that, they need not be looked for again."""
+EXTRA_RADIUS = 0.7
+"""Additional search radius for neighbouring patches over the radius: their simplices are not searched again
+before they have approached each other by so much."""
 
 
 class Simplices:
-    """Vertices, edges or triangles (n, m), those of patch p from ``first[p]`` to ``first[p + 1]``."""
+    """Vertices, edges or triangles (n, m) in the order of patches: those of patch p are first[p] to first[p +
+    1].
+    """
 
     def __init__(self, corners: Ints, patch: Ints, n_patches: int) -> None:
         order: Ints = np.argsort(patch, kind="stable")
         self.order, self.corners = order, np.ascontiguousarray(corners[order])
         self.first = np.searchsorted(patch[order], np.arange(n_patches + 1))
 
-    def of(self, chosen: Ints) -> Ints:
-        """Corners of those of some patches (n,)."""
+    def corners_of(self, chosen: Ints) -> Ints:
+        """Corners of the simplices of some patches (n,)."""
         sizes = self.first[chosen + 1] - self.first[chosen]
         shift = np.repeat(self.first[chosen] - np.cumsum(sizes) + sizes, sizes)
         return self.corners[np.arange(len(shift)) + shift]
 
 
 class SheetSearch:
-    """The simplices of the sheets in patches.
+    """Search for near simplices of the sheets, which are split into patches.
 
     Parameters
     ----------
@@ -52,38 +56,38 @@ class SheetSearch:
     """
 
     def __init__(self, surface: Ints, uv: Array) -> None:
-        patch = patches.patches_of(uv.mean(axis=1), patches.connected(surface))
-        patch = np.unique(patches.connected(surface, patch), return_inverse=True)[1].astype(np.int64)
-        self._patch, self._flat = patch, patches.flat(surface, uv, patch)
+        patch = patches.split_into_patches(uv.mean(axis=1), patches.connected_pieces(surface))
+        patch = np.unique(patches.connected_pieces(surface, patch), return_inverse=True)[1].astype(np.int64)
+        self._patch, self._flat = patch, patches.flat_patches(surface, uv, patch)
         self._n = len(self._flat.first) - 1
         # the vertices of each patch once, as places among the corners of all triangles
-        at = np.column_stack([np.repeat(patch, 3), surface.ravel()])
-        found, corner = np.unique(at, axis=0, return_index=True)
+        patch_corners = np.column_stack([np.repeat(patch, 3), surface.ravel()])
+        found, corner = np.unique(patch_corners, axis=0, return_index=True)
         self._corners, self._n_own = corner, len(corner)
         self._own_first = np.searchsorted(found[:, 0], np.arange(self._n + 1))
-        self._margins = Margins(self._flat.beside, self._own_first)
-        self._alone = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
-        self._given: Ints | None = None
-        self._room = 1024
+        self._bounds = DistanceBounds(self._flat.beside, self._own_first)
+        self._same_patch = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
+        self._triangles: Ints | None = None
+        self._capacity = 1024
 
-    def take(self, x: Array, numbers: Ints, triangles: Ints, rings: Ints | None = None) -> None:
-        """Let the simplices be those of triangles (F, 3), of which this rank's come first.
+    def set_triangles(self, x: Array, numbers: Ints, triangles: Ints, rings: Ints | None = None) -> None:
+        """Set the triangles (F, 3) to be searched, of which this rank's come first.
 
-        x (N, 3) [m] and numbers (N,) are positions and global numbers of all points, rings (F,) what is
-        around the triangles, as `surface_shares.rings` has it; 0 where that does not matter.
+        x (N, 3) [m] and numbers (N,) are positions and global numbers of all points, rings (F,) the codes
+        from `surface_shares.rings`; 0 if they do not matter.
         """
-        if self._given is not None and np.array_equal(triangles, self._given):
+        if self._triangles is not None and np.array_equal(triangles, self._triangles):
             return
-        self._given, own = triangles, len(self._patch)
-        more = patches.patches_of(x[triangles[own:]].mean(axis=1))
-        patch = np.concatenate([self._patch, self._n + more])
-        n = self._n + int(more.max(initial=-1)) + 1
+        self._triangles, n_own = triangles, len(self._patch)
+        other_patch = patches.split_into_patches(x[triangles[n_own:]].mean(axis=1))
+        patch = np.concatenate([self._patch, self._n + other_patch])
+        n = self._n + int(other_patch.max(initial=-1)) + 1
         self.triangles = Simplices(triangles, patch, n)
-        theirs = self.triangles.first[self._n :]
+        other_first = self.triangles.first[self._n :]
         self._vertices = np.concatenate(
-            [triangles.ravel()[self._corners], self.triangles.corners[theirs[0] :].ravel()]
+            [triangles.ravel()[self._corners], self.triangles.corners[other_first[0] :].ravel()]
         )
-        self._first = np.concatenate([self._own_first, self._n_own + 3 * (theirs[1:] - theirs[0])])
+        self._first = np.concatenate([self._own_first, self._n_own + 3 * (other_first[1:] - other_first[0])])
         self._rings = (
             np.zeros(len(triangles), dtype=np.int64) if rings is None else rings[self.triangles.order]
         )
@@ -95,243 +99,253 @@ class SheetSearch:
         sides = table.sides[table.first]
         edges = np.column_stack([triangles[sides // 3, sides % 3], triangles[sides // 3, (sides + 1) % 3]])
         edges = np.where((numbers[edges[:, 0]] < numbers[edges[:, 1]])[:, None], edges, edges[:, ::-1])
-        least = np.minimum.reduceat(patch[table.sides // 3], table.first) if len(edges) else patch[:0]
-        self.edges = Simplices(edges, least, n)
+        lowest_patch = np.minimum.reduceat(patch[table.sides // 3], table.first) if len(edges) else patch[:0]
+        self.edges = Simplices(edges, lowest_patch, n)
 
-    def boxes(self, x: Array, way: Array) -> Array:
-        """Low and high corners (4, P, 3) [m] of patches at the start and the end of their ways (N, 3) [m]."""
+    def boxes(self, x: Array, dx: Array) -> Array:
+        """Low and high corners (4, P, 3) [m] of patches at the start and at the end of displacements dx (N,
+        3) [m].
+        """
         out = np.empty((4, len(self._first) - 1, 3))
-        _boxes(x, way, self._vertices, self._first, out)
+        _boxes(x, dx, self._vertices, self._first, out)
         return out
 
     def pairs(
         self,
         x: Array,
-        way: Array,
+        dx: Array,
         numbers: Ints,
-        reach: float,
-        edges: float | None = None,
+        radius: float,
+        edge_radius: float | None = None,
         boxes: Array | None = None,
-        most: float = math.inf,
+        limit: float = math.inf,
     ) -> Ints | None:
-        """Rows (m, 7) of pairs that may come within ``reach`` [m] on their ways: kind, −1, vertices, and what
-        is around the triangle; None if there are more than ``most``.
+        """Rows (m, 7) of pairs that may come within ``radius`` [m] on displacements dx (N, 3) [m]: kind, −1,
+        four vertices, and the code of the triangle's surroundings. None if there are more than ``limit``.
 
-        Two edges within ``edges`` [m], not more than ``reach``. ``boxes`` are those of `boxes`.
+        Two edges must come within ``edge_radius`` [m], at most ``radius``. ``boxes`` are those from `boxes`.
         """
-        reaches = reach, reach if edges is None else edges
+        radii = radius, radius if edge_radius is None else edge_radius
         if len(self._first) == 1:
             return np.empty((0, 7), dtype=np.int64)
         n = len(self._first) - 1
-        swept, goes = np.empty((2, n, 3)), np.empty((n, 3))
-        _sweep(self.boxes(x, way) if boxes is None else boxes, swept, goes)
-        met = np.concatenate([self._alone, near_in_order(swept[0], swept[1], reach)])
-        lasting = self._margins.spend(x, way, self._vertices[: self._n_own])
-        met, row, known = self._margins.among(met, lasting, *reaches)
-        if not len(met):
+        swept, drift = np.empty((2, n, 3)), np.empty((n, 3))
+        _swept_boxes(self.boxes(x, dx) if boxes is None else boxes, swept, drift)
+        patch_pairs = np.concatenate([self._same_patch, near_pairs_by_tree(swept[0], swept[1], radius)])
+        path_bounds = self._bounds.update(x, dx, self._vertices[: self._n_own])
+        patch_pairs, row, known = self._bounds.select(patch_pairs, path_bounds, *radii)
+        if not len(patch_pairs):
             return np.empty((0, 7), dtype=np.int64)
-        if np.count_nonzero(row >= 0) > self._n:  # to look at gradients takes less time than at simplices
-            known = np.maximum(known, self.kept(x, way, met, reaches[1])[:, None])
-            self._margins.learn(row, known)
-        some = (known < reaches).any(axis=1)
-        met, row, known = met[some], row[some], known[some]
-        if not len(met):
+        if np.count_nonzero(row >= 0) > self._n:  # then gradients take less time than simplices
+            known = np.maximum(known, self.bending_bounds(x, dx, patch_pairs, radii[1])[:, None])
+            self._bounds.raise_to(row, known)
+        close = (known < radii).any(axis=1)
+        patch_pairs, row, known = patch_pairs[close], row[close], known[close]
+        if not len(patch_pairs):
             return np.empty((0, 7), dtype=np.int64)
-        more = np.where(row >= 0, SPARE * reach, 0.0)
-        asked = np.zeros((2, n), dtype=np.bool_)
+        extra = np.where(row >= 0, EXTRA_RADIUS * radius, 0.0)
+        needed = np.zeros((2, n), dtype=np.bool_)
         for column in (0, 1):
-            asked[column, met[known[:, column] < reaches[column]]] = True
-        given = []
-        for of, column in ((self.vertices, 0), (self.edges, 1), (self.triangles, 0)):
-            around, whole = np.empty((7, len(of.corners))), np.empty((n, 7))
-            _around(x, way, of.corners, of.first, asked[column], goes, around, whole)
-            given.append((of.corners, of.first, around, whole))
+            needed[column, patch_pairs[known[:, column] < radii[column]]] = True
+        simplices = []
+        for group, column in ((self.vertices, 0), (self.edges, 1), (self.triangles, 0)):
+            boxes_of, patch_boxes = np.empty((7, len(group.corners))), np.empty((n, 7))
+            _simplex_boxes(x, dx, group.corners, group.first, needed[column], drift, boxes_of, patch_boxes)
+            simplices.append((group.corners, group.first, boxes_of, patch_boxes))
         while True:
-            out, apart = np.empty((self._room, 7), dtype=np.int64), known.copy()
-            between = met, known, more, apart, goes
-            several = 3 * patches.SIZE, self._rings, most
-            found = _pairs(x, way, *between, *given, numbers, *reaches, *several, out)
-            if found > most:
+            out, new_bounds = np.empty((self._capacity, 7), dtype=np.int64), known.copy()
+            between = patch_pairs, known, extra, new_bounds, drift
+            constants = 3 * patches.MAX_TRIANGLES, self._rings, limit
+            n_found = _find_pairs(x, dx, *between, *simplices, numbers, *radii, *constants, out)
+            if n_found > limit:
                 return None
-            if found <= self._room:
-                self._margins.learn(row, apart)
-                return out[:found]
-            self._room = found + found // 4
+            if n_found <= self._capacity:
+                self._bounds.raise_to(row, new_bounds)
+                return out[:n_found]
+            self._capacity = n_found + n_found // 4
 
-    def kept(self, x: Array, way: Array, met: Ints, least: float) -> Array:
-        """Distances (n,) [m] that simplices of pairs of patches met (n, 2) surely keep, without those that
-        have a vertex in common: 0 where it may be less than ``least`` [m].
+    def bending_bounds(self, x: Array, dx: Array, patch_pairs: Ints, radius: float) -> Array:
+        """Lower bounds (n,) [m] of the distances of simplices without a common vertex in pairs of patches (n,
+        2), by the deformation gradients; 0 if the bound is below ``radius`` [m].
         """
-        flat, n, out = self._flat, self._n, np.empty(len(met))
-        found: tuple[Array, Array, Array] = np.empty((n, 6)), np.empty(n), np.empty(n)
-        place, needs = np.empty(len(met), dtype=np.int64), np.zeros(n, dtype=np.bool_)
-        patches.needed(met, flat.pairs, flat.around, flat.reached, place, needs)
-        patches.gradients(x, way, self._given, flat.order, flat.first, flat.inverse, needs, *found)
-        flats = flat.around, flat.height, flat.reached
-        patches.distances_kept(place, least, *flats, np.ascontiguousarray(met[:, 0]), *found, out)
+        flat, n, out = self._flat, self._n, np.empty(len(patch_pairs))
+        gradients: tuple[Array, Array, Array] = np.empty((n, 6)), np.empty(n), np.empty(n)
+        rows, needed = np.empty(len(patch_pairs), dtype=np.int64), np.zeros(n, dtype=np.bool_)
+        patches.mark_needed(patch_pairs, flat.pairs, flat.around, flat.reached, rows, needed)
+        triangles = self._triangles, flat.order, flat.first, flat.inverse
+        patches.deformation_gradients(x, dx, *triangles, needed, *gradients)
+        first = np.ascontiguousarray(patch_pairs[:, 0])
+        regions = flat.around, flat.height, flat.reached
+        patches.distance_bounds(rows, radius, *regions, first, *gradients, out)
         return out
 
 
 @kernel()
-def _boxes(x, way, vertices, first, out):  # type: ignore[no-untyped-def]
+def _boxes(x, dx, vertices, first, out):  # type: ignore[no-untyped-def]
     for p in range(len(first) - 1):
         for k in range(3):
-            low = low_then = np.inf
-            high = high_then = -np.inf
+            low = low_end = np.inf
+            high = high_end = -np.inf
             for at in range(first[p], first[p + 1]):
-                here = x[vertices[at], k]
-                to = here + way[vertices[at], k]
-                low, high = min(low, here), max(high, here)
-                low_then, high_then = min(low_then, to), max(high_then, to)
-            out[0, p, k], out[1, p, k], out[2, p, k], out[3, p, k] = low, high, low_then, high_then
+                start = x[vertices[at], k]
+                end = start + dx[vertices[at], k]
+                low, high = min(low, start), max(high, start)
+                low_end, high_end = min(low_end, end), max(high_end, end)
+            out[0, p, k], out[1, p, k], out[2, p, k], out[3, p, k] = low, high, low_end, high_end
 
 
 @kernel()
-def _sweep(boxes, swept, goes):  # type: ignore[no-untyped-def]
-    """Boxes around patches all along their ways but for what all of them go together, which brings none
-    nearer, from `SheetSearch.boxes`: low and high corners into swept (2, P, 3) [m]; how far the middles of
-    their boxes go into goes (P, 3) [m].
+def _swept_boxes(boxes, swept, drift):  # type: ignore[no-untyped-def]
+    """Boxes around patches on their displacements relative to the mean of all patches, which brings none
+    nearer.
+
+    From boxes as of `SheetSearch.boxes`: low and high corners to swept (2, P, 3) [m], and the mean
+    displacements of the centres of the boxes to drift (P, 3) [m].
     """
-    low, high, low_then, high_then = boxes
+    low, high, low_end, high_end = boxes
     for k in range(3):
-        drift = 0.0
-        for p in range(len(goes)):
-            goes[p, k] = 0.5 * (low_then[p, k] + high_then[p, k] - low[p, k] - high[p, k])
-            drift += goes[p, k] / len(goes)
-        for p in range(len(goes)):
-            swept[0, p, k] = min(low[p, k], low_then[p, k] - drift)
-            swept[1, p, k] = max(high[p, k], high_then[p, k] - drift)
+        mean = 0.0
+        for p in range(len(drift)):
+            drift[p, k] = 0.5 * (low_end[p, k] + high_end[p, k] - low[p, k] - high[p, k])
+            mean += drift[p, k] / len(drift)
+        for p in range(len(drift)):
+            swept[0, p, k] = min(low[p, k], low_end[p, k] - mean)
+            swept[1, p, k] = max(high[p, k], high_end[p, k] - mean)
 
 
 @kernel()
-def _around(x, way, corners, first, asked, goes, out, whole):  # type: ignore[no-untyped-def]
-    """Low and high corners [m] of simplices, and how far [m] they go at most beside their patch (P, 3),
-    into out (7, n); the same of all of a patch into whole (P, 7). Of patches asked for (P,).
+def _simplex_boxes(x, dx, corners, first, needed, drift, out, patch_box):  # type: ignore[no-untyped-def]
+    """Low and high corners [m] of simplices and their largest displacement [m] relative to the drift of the
+    patch, to out (7, n); the same for whole patches to patch_box (P, 7). For patches that are needed (P,).
     """
-    for p in np.flatnonzero(asked):
-        whole[p, :3], whole[p, 3:6], whole[p, 6] = np.inf, -np.inf, 0.0
+    for p in np.flatnonzero(needed):
+        patch_box[p, :3], patch_box[p, 3:6], patch_box[p, 6] = np.inf, -np.inf, 0.0
         for at in range(first[p], first[p + 1]):
-            farthest = 0.0
+            largest = 0.0
             for k in range(3):
                 out[k, at], out[3 + k, at] = np.inf, -np.inf
             for i in corners[at]:
                 square = 0.0
                 for k in range(3):
                     out[k, at], out[3 + k, at] = min(out[k, at], x[i, k]), max(out[3 + k, at], x[i, k])
-                    square += (way[i, k] - goes[p, k]) ** 2
-                farthest = max(farthest, square)
-            out[6, at] = math.sqrt(farthest)
+                    square += (dx[i, k] - drift[p, k]) ** 2
+                largest = max(largest, square)
+            out[6, at] = math.sqrt(largest)
             for k in range(3):
-                whole[p, k] = min(whole[p, k], out[k, at])
-                whole[p, 3 + k] = max(whole[p, 3 + k], out[3 + k, at])
-            whole[p, 6] = max(whole[p, 6], out[6, at])
+                patch_box[p, k] = min(patch_box[p, k], out[k, at])
+                patch_box[p, 3 + k] = max(patch_box[p, 3 + k], out[3 + k, at])
+            patch_box[p, 6] = max(patch_box[p, 6], out[6, at])
 
 
 @kernel(inline="always")
-def _outside(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
-    """How far two intervals are from each other."""
-    one, other = other_low - high, low - other_high
-    apart = one if one > other else other
-    return apart if apart > 0.0 else 0.0
+def _interval_distance(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
+    """Distance of two intervals; 0 if they overlap."""
+    above, below = other_low - high, low - other_high
+    distance = above if above > below else below
+    return distance if distance > 0.0 else 0.0
 
 
 @leaf()
-def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def]
-    """What is left of reach² of boxes lo to hi of others (7, m) around one of around (7, n), into out."""
-    x0, y0, z0 = around[0, a], around[1, a], around[2, a]
-    x1, y1, z1 = around[3, a], around[4, a], around[5, a]
-    x2, y2, z2, x3, y3, z3, way = others[0], others[1], others[2], others[3], others[4], others[5], others[6]
+def _box_margins(boxes, a, others, lo, hi, radius, out):  # type: ignore[no-untyped-def]
+    """Radius² less the squared distance of box ``a`` of boxes (7, n) from boxes lo to hi of others (7, m), to
+    out.
+    """
+    x0, y0, z0 = boxes[0, a], boxes[1, a], boxes[2, a]
+    x1, y1, z1 = boxes[3, a], boxes[4, a], boxes[5, a]
+    x2, y2, z2, x3, y3, z3 = others[0], others[1], others[2], others[3], others[4], others[5]
+    motion = others[6]
     for n in range(hi - lo):
         b = Index(lo + n)
-        x, y = _outside(x0, x1, x2[b], x3[b]), _outside(y0, y1, y2[b], y3[b])
-        z, within = _outside(z0, z1, z2[b], z3[b]), reach + way[b]
-        out[Index(n)] = within * within - x * x - y * y - z * z
+        x, y = _interval_distance(x0, x1, x2[b], x3[b]), _interval_distance(y0, y1, y2[b], y3[b])
+        z, limit = _interval_distance(z0, z1, z2[b], z3[b]), radius + motion[b]
+        out[Index(n)] = limit * limit - x * x - y * y - z * z
 
 
 @kernel()
-def _pairs(  # type: ignore[no-untyped-def]
-    x, way, met, known, more, apart, goes,
-    vertices, edges, triangles, numbers, reach, edges_reach, size_of_patch, rings, most, out,
+def _find_pairs(  # type: ignore[no-untyped-def]
+    x, dx, patch_pairs, known, extra, new_bounds, drift,
+    vertices, edges, triangles, numbers, radius, edge_radius, size_of_patch, rings, limit, out,
 ):  # fmt: skip
-    """Rows of the near simplices of pairs of patches, as many as fit; how many there are, or more than
-    ``most``.
+    """Write rows of near simplices of pairs of patches, as many as fit; returns their number, or more than
+    ``limit``.
 
-    No patch has more than ``size_of_patch`` vertices, edges or triangles. Vertices and triangles, and edges,
-    of a pair of patches that are ``known`` (n, 2) [m] to be apart are looked at where that is less than their
-    reach; ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``goes``
-    is that of `_sweep`, and of vertices, edges and triangles there is what `_around` gives.
+    No patch has more than ``size_of_patch`` vertices, edges or triangles. For each pair of patches, vertices
+    and triangles, and edges, are compared if the ``known`` bound (n, 2) [m] is below their radius.
+    ``new_bounds`` (n, 2) [m] then gets the bound that was found, at most radius + ``extra`` (n,) [m].
+    ``drift`` is from `_swept_boxes`, the boxes of vertices, edges and triangles are from `_simplex_boxes`.
     """
     found = 0
-    left, p, w = np.empty(size_of_patch), np.empty((4, 3)), np.empty((4, 3))
+    margin, p, w = np.empty(size_of_patch), np.empty((4, 3)), np.empty((4, 3))
     points, hits = np.empty(4, np.int64), np.empty(size_of_patch, np.int64)
-    for n in range(len(met)):
-        if found > most:
+    for n in range(len(patch_pairs)):
+        if found > limit:
             break
         for part in range(3):
-            i, j = met[n]
+            i, j = patch_pairs[n]
             if part == 1:
                 i, j = j, i
                 if i == j:
                     continue
             kind, size = (EDGE_EDGE, 2) if part == 2 else (VERTEX_TRIANGLE, 1)
-            within, column = (edges_reach, 1) if part == 2 else (reach, 0)
-            if known[n, column] >= within:
+            limit_radius, column = (edge_radius, 1) if part == 2 else (radius, 0)
+            if known[n, column] >= limit_radius:
                 continue
-            ample = within + more[n]
+            wide_radius = limit_radius + extra[n]
             if part != 1:
-                apart[n, column] = ample
-            mine, first, around, _ = edges if part == 2 else vertices
-            theirs, begin, others, whole = edges if part == 2 else triangles
+                new_bounds[n, column] = wide_radius
+            own, own_first, own_boxes, _ = edges if part == 2 else vertices
+            other, other_first, other_boxes, patch_boxes = edges if part == 2 else triangles
             square = 0.0
             for k in range(3):
-                square += (goes[i, k] - goes[j, k]) ** 2
-            together = ample + math.sqrt(square)
-            for a in range(first[i], first[i + 1]):
-                start = a + 1 if part == 2 and i == j else begin[j]
-                end = begin[j + 1]
+                square += (drift[i, k] - drift[j, k]) ** 2
+            wide_reach = wide_radius + math.sqrt(square)
+            for a in range(own_first[i], own_first[i + 1]):
+                start = a + 1 if part == 2 and i == j else other_first[j]
+                end = other_first[j + 1]
                 if start == end:
                     continue
-                nearer = together + around[6, a]
-                far = (nearer + whole[j, 6]) ** 2
+                reach = wide_reach + own_boxes[6, a]
+                rest = (reach + patch_boxes[j, 6]) ** 2
                 for k in range(3):
-                    far -= _outside(around[k, a], around[3 + k, a], whole[j, k], whole[j, 3 + k]) ** 2
-                if far < 0.0:
+                    low, high = own_boxes[k, a], own_boxes[3 + k, a]
+                    rest -= _interval_distance(low, high, patch_boxes[j, k], patch_boxes[j, 3 + k]) ** 2
+                if rest < 0.0:
                     continue
-                _near(around, a, others, start, end, nearer, left)
-                close = 0
-                for b in range(end - start):  # written so that no branch is guessed
-                    hits[close] = start + b
-                    close += 0 if left[b] < 0.0 else 1
-                for b in hits[:close]:
-                    common = False
+                _box_margins(own_boxes, a, other_boxes, start, end, reach, margin)
+                n_hits = 0
+                for b in range(end - start):  # without a branch that is hard to predict
+                    hits[n_hits] = start + b
+                    n_hits += 0 if margin[b] < 0.0 else 1
+                for b in hits[:n_hits]:
+                    shared = False
                     for k in range(size):
-                        points[k] = mine[a, k]
+                        points[k] = own[a, k]
                     for k in range(4 - size):
-                        points[size + k] = theirs[b, k]
+                        points[size + k] = other[b, k]
                         for m in range(size):
-                            common |= points[m] == points[size + k]
-                    if common:
+                            shared |= points[m] == points[size + k]
+                    if shared:
                         continue
                     for m in range(4):
                         for k in range(3):
-                            w[m, k] = way[points[m], k]
-                    nearer_by = approach_bound(kind, w)
-                    longest = ample + nearer_by
-                    if (nearer + others[6, b]) ** 2 - left[b - start] >= longest * longest:
+                            w[m, k] = dx[points[m], k]
+                    approach = approach_bound(kind, w)
+                    longest = wide_radius + approach
+                    if (reach + other_boxes[6, b]) ** 2 - margin[b - start] >= longest * longest:
                         continue
                     for m in range(4):
                         for k in range(3):
                             p[m, k] = x[points[m], k]
-                    left_over = distance(kind, p) - nearer_by
-                    if not left_over >= apart[n, column]:
-                        apart[n, column] = left_over
-                    if left_over >= within:
+                    bound = distance(kind, p) - approach
+                    if not bound >= new_bounds[n, column]:
+                        new_bounds[n, column] = bound
+                    if bound >= limit_radius:
                         continue
                     if found < len(out):
-                        turned = part == 2 and numbers[points[0]] > numbers[points[2]]
+                        swapped = part == 2 and numbers[points[0]] > numbers[points[2]]
                         out[found, 0], out[found, 1] = kind, -1
                         out[found, 6] = 0 if part == 2 else rings[b]
                         for m in range(4):
-                            out[found, 2 + m] = points[(m + 2) % 4 if turned else m]
+                            out[found, 2 + m] = points[(m + 2) % 4 if swapped else m]
                     found += 1
     return found

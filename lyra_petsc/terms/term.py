@@ -340,15 +340,13 @@ class Elastic(Term):
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
-    def neighbours(
-        self, x: Array, displacement: Array, numbers: Ints, triangles: Ints
-    ) -> tuple[Ints, Ints] | None:
+    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``,
         and whole numbers (E, m) of each, which ``take`` gets as data ``what``.
 
         ``numbers`` (N,) are the points' global numbers, ``triangles`` (F, 3 + m) near triangles of
         ``surface`` with their marks. A term with an ``approach_limit`` also returns elements whose points
-        come so near anywhere along straight displacements (N, 3) [m]; None if these are so long that there
+        come so near anywhere along straight displacements dx (N, 3) [m]; None if these are so long that there
         are too many: it is asked again with shorter ones. Ranks that see the same points must return them in
         the same order within an element; the owner of the first counts the element.
         """
@@ -364,13 +362,13 @@ class Elastic(Term):
         """Which elements (E,) have a non-zero Hessian at positions x (n_local, 3)."""
         return np.ones(self.n_elements, dtype=np.bool_)
 
-    def largest_step(self, x: Array, increment: Array, frozen: Any) -> float:
-        """Largest fraction, up to 1, of Newton's increment (n_local, 3) [m] of x that may be applied."""
+    def largest_step(self, x: Array, dx: Array, frozen: Any) -> float:
+        """Largest fraction, up to 1, of Newton's increment dx (n_local, 3) [m] of x that may be applied."""
         return 1.0
 
-    def springs(self, x: Array, increment: Array, frozen: Any) -> Springs | None:
-        """One-sided springs for the pairs that are in contact at x, or may be after an increment (n_local, 3)
-        [m]. Their elements count as active until `release_springs`. None: the term has no such springs.
+    def springs(self, x: Array, dx: Array, frozen: Any) -> Springs | None:
+        """One-sided springs for the pairs that are in contact at x, or may be after an increment dx (n_local,
+        3) [m]. Their elements count as active until `release_springs`. None: the term has no such springs.
         """
         return None
 
@@ -379,23 +377,23 @@ class Elastic(Term):
         expects.
         """
 
-    def target_distances(self, x: Array, increment: Array, frozen: Any) -> Any:
-        """Distances of pairs that `add_corrections` restores after Newton's increment (n_local, 3) [m]."""
+    def target_distances(self, x: Array, dx: Array, frozen: Any) -> Any:
+        """Distances of pairs that `add_corrections` restores after Newton's increment dx (n_local, 3)."""
         return None
 
     def add_corrections(
-        self, x: Array, increment: Array, frozen: Any, targets: Any, out: Array, weight: Array
+        self, x: Array, dx: Array, frozen: Any, targets: Any, out: Array, weight: Array
     ) -> bool:
-        """Whether points are nearer after the increment (n_local, 3) [m] of x than their target distances.
+        """Whether points are nearer after the increment dx (n_local, 3) [m] of x than their target distances.
 
         Adds corrections of the increment to ``out`` (n_local, 3) [m], each times a weight, and the weights to
         ``weight`` (n_local, 1).
         """
         return False
 
-    def is_collision_free(self, x: Array, displacement: Array, frozen: Any, interval: StepInterval) -> bool:
-        """Whether nothing collides on the displacement (n_local, 3) [m] from x, while obstacles move as in an
-        interval of the step.
+    def is_collision_free(self, x: Array, dx: Array, frozen: Any, interval: StepInterval) -> bool:
+        """Whether nothing collides on the displacement dx (n_local, 3) [m] from x, while obstacles move as in
+        an interval of the step.
         """
         return True
 
@@ -406,18 +404,16 @@ class Elastic(Term):
         """
         return np.empty(0)
 
-    def collision_free_fractions(
-        self, x: Array, displacement: Array, frozen: Any, interval: StepInterval
-    ) -> Array:
-        """Fraction, up to 1, of the displacement (n_local, 3) [m] from x on which the pair of each owned
+    def collision_free_fractions(self, x: Array, dx: Array, frozen: Any, interval: StepInterval) -> Array:
+        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which the pair of each owned
         element does not collide, (n_owned,), while obstacles move as in an interval of the step.
 
         Empty for a term that keeps nothing apart.
         """
         return np.empty(0)
 
-    def may_collide(self, x: Array, displacement: Array, frozen: Any, threshold: float) -> bool:
-        """Whether any pair of this rank may come into contact in a step with this displacement (n_local, 3)
+    def may_collide(self, x: Array, dx: Array, frozen: Any, threshold: float) -> bool:
+        """Whether any pair of this rank may come into contact in a step with displacement dx (n_local, 3)
         [m] from x; only pairs that approach by more than ``threshold`` [m] count.
         """
         return False
@@ -468,11 +464,11 @@ class Elastic(Term):
         points, beta, normal, force, vertex = Elastic.contact_points(self, x, frozen)
         return Dashpots(points, beta, normal, force, vertex, vertex, force)
 
-    def moved_with_obstacles(self, x: Array, displacement: Array, frozen: Any) -> Array:
-        """Displacements (n_local, 3) [m] from x, changed to those of moving obstacles for vertices in their
-        path.
+    def moved_with_obstacles(self, x: Array, dx: Array, frozen: Any) -> Array:
+        """Displacements dx (n_local, 3) [m] from x, for vertices in the path of moving obstacles changed to
+        those of the obstacles.
         """
-        return displacement
+        return dx
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""

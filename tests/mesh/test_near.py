@@ -1,4 +1,4 @@
-"""Overlapping boxes against a comparison of all with all."""
+"""Pairs of near boxes against a comparison of all with all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.mesh.near import near, near_in_order, swept_boxes
+from lyra_petsc.mesh.near import near_pairs, near_pairs_by_tree, swept_boxes
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,
@@ -40,22 +40,22 @@ def test_against_brute_force(n: int, size: str) -> None:
     rng = np.random.default_rng(n)
     low, high = boxes(rng, n, SIZES[size])
     others = boxes(rng, n + 7, SIZES[size])
-    assert as_set(near((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
+    assert as_set(near_pairs((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
     mutual = np.argwhere(np.triu(brute(low, high, low, high), 1))
-    assert as_set(near((low, high))) == as_set(mutual)
-    assert as_set(near_in_order(low, high, 0.0)) == as_set(mutual)
-    reach = 0.1
-    assert as_set(near_in_order(low, high, reach)) == as_set(near((low, high), reach=reach))
+    assert as_set(near_pairs((low, high))) == as_set(mutual)
+    assert as_set(near_pairs_by_tree(low, high, 0.0)) == as_set(mutual)
+    radius = 0.1
+    assert as_set(near_pairs_by_tree(low, high, radius)) == as_set(near_pairs((low, high), radius=radius))
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
 def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
-    """Cells are then thinner than any distance by more than whole numbers can tell."""
+    """Cells are then so thin that their numbers exceed the range of integers."""
     rng = np.random.default_rng(5)
     low = rng.random((400, 3)) * [1.0, 1.0, thickness]
     high = low + rng.random((400, 3)) * [0.05, 0.05, 0.0]
     mine = rng.random((60, 3)) * [1.0, 1.0, 0.2]
-    found = near((mine - 0.1, mine + 0.1), (low, high))
+    found = near_pairs((mine - 0.1, mine + 0.1), (low, high))
     assert as_set(found) == as_set(np.argwhere(brute(mine - 0.1, mine + 0.1, low, high)))
     assert len(found) > 60
 
@@ -63,43 +63,43 @@ def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
 def test_one_box_among_many_is_far_away() -> None:
     low = np.vstack([np.random.default_rng(2).random((500, 3)), [[1e6, -1e6, 1e6]]])
     high = low + 0.05
-    assert as_set(near((low, high))) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
+    assert as_set(near_pairs((low, high))) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
 
 
 def test_what_touches_overlaps() -> None:
     low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
-    assert near((low, high)).tolist() == [[0, 1]]
+    assert near_pairs((low, high)).tolist() == [[0, 1]]
 
 
-def test_more_pairs_than_there_is_room_for_at_first() -> None:
+def test_more_pairs_than_the_first_capacity() -> None:
     low = np.zeros((200, 3))
-    assert len(near((low, low + 1.0))) == 200 * 199 // 2
+    assert len(near_pairs((low, low + 1.0))) == 200 * 199 // 2
 
 
 @pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
 def test_none(n: tuple[int, int]) -> None:
     mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
-    assert near((mine, mine), (others, others)).shape == (0, 2)
+    assert near_pairs((mine, mine), (others, others)).shape == (0, 2)
 
 
-@pytest.mark.parametrize("reach", [0.0, 0.05, 0.4])
-def test_boxes_within_reach(reach: float) -> None:
+@pytest.mark.parametrize("radius", [0.0, 0.05, 0.4])
+def test_boxes_within_reach(radius: float) -> None:
     rng = np.random.default_rng(3)
     low, high = boxes(rng, 80, 1.0)
     other_low, other_high = boxes(rng, 90, 0.8)
-    way = np.maximum(np.maximum(other_low - high[:, None], low[:, None] - other_high), 0.0)
-    close = np.linalg.norm(way, axis=2) <= reach
-    found = near((low, high), (other_low, other_high), reach=reach)
+    gaps = np.maximum(np.maximum(other_low - high[:, None], low[:, None] - other_high), 0.0)
+    close = np.linalg.norm(gaps, axis=2) <= radius
+    found = near_pairs((low, high), (other_low, other_high), radius=radius)
     assert as_set(found) == as_set(np.argwhere(close))
-    way = np.maximum(low[:, None] - high, 0.0)
-    close = np.linalg.norm(np.maximum(way, way.transpose(1, 0, 2)), axis=2) <= reach
-    assert as_set(near((low, high), reach=reach)) == as_set(np.argwhere(np.triu(close, 1)))
+    dx = np.maximum(low[:, None] - high, 0.0)
+    close = np.linalg.norm(np.maximum(dx, dx.transpose(1, 0, 2)), axis=2) <= radius
+    assert as_set(near_pairs((low, high), radius=radius)) == as_set(np.argwhere(np.triu(close, 1)))
 
 
-def test_boxes_of_what_simplices_pass() -> None:
+def test_swept_boxes_of_simplices() -> None:
     rng = np.random.default_rng(4)
-    x, way, simplices = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.integers(0, 9, (5, 3))
-    low, high = swept_boxes(x, way, simplices)
-    both = np.concatenate([x[simplices], (x + way)[simplices]], axis=1)
+    x, dx, simplices = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.integers(0, 9, (5, 3))
+    low, high = swept_boxes(x, dx, simplices)
+    both = np.concatenate([x[simplices], (x + dx)[simplices]], axis=1)
     np.testing.assert_array_equal(low, both.min(axis=1))
     np.testing.assert_array_equal(high, both.max(axis=1))

@@ -1,4 +1,4 @@
-"""Obstacles: their shapes, where motions carry them, and that all ranks have the same."""
+"""Obstacles: their shapes, their motions, and that they are the same on all ranks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_scene_mesh
-from lyra_petsc.mesh.obstacles import Container, Solid, obstacles_of
+from lyra_petsc.mesh.obstacles import Container, Solid, build_scene_obstacles
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import scene_of
 from lyra_petsc.scene.schema import Scene
@@ -68,7 +68,7 @@ def scene(obstacle: dict[str, Any], **more: Any) -> Scene:
 def built(comm: MPI.Comm, obstacle: dict[str, Any], **more: Any) -> Solid | Container:
     whole = scene(obstacle, **more)
     mesh = on_root(comm, lambda: build_scene_mesh(whole), share=False)
-    (one,) = obstacles_of(comm, whole, mesh, Motion)
+    (one,) = build_scene_obstacles(comm, whole, mesh, Motion)
     return one
 
 
@@ -220,8 +220,10 @@ def test_a_bad_mesh_is_refused_on_all_ranks(comm: MPI.Comm, shared_tmp: Path, te
 
 def test_many_obstacles_are_in_the_order_of_the_scene(comm: MPI.Comm) -> None:
     whole = scene(BOX, obstacles={"z": BOX, "a": PLANE, "m": SPHERE})
-    assert [each.name for each in obstacles_of(comm, whole, None, Motion)] == ["z", "a", "m"]
-    assert obstacles_of(comm, whole.changed({"obstacles": None, "contact": None}), None, Motion) == []
+    assert [each.name for each in build_scene_obstacles(comm, whole, None, Motion)] == ["z", "a", "m"]
+    assert (
+        build_scene_obstacles(comm, whole.changed({"obstacles": None, "contact": None}), None, Motion) == []
+    )
 
 
 def test_a_motion_that_cannot_be_is_refused(comm: MPI.Comm) -> None:

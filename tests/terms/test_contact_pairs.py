@@ -1,4 +1,4 @@
-"""Contact of single pairs: distances, derivatives and free ways, against sampling and differences."""
+"""Contact of single pairs: distances, derivatives and collisions, against sampling and differences."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Ints = NDArray[np.int64]
 
 GAP, STIFFNESS, KEPT = 3.0, 2.0, 0.2
 NOWHERE = 1e-9
-"""A ``parallel`` below which no edges of a test are."""
+"""A ``parallel`` so small that no edges are mollified."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of one kind, whose points are in ``x`` or, for obstacles, in ``obstacle_x``."""
+    """Pairs of one kind; their points are in ``x`` or, for obstacles, in ``obstacle_x``."""
 
     kind: Ints
     points: Ints
@@ -101,13 +101,15 @@ class Pairs:
 
 
 ACTIVE_COLUMNS = ["at", "weight", "beta", "derivatives"]
-"""What the kernels take of what `found_active` gives."""
+"""Results of `found_active` that the kernels need."""
 
 
 def blocks_of(
     x: Array, obstacle_x: Array, of: tuple[Any, ...], active: tuple[Any, ...], blend: float
 ) -> Array:
-    """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other one turned."""
+    """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other block is added
+    transposed.
+    """
     n, (one, other) = len(of[0]), np.triu_indices(4)
     number = np.arange(10 * n, dtype=np.int32).reshape(n, 10)
     turned = number % 2
@@ -121,7 +123,7 @@ def blocks_of(
 
 
 def found_active(*given: Any, counted: int, capacity: int | None = None) -> dict[str, NDArray[Any]]:
-    """What `contact_pairs.find_active` finds, by name, as remembered: it cannot be written to."""
+    """The results of `contact_pairs.find_active` by name, read-only as from `Remembered`."""
     n = len(given[2])
     capacity = n if capacity is None else capacity
     least, found = np.empty(n), {"at": np.empty(capacity, dtype=np.int64), "weight": np.empty(capacity)}
@@ -155,7 +157,7 @@ def nearly_parallel(n: int) -> Pairs:
 
 
 def planes(n: int) -> Pairs:
-    """Vertices before a plane, at most twice the gap."""
+    """Vertices in front of a plane, at most twice the gap away."""
     rng = np.random.default_rng(3)
     x, normals = rng.normal(size=(n, 3)), units(rng, n)
     across = np.cross(normals, units(rng, n))
@@ -191,7 +193,7 @@ KINDS: dict[str, tuple[Callable[[], Pairs], float]] = {
 
 
 def sampled_distance(kind: int, p: Array) -> float:
-    """Least distance of points of both, at a grid of places."""
+    """Smallest distance of points of both simplices on a grid."""
     s = np.linspace(0.0, 1.0, 61)
     if kind == VERTEX_TRIANGLE:
         u, v = (c[np.add.outer(s, s) <= 1.0 + 1e-12] for c in np.meshgrid(s, s))
@@ -212,7 +214,7 @@ def test_distances_of_simplices(kind: int) -> None:
 
 @pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
 def test_distances_of_simplices_without_extent(kind: int) -> None:
-    """An obstacle's vertex is a triangle, and its edge may be a point, of which all corners are one."""
+    """A vertex or edge of an obstacle may be stored as a triangle or edge with equal corners."""
     pairs = among_sheets(kind, 20)
     x = pairs.x.copy().reshape(-1, 4, 3)
     x[:10, 2] = x[:10, 3]
@@ -273,7 +275,7 @@ def test_derivatives(name: str) -> None:
     assert np.percentile(error[usable], 99) < 1e-4
 
 
-def test_edges_fade_alike_whatever_their_length() -> None:
+def test_mollifier_does_not_depend_on_lengths() -> None:
     pairs = nearly_parallel(100)
     p = pairs.x.reshape(-1, 4, 3).copy()
     p[:, 3] = p[:, 2] + 30.0 * (p[:, 3] - p[:, 2])
@@ -310,7 +312,7 @@ def test_forces_of_both_sides_balance(name: str) -> None:
     assert np.abs(out).sum() > 0.0
 
 
-def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> None:
+def test_barrier_is_smooth_at_the_gap_and_zero_beyond() -> None:
     pairs = planes(2)
     normal, foot = pairs.obstacle_x[1], pairs.obstacle_x[0]
     for beyond, energy, force in ((1e-3, 0.0, 0.0), (-1e-3, 1e-8, 1e-5)):
@@ -321,8 +323,8 @@ def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> Non
 
 
 def closest(pairs: Pairs, e: int, dx: Array, obstacle_dx: Array, end: float) -> tuple[float, float]:
-    """Least of what is left on the way to a fraction of it, over what is left at first or the gap if that is
-    less; that at the end.
+    """Smallest distance less offset up to a fraction of the displacements, over that at the start or the gap
+    if that is less; and the same ratio at this fraction.
     """
     left = [
         pairs.distances(pairs.x + t * dx, pairs.obstacle_x + t * obstacle_dx)[e] - pairs.offset[e]
@@ -334,7 +336,7 @@ def closest(pairs: Pairs, e: int, dx: Array, obstacle_dx: Array, end: float) -> 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0, 100.0])
 @pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
-def test_free_ways(name: str, speed: float) -> None:
+def test_free_fractions(name: str, speed: float) -> None:
     pairs = KINDS[name][0]()
     pairs = pairs.part(pairs.distances() > pairs.offset).part(slice(0, 120))
     rng = np.random.default_rng(11)
@@ -355,7 +357,7 @@ def test_free_ways(name: str, speed: float) -> None:
     assert pairs.free_fraction(dx, obstacle_dx, most=0.5 * min(found)) == 0.5 * min(found)
 
 
-def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
+def test_target_distances_have_the_expected_force() -> None:
     pairs = KINDS["vertex and triangle"][0]()
     n, gap, force = len(pairs), np.full(len(pairs), GAP), 3.0 * GAP
     target, before, loaded = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
@@ -373,7 +375,7 @@ def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
     )
 
 
-def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
+def test_springs_have_the_force_of_the_barrier_and_its_tangent_below() -> None:
     least = 0.5 * GAP
     delta = GAP * np.linspace(-2.0, 1.2, 65)
     gap, below = np.full(len(delta), GAP), np.full(len(delta), least)
@@ -399,7 +401,7 @@ def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
-def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: str) -> None:
+def test_corrections_lead_to_the_force_of_the_linear_model(name: str) -> None:
     pairs = KINDS[name][0]()
     n, gap, most = len(pairs), np.full(len(pairs), GAP), 0.7
     dx = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
@@ -453,7 +455,7 @@ def test_a_common_motion_of_both_is_free() -> None:
         assert pairs.free_fraction(dx, obstacle_dx) == 1.0
 
 
-def test_long_ways_past_each_other_are_judged_at_once() -> None:
+def test_long_displacements_past_each_other_take_no_time() -> None:
     pairs = among_sheets(VERTEX_TRIANGLE, 50)
     pairs = pairs.part(pairs.distances() > pairs.offset)
     dx = np.zeros_like(pairs.x)
@@ -462,7 +464,7 @@ def test_long_ways_past_each_other_are_judged_at_once() -> None:
 
 
 def test_planes_that_turn() -> None:
-    """The normal at a fraction of the way is that of straight ways of both its ends."""
+    """The normal at a fraction of the displacement is interpolated linearly."""
     pairs = planes(200)
     rng = np.random.default_rng(12)
     obstacle_dx = np.zeros_like(pairs.obstacle_x)
@@ -480,7 +482,7 @@ def test_planes_that_turn() -> None:
 
 
 def two_layers(noise: float) -> Pairs:
-    """All pairs of two squares of 3 × 3 vertices, the vertices of one above those of the other."""
+    """All pairs of two squares of 3 × 3 vertices, those of one above those of the other."""
     rng = np.random.default_rng(5)
     flat = np.array([(i, j, 0.0) for j in range(3) for i in range(3)])
     x = np.concatenate([flat, flat + [0.0, 0.0, 0.5]]) + noise * rng.normal(size=(18, 3))
@@ -497,7 +499,9 @@ def two_layers(noise: float) -> Pairs:
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 0.05])
 @pytest.mark.parametrize("parallel", [NOWHERE, 1e-3, 0.3])
-def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel: float) -> None:
+def test_pairs_with_the_same_nearest_vertices_are_counted_once_with_a_weight(
+    noise: float, parallel: float
+) -> None:
     pairs, gap = two_layers(noise), 0.8
     n = len(pairs)
 
@@ -526,7 +530,9 @@ def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel
 
 
 def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
-    """Points of 4 × 4 cells and, after them, of five vertices before them; triangles and shares."""
+    """Points of 4 × 4 cells, followed by five vertices in front of them; pairs of these and triangles, and
+    shares.
+    """
     rng = np.random.default_rng(5)
     n = 5
     flat = np.array([(i, j, 0.0) for j in range(n) for i in range(n)])
@@ -541,7 +547,7 @@ def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
 
 
 def active_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray[Any]], Array, Array]:
-    """What is active, its gradient, and its Hessian."""
+    """The active pairs, their gradient and their Hessian."""
     n, none = len(pairs), np.empty((0, 3))
     of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
     found = found_active(x, none, *of, shares, counted=n, capacity=999)
@@ -552,8 +558,8 @@ def active_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArr
     return found, out, hessian
 
 
-def test_a_vertex_feels_a_flat_surface_once() -> None:
-    """Also over an edge, and over a vertex."""
+def test_a_flat_surface_repels_a_vertex_once() -> None:
+    """Also above an edge or a vertex of the surface."""
     pairs, x, _, shares = before_a_surface(0.0)
     found, gradient, _ = active_before(x, pairs, shares)
     height = x[25:, 2]
@@ -565,7 +571,7 @@ def test_a_vertex_feels_a_flat_surface_once() -> None:
     np.testing.assert_allclose(gradient[25:, :2], 0.0, atol=1e-14)
 
 
-def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
+def test_force_in_front_of_a_bent_surface_is_smooth() -> None:
     pairs, x, _, shares = before_a_surface(0.04)
     rng = np.random.default_rng(3)
     found, gradient, hessian = active_before(x, pairs, shares)
@@ -592,8 +598,8 @@ def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
     assert np.abs(np.diff(along, 2)).max() < 0.1 * np.abs(np.diff(along)).max()
 
 
-def test_a_vertex_feels_an_obstacle_as_it_feels_a_sheet() -> None:
-    """Whose points have numbers below 0, so that edges are told apart in another way."""
+def test_an_obstacle_repels_a_vertex_as_a_sheet_does() -> None:
+    """Points of obstacles have negative numbers, which edges are identified by."""
     pairs, x, _, shares = before_a_surface(0.1)
     x[25:, :2], x[25:, 2] = [[2, 2], [2.01, 2.02], [1.98, 2], [1.99, 1.99], [3.01, 2.01]], 0.2
     found, _, _ = active_before(x, pairs, shares)
@@ -608,7 +614,7 @@ def test_a_vertex_feels_an_obstacle_as_it_feels_a_sheet() -> None:
     assert active["weight"] @ active["energy"] == pytest.approx(found["weight"] @ found["energy"], rel=1e-12)
 
 
-def test_negative_normal_forces_are_taken_off_those_of_the_same_side() -> None:
+def test_negative_normal_forces_are_subtracted_on_the_same_side() -> None:
     up, down = [0.0, 0.0, 1.0], [0.0, 0.1, -1.0]
     # two vertices; the first one is between two layers, and that below it is hollow
     normal = np.array([up, up, [0.1, 0.0, 1.0], down, down, up, down])

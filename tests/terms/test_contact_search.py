@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.mesh.near import near as patches_near
+from lyra_petsc.mesh.near import near_pairs as near_patches
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
 from lyra_petsc.terms.contact_search import SheetSearch
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-REACH = 0.4
+RADIUS = 0.4
 """Of an edge of the grid."""
 
 
@@ -77,8 +77,8 @@ def moved(name: str, corners: Array, triangles: Ints, rng: np.random.Generator) 
     return out + np.array([0.0, 0.0, 1e-3]) * np.arange(len(out))[:, None] / len(out)
 
 
-def brute(x: Array, way: Array, triangles: Ints) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
-    """All pairs without common vertices, and those that are within `REACH` somewhere on their ways."""
+def brute(x: Array, dx: Array, triangles: Ints) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
+    """All pairs without common vertices, and those that are within `RADIUS` anywhere on the displacements."""
     edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     v, t = (each.ravel() for each in np.indices((len(x), len(triangles))))
     rows = np.column_stack([v, triangles[t]])
@@ -90,10 +90,10 @@ def brute(x: Array, way: Array, triangles: Ints) -> tuple[set[tuple[int, ...]], 
     kind = np.repeat([VERTEX_TRIANGLE, EDGE_EDGE], [len(rows), len(across)])
     out, least = np.empty(len(points)), np.full(len(points), np.inf)
     for part in np.linspace(0.0, 1.0, 5):
-        distances(x + part * way, np.empty((0, 3)), kind, points, out)
+        distances(x + part * dx, np.empty((0, 3)), kind, points, out)
         least = np.minimum(least, out)
     named = [name(k, p) for k, p in zip(kind.tolist(), points.tolist(), strict=True)]
-    near = least < REACH
+    near = least < RADIUS
     return set(named), {row for row, found in zip(named, near, strict=True) if found}
 
 
@@ -111,10 +111,10 @@ def test_no_pair_that_comes_near_is_missed(which: str, how: str) -> None:
     triangles, corners = sheet(which)
     x = moved(how, corners, triangles, rng)
     search, numbers = SheetSearch(triangles, corners), np.arange(len(x))
-    for way in (np.zeros_like(x), np.array([3.0, 1.0, 2.0]) + 0.1 * rng.normal(size=x.shape)):
-        every, near = brute(x, way, triangles)
-        search.take(x, numbers, triangles)
-        rows = search.pairs(x, way, numbers, REACH)
+    for dx in (np.zeros_like(x), np.array([3.0, 1.0, 2.0]) + 0.1 * rng.normal(size=x.shape)):
+        every, near = brute(x, dx, triangles)
+        search.set_triangles(x, numbers, triangles)
+        rows = search.pairs(x, dx, numbers, RADIUS)
         found = [name(row[0], row[2:6]) for row in rows.tolist()]
         assert len(found) == len(set(found)), "pairs are named once"
         assert near <= set(found) <= every
@@ -122,7 +122,7 @@ def test_no_pair_that_comes_near_is_missed(which: str, how: str) -> None:
 
 
 def turned(x: Array, angle: float) -> Array:
-    """Positions (V, 3) turned about an axis askew."""
+    """Positions (V, 3) rotated about an oblique axis."""
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     across = np.cross(axis, x)
     out: Array = x + np.sin(angle) * across + (1.0 - np.cos(angle)) * np.cross(axis, across)
@@ -131,39 +131,39 @@ def turned(x: Array, angle: float) -> Array:
 
 @pytest.mark.parametrize("how", ["rolled", "folded"])
 @pytest.mark.parametrize("which", ["jittered", "slit"])
-def test_no_pair_is_missed_by_what_was_known_of_earlier_steps(which: str, how: str) -> None:
+def test_bounds_of_earlier_steps_hide_no_pair(which: str, how: str) -> None:
     rng = np.random.default_rng(5)
     triangles, corners = sheet(which)
     flat, bent = (moved(name, corners, triangles, rng) for name in ("flat", how))
     search, numbers, met = SheetSearch(triangles, corners), np.arange(len(flat)), []
-    search.take(flat, numbers, triangles)
+    search.set_triangles(flat, numbers, triangles)
     parts = [0.0, 0.02, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0, 0.7, 1.0]
     places = [turned((1.0 - part) * flat + part * bent, 0.2 * n) for n, part in enumerate(parts)]
     for x, there in itertools.pairwise(places):
-        way = there - x + 0.02 * rng.normal(size=x.shape)  # it will come otherwise
-        every, near = brute(x, way, triangles)
-        found = {name(row[0], row[2:6]) for row in search.pairs(x, way, numbers, REACH).tolist()}
+        dx = there - x + 0.02 * rng.normal(size=x.shape)  # not the displacement that follows
+        every, near = brute(x, dx, triangles)
+        found = {name(row[0], row[2:6]) for row in search.pairs(x, dx, numbers, RADIUS).tolist()}
         assert near <= found <= every
         met.append(len(near))
     assert max(met) > 0
 
 
-def test_what_a_bent_sheet_does_as_a_whole_takes_no_new_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rigid_motion_of_a_bent_sheet_takes_no_new_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
     triangles, corners = sheet("plain")
     along, y, _ = moved("flat", corners, triangles, np.random.default_rng(0)).T
     x = np.column_stack([3.0 * np.sin(along / 3.0), y, 3.0 * np.cos(along / 3.0)])
     search, compared = SheetSearch(triangles, corners), []
-    search.take(x, np.arange(len(x)), triangles)
-    among = search._margins.among
+    search.set_triangles(x, np.arange(len(x)), triangles)
+    among = search._bounds.select
 
     def noted(*given: Any) -> Any:
         compared.append(len((found := among(*given))[0]))
         return found
 
-    monkeypatch.setattr(search._margins, "among", noted)
+    monkeypatch.setattr(search._bounds, "select", noted)
     for step in range(4):
         here, there = (turned(x, 0.05 * at) + [0.0, 0.3 * at, 0.0] for at in (step, step + 1))
-        search.pairs(here, there - here, np.arange(len(x)), 0.5 * REACH)
+        search.pairs(here, there - here, np.arange(len(x)), 0.5 * RADIUS)
     assert compared[0] > 0
     assert compared[1:] == [0, 0, 0]
 
@@ -173,11 +173,11 @@ def test_triangles_of_other_ranks_are_compared_one_by_one() -> None:
     x = moved("folded", corners, triangles, np.random.default_rng(0))
     own = len(triangles) // 2
     search, numbers = SheetSearch(triangles[:own], corners[:own]), np.arange(len(x))
-    search.take(x, numbers, triangles)
-    rows = search.pairs(x, np.zeros_like(x), numbers, REACH)
+    search.set_triangles(x, numbers, triangles)
+    rows = search.pairs(x, np.zeros_like(x), numbers, RADIUS)
     _, near = brute(x, np.zeros_like(x), triangles)
     mine = set(triangles[:own].ravel())
-    touching = {pair for pair in near if mine & set(pair[1:])}  # what is between others they find themselves
+    touching = {pair for pair in near if mine & set(pair[1:])}  # other ranks find the rest
     assert touching
     assert touching <= {name(row[0], row[2:6]) for row in rows.tolist()}
 
@@ -185,8 +185,8 @@ def test_triangles_of_other_ranks_are_compared_one_by_one() -> None:
 def test_a_rank_without_triangles_finds_nothing() -> None:
     none = np.empty((0, 3), dtype=np.int64)
     search = SheetSearch(none, np.empty((0, 3, 2)))
-    search.take(np.zeros((4, 3)), np.arange(4), none)
-    assert len(search.pairs(np.zeros((4, 3)), np.ones((4, 3)), np.arange(4), REACH)) == 0
+    search.set_triangles(np.zeros((4, 3)), np.arange(4), none)
+    assert len(search.pairs(np.zeros((4, 3)), np.ones((4, 3)), np.arange(4), RADIUS)) == 0
 
 
 @pytest.mark.parametrize("which", ["plain", "jittered"])
@@ -194,21 +194,24 @@ def test_parts_of_a_sheet_that_hardly_bends_are_not_compared(which: str) -> None
     triangles, corners = sheet(which)
     x = moved("flat", corners, triangles, np.random.default_rng(0))
     search = SheetSearch(triangles, corners)
-    search.take(x, np.arange(len(x)), triangles)
+    search.set_triangles(x, np.arange(len(x)), triangles)
     n = len(search.triangles.first) - 1
     alone = np.repeat(np.arange(n)[:, None], 2, axis=1)
-    kept = search.kept(turned(x, 0.9), 0.02 * x, alone, 0.05)
+    kept = search.bending_bounds(turned(x, 0.9), 0.02 * x, alone, 0.05)
     assert (kept >= 0.1).all()
     crumpled = np.random.default_rng(1).normal(size=x.shape)
-    assert not search.kept(crumpled, 0.0 * x, alone, 0.05).any()
+    assert not search.bending_bounds(crumpled, 0.0 * x, alone, 0.05).any()
 
 
 def test_patches_beside_each_other_keep_their_distance_without_a_common_vertex() -> None:
     uv, triangles = grid(30, 20)
     search, x = SheetSearch(triangles, uv[triangles]), np.column_stack([uv, 0.0 * uv[:, 0]])
-    search.take(x, np.arange(len(x)), triangles)
+    search.set_triangles(x, np.arange(len(x)), triangles)
     low, high, *_ = search.boxes(x, 0.0 * x)
-    pairs = patches_near((low, high), reach=0.1)
-    patch = [set(search.triangles.of(np.array([n])).ravel()) for n in range(len(search.triangles.first) - 1)]
+    pairs = near_patches((low, high), radius=0.1)
+    patch = [
+        set(search.triangles.corners_of(np.array([n])).ravel())
+        for n in range(len(search.triangles.first) - 1)
+    ]
     assert any(not patch[i] & patch[j] for i, j in pairs)
-    assert (search.kept(x, 0.0 * x, pairs, 0.05) >= 0.1).all()
+    assert (search.bending_bounds(x, 0.0 * x, pairs, 0.05) >= 0.1).all()
