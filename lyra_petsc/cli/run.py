@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.kernels.compilation import COMPILATION, nothing
+from lyra_petsc.kernels.compilation import COMPILATION, no_action
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
@@ -114,7 +114,7 @@ class TerminalProgress(ProgressCallbacks):
     def _announce_compilation(self) -> None:
         """Tell the user that kernels are being compiled, above the bar once there is one."""
         text = "compiling kernels, once, about 15 s"
-        if not COMPILATION.kept:
+        if not COMPILATION.all_cached:
             self._noted_cache = True
             text = f"compiling kernels, about 15 s in every run: {NO_CACHE}"
         if self._progress is not None:
@@ -149,7 +149,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def close(self) -> None:
         """Leave the terminal as it was, and tell the page that the run has ended."""
-        COMPILATION.first = nothing
+        COMPILATION.first = no_action
         if self._page is not None:
             self._page.end()
         if self._progress is not None:
@@ -162,7 +162,7 @@ class TerminalProgress(ProgressCallbacks):
         if not simulation.at_end:
             now = f"step {simulation.step_number}, t = {simulation.time:g} of {simulation.control.end:g} s"
             outcome = f"stopped at {now}, by -ts_max_steps; --resume goes on"
-        if not COMPILATION.kept and not self._noted_cache:
+        if not COMPILATION.all_cached and not self._noted_cache:
             self._say(f"note: the next run compiles kernels anew: {NO_CACHE}")
         closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._page is not None:

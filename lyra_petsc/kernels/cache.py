@@ -1,7 +1,7 @@
-"""Functions compiled by numba and kept on disk, safe with many ranks and with a disk that fails.
+"""Functions compiled by numba and cached on disk, safe with many ranks and with a disk that fails.
 
-Numba keeps what it compiled beside the source, in the user's cache where that cannot be written, or in
-``NUMBA_CACHE_DIR``; where it finds no place, every run compiles anew.
+Numba stores compiled functions beside the source, in the user's cache directory if the source's is not
+writable, or in ``NUMBA_CACHE_DIR``; if it finds no place, every run compiles anew.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from numba.core.sigutils import normalize_signature
 from lyra_petsc.kernels.compilation import COMPILATION
 
 Index = np.uintp
-"""Kernels look entries up by it: no number is negative then, which numba would count from the end."""
+"""Type of indices in kernels: it is never negative, so that numba does not test for indices from the end."""
 
-# what the first function would load: so all ranks do it at once, none while the others wait for its mesh
+# otherwise the first function loads this on rank 0 alone, while the others wait for its mesh
 cpu_target.target_context.refresh()
 
 
 @cache
-def digest(room: Path) -> str:
-    """Of all modules of a package, and of ``kernels``, whose kernels others call.
+def digest(package: Path) -> str:
+    """Digest of all modules of a package, and of ``kernels``, whose kernels others call.
 
-    A compiled function contains those of other modules that it calls, while numba looks at its own only.
+    A compiled function contains the functions of other modules that it calls, but numba checks only its own
+    module.
     """
-    rooms = sorted({room, Path(__file__).parent})
-    files = [file for each in rooms for file in sorted(each.rglob("*.py"))]
+    packages = sorted({package, Path(__file__).parent})
+    files = [file for each in packages for file in sorted(each.rglob("*.py"))]
     return sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache of one function.
+    """Numba's cache of one function, with the digest in the names of its files.
 
-    The digest stands in the file names: numba announces an entry before it writes it, and what an older
-    source left under the same name would be taken for it.
+    Numba registers an entry before it writes the file, so that a file of the same name from an older source
+    would be taken for it.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -54,10 +55,9 @@ class KernelCache(FunctionCache):
         self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """As numba's, with compiled functions that a kernel is made from by their names.
+        """Numba's key, but with the names of functions in the closure instead of their pickled contents.
 
-        Numba would take their contents, in which every process has another number. A change of them changes
-        the digest.
+        These differ between processes. A change of the functions changes the digest.
         """
         function = self._py_func
         parts = [
@@ -68,10 +68,10 @@ class KernelCache(FunctionCache):
         return sig, codegen.magic_tuple(), (code, tuple(names))
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What was compiled for the argument types ``sig``; None if there is nothing sound."""
+        """The compiled function for argument types ``sig``; None if there is none or the file is damaged."""
         try:
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        except Exception:  # whatever reading half a file may raise
+        except Exception:  # reading a damaged file may raise anything
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]
             return None
@@ -80,11 +80,11 @@ class KernelCache(FunctionCache):
         return found if found is not None and found.signature.args == types else None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep it, if the disk can."""
+        """Store a compiled function if the disk permits."""
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError:
-            COMPILATION.kept = False
+            COMPILATION.all_cached = False
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -94,8 +94,8 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         dispatcher = njit(**options)(function)
         try:
             dispatcher._cache = KernelCache(function)
-        except RuntimeError:  # numba's word for no place to keep it
-            COMPILATION.kept = False
+        except RuntimeError:  # numba found no place for the cache
+            COMPILATION.all_cached = False
         return dispatcher
 
     return compiled

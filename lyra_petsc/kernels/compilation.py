@@ -8,47 +8,47 @@ from collections.abc import Callable
 from numba.core import event
 
 
-def nothing() -> None:
-    """Called where no run is to hear of it."""
+def no_action() -> None:
+    """Default callback."""
 
 
 class Compilation(event.Listener):
-    """Times the compilation of kernels by numba; those that are loaded from the disk do not count.
+    """Measures the time in which numba compiles kernels; kernels loaded from disk do not count.
 
     Attributes
     ----------
     begins, ends : callable
-        Called when numba starts to compile, and when it has ended; not for a kernel that another one calls.
+        Called when numba starts and ends a compilation; not for a kernel that another one calls.
     first : callable
-        Called once, when numba compiles for the first time.
-    kept : bool
-        Whether all kernels have a place on the disk.
+        Called once, at the first compilation.
+    all_cached : bool
+        Whether all kernels could be stored on disk.
     """
 
     def __init__(self) -> None:
-        self.begins: Callable[[], None] = nothing
-        self.ends: Callable[[], None] = nothing
-        self.first: Callable[[], None] = nothing
-        self.kept = True
+        self.begins: Callable[[], None] = no_action
+        self.ends: Callable[[], None] = no_action
+        self.first: Callable[[], None] = no_action
+        self.all_cached = True
         self._done = self._since = 0.0
         self._depth = 0
 
     @property
     def seconds(self) -> float:
-        """Wall time [s] that was spent compiling."""
+        """Wall time [s] spent compiling."""
         return self._done + (time.perf_counter() - self._since if self._depth else 0.0)
 
     def on_start(self, event: event.Event) -> None:
-        """As numba begins with a kernel."""
+        """Numba starts to compile a kernel."""
         self._depth += 1
         if self._depth == 1:
             self._since = time.perf_counter()
             self.begins()
-            first, self.first = self.first, nothing
+            first, self.first = self.first, no_action
             first()
 
     def on_end(self, event: event.Event) -> None:
-        """As numba ends with a kernel."""
+        """Numba has compiled a kernel."""
         self._depth -= 1
         if self._depth == 0:
             self.ends()

@@ -1,6 +1,7 @@
-"""How element kernels are compiled: cached, contractions allowed, division by zero gives inf.
+"""Decorators of element kernels: cached, contraction of products and sums permitted, division by zero gives
+inf.
 
-Not the whole of ``fastmath``: NaN must survive, since it is how a collapsed element is noticed.
+Not the whole of ``fastmath``: NaN must survive, since a collapsed element is recognised by it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,6 @@ from lyra_petsc.kernels.cache import cached
 kernel: Any = partial(cached, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 
 leaf: Any = partial(kernel, _nrt=False)
-"""Kernels for others to call that make no arrays, and do not count references to those they are given: numba
-does so in a whole function, and atomic counting takes several times as long as a few sums.
-"""
+"""For functions that kernels call and that create no arrays: without reference counting of their arguments.
+Numba counts references in a whole function or not at all, and atomic counting takes several times as long as
+a few sums."""

@@ -1,8 +1,8 @@
-"""Element blocks added to block rows, where the ``offsets`` of the pattern say.
+"""Addition of element blocks to block rows at the ``offsets`` of the pattern.
 
-An element's offsets are those of its pairs of points (0, 0), (0, 1), …, (n − 1, n − 1): twice the number of
-the block that the pair is added to, plus 1 where it is added transposed; negative where others have it. Where
-edges carry unknowns they are those of ``edge_couplings.offsets_of``.
+The offsets of an element are those of its pairs of points (0, 0), (0, 1), …, (n − 1, n − 1): twice the number
+of the block to which the pair is added, plus 1 if it is added transposed; negative if another rank stores the
+block. Offsets of edge unknowns are from ``edge_couplings.offsets_of``.
 """
 
 from __future__ import annotations
@@ -11,14 +11,15 @@ from lyra_petsc.kernels.cache import cached
 from lyra_petsc.kernels.vectors import fetch
 
 AHEAD = 8
-"""Elements by which blocks are fetched before they are added to: neighbours' lie far apart in memory."""
+"""Number of elements by which prefetching runs ahead: blocks of neighbouring elements are far apart in
+memory."""
 
 
 @cached(forceinline=True)
 def fetch_ahead(element, offsets, values, n_pairs, ahead=AHEAD):  # type: ignore[no-untyped-def]
-    """Let the blocks of a later element with offsets (E, n_pairs) come into the caches."""
+    """Prefetch the blocks of a later element with offsets (E, n_pairs) into the caches."""
     later = min(element + ahead, offsets.shape[0] - 1)
-    for pair in range(n_pairs):  # which compilers know where it is written down
+    for pair in range(n_pairs):  # a constant for the compiler
         fetch(values, offsets[later, pair] >> 1)
 
 
@@ -49,7 +50,7 @@ def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-de
 def add_mixed_elements(weight, blocks, n, corners, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the Hessians (E, 3 n + m, 3 n + m) of elements of n vertices and m edge unknowns.
 
-    ``corners`` are offsets of the pairs of vertices, ``offsets`` of all others.
+    ``corners`` are offsets of pairs of vertices, ``offsets`` those of all other pairs.
     """
     flat, m = values.reshape(-1), blocks.shape[1] - 3 * n
     for e in range(offsets.shape[0]):

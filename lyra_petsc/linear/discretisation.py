@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
-from lyra_petsc.kernels.sorting import ascending
+from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
@@ -341,7 +341,7 @@ class Discretisation:
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
         # sorted, so that the same elements give the same stencil after every search
         parts = np.flatnonzero(counted), np.flatnonzero(~counted)
-        order = np.concatenate([ascending(part, stencil, attributes, SORT_COLUMNS) for part in parts])
+        order = np.concatenate([sort_rows(part, stencil, attributes, SORT_COLUMNS) for part in parts])
         if (order[1:] < order[:-1]).any():
             stencil, attributes = stencil[order], attributes[order]
         local = layout.local(stencil.ravel()).reshape(stencil.shape).astype(np.int32)

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.kernels.vectors import put
+from lyra_petsc.kernels.vectors import store_block
 from lyra_petsc.linear.pattern import BlockPattern, index_type, row_pointers
 from lyra_petsc.mesh.points import Points
 
@@ -41,14 +41,14 @@ def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: i
     blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
     for row in range(n):
         for t in range(begin[row], begin[row + 1]):
-            put(blocks, below[t], inner, 2 * p + 1)
+            store_block(blocks, below[t], inner, 2 * p + 1)
             p += 1
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                put(blocks, k, inner, 2 * p)
+                store_block(blocks, k, inner, 2 * p)
                 p += 1
             else:
-                put(blocks, k, outer, 2 * q)
+                store_block(blocks, k, outer, 2 * q)
                 q += 1
 
 

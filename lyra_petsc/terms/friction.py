@@ -22,83 +22,88 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.sorting import ascending
+from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY_CURVATURE, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
-from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, GRIP, SLID
+from lyra_petsc.terms.friction_pairs import COLUMNS, FACTOR, FORCE, SLID
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, UpcomingStep
 
 WORK, OWED = 0, 1
-"""Columns of what is known of vertices: work of friction [J]; impulse of normal forces [N s] that friction
-has not followed yet."""
+"""Columns of the data of vertices: work of friction [J]; impulse of normal forces [N s] whose friction is
+owed."""
 
-HEAT = np.arange(3) == WORK
-"""Which column is that of the work."""
+IS_WORK = np.arange(3) == WORK
+"""Mask of the column of the work."""
 
-PAID = 0.25
-"""Part of that which is made up for in a step: all at once would make friction tremble."""
+PAID_FRACTION = 0.25
+"""Part of the owed impulse that is paid in a step: with all of it at once friction would oscillate."""
 
-ELASTIC = 0.01
-"""Part of the gap that a pair which sticks may go before it slides, at most. Where less holds what slides
-than what sticks, all go as far: if what is pressed least, as a sheet's border, slid before the rest, the
-sheet would follow long before it has to. Else light pairs go less far, as they must again whenever they part
-and meet."""
+MAX_ELASTIC_SLIP = 0.01
+"""Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
+have this elastic slip: if lightly pressed pairs, such as those at a sheet's border, slid before the others,
+the sheet would slide too early. Otherwise lightly pressed pairs have a shorter one, because they have to
+build it up again whenever they separate and come back."""
 
-BESIDE = 0.3
-"""By how much more than friction may stop what sticks in a step, over that, where less holds what slides:
-formulas of second order overshoot in steps longer than its springs swing."""
+OVERSHOOT = 0.3
+"""Part by which the static limit may be exceeded to stop a sticking pair in a step, if the kinetic
+coefficient is lower: integrators of second order overshoot in steps longer than the period of the friction
+springs."""
 
-SOFTER = 0.25
-"""Stiffness between sheets over that on obstacles, of pairs which are pressed little: springs as stiff as the
-barrier halfway through the gap turn sheets by much, and take up to 1.4 times as many Newton iterations."""
+SHEET_SOFTNESS = 0.25
+"""Friction stiffness between sheets over that on obstacles, for lightly pressed pairs. With springs as stiff
+as the barrier halfway through the gap sheets rotate by much, and Newton's method needs up to 1.4 times as
+many iterations."""
 
 
 class Pairs(NamedTuple):
-    """Pairs in contact at an accepted state, those that this rank counts, with ascending keys.
+    """Pairs in contact in an accepted state that this rank counts, with ascending keys.
 
     Attributes
     ----------
     key : (E, 10)
-        Numbers of the vertices, kind, obstacle, its points (0 for vertices): what tells a pair from others.
-    what : (E, 34)
-        The key without the vertices; elastic part of the way so far [m]; 1 if it slid in the last step; β (0
-        for obstacles' points), unit normals, Σ β_i x_i [m] and, between sheets, Σ d_i (n · x_i), where an
-        obstacle is touched [m], normal force [N], the part of it that rubs, d_i of all but the first [m/m].
+        Numbers of four vertices, kind, obstacle, and numbers of the obstacle's points (0 for vertices): these
+        identify a pair.
+    data : (E, 34)
+        The key without the vertices; elastic slip [m]; 1 if the pair slid in the last step; β (0 for points
+        of obstacles), unit normal, Σ β_i x_i + Σ d_i (n · x_i) [m], contact point of an obstacle [m], normal
+        force [N], factor of friction (`FACTOR`), and d_i of all but the first vertex [m/m].
     stencil : (E, 4)
         Numbers of all vertices of the triangle, or of both edges.
     """
 
     key: Ints
-    what: Array
+    data: Array
     stencil: Ints
 
 
-class ObstacleMoves(NamedTuple):
-    """How obstacles move in a step.
+class ObstacleMotion(NamedTuple):
+    """Motion of the obstacles in a step.
 
     Attributes
     ----------
     time : float
         The end of the step [s].
-    part : float
-        Of the step, up to its stage; 1 also at its start.
-    stage, end : list of (3, 3) and (3,)
-        Rotation and translation [m] of each from where pairs were taken, the start of the step but on the way
-        of a static load step, to where friction is asked, and to the end.
-    now, places : (m, 3)
-        Their points and normals at the stage, and at the end.
+    stage_fraction : float
+        Time from the start of the step to its stage over the length of the step; 1 also for a stage at the
+        start.
+    stage_motions, end_motions : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle from the time at which the pairs were found to the time
+        of the forces, and to the end of the step. Pairs are found at the start of the step, or in statics
+        after a part of a load step.
+    stage_points, end_points : (m, 3)
+        Points [m] and normals of the obstacles at the stage, and at the end.
     """
 
     time: float
-    part: float
-    stage: list[tuple[Array, Array]]
-    end: list[tuple[Array, Array]]
-    now: Array
-    places: Array
+    stage_fraction: float
+    stage_motions: list[tuple[Array, Array]]
+    end_motions: list[tuple[Array, Array]]
+    stage_points: Array
+    end_points: Array
 
 
 def _no_pairs() -> Pairs:
@@ -106,63 +111,64 @@ def _no_pairs() -> Pairs:
 
 
 def _order(key: Ints) -> Ints:
-    """Numbers (E,) of keys (E, 10) in ascending order."""
-    return ascending(np.arange(len(key)), key, key, 0)
+    """Rows (E,) of keys (E, 10) in ascending order of the keys."""
+    return sort_rows(np.arange(len(key)), key, key, 0)
 
 
 class CoulombFriction(Elastic):
-    """Friction in a step.
+    """Friction of all pairs in contact during a step.
 
     Parameters
     ----------
     scene : Scene
     n_vertices : int
-        That this rank owns.
+        Number of vertices that this rank owns.
     """
 
     slips = True
 
     def __init__(self, scene: Scene, n_vertices: int) -> None:
         assert scene.contact is not None
-        self._common = coefficients(scene.contact.friction)
-        self._heat = np.zeros((n_vertices, 3))
-        self._pairs = self._known = _no_pairs()
-        self._taken_at: float | None = None  # [s], where obstacles stood on the way of a load step
-        self._owed: Array | None = None  # after the step, until that is accepted
+        self._sheet_friction = coefficients(scene.contact.friction)
+        self._vertex_data = np.zeros((n_vertices, 3))
+        self._pairs = self._element_pairs = _no_pairs()
+        self._contact_time: float | None = None  # [s], of the last part of a load step
+        self._next_owed: Array | None = None  # impulses after the step, until it is accepted
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
     def set_up(self, contact: ContactBarrier) -> None:
-        """Know the contact whose pairs rub."""
+        """Take the contact term whose pairs have friction."""
         self._contact = contact
-        each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._common]
+        each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._sheet_friction]
         self._coefficients = np.array(each)
-        self._on_obstacles = np.zeros((len(contact.obstacles.each), 6))  # in the last step
-        self._stiffest = HALFWAY_CURVATURE * contact.barrier.stiffness
+        self._obstacle_loads = np.zeros((len(contact.obstacles.each), 6))  # in the last step
+        self._contact_stiffness = HALFWAY_CURVATURE * contact.barrier.stiffness
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
-        what = elements.data["what"].reshape(-1, COLUMNS)
-        n = len(what)
-        self._beta, self._tangents, self._ways = np.empty((n, 4)), np.empty((n, 2, 3)), np.empty((n, 2, 4, 3))
-        self._still, self._slip, self._foot = np.empty((n, 2)), np.empty((n, 3)), np.empty((n, 3))
-        taken = self._beta, self._tangents, self._ways, self._still, self._slip, self._foot
-        friction_pairs.unpack(what, *taken)
-        self._obstacle = what[:, 1].astype(np.int64)
-        of_vertex = (what[:, 0] != EDGE_EDGE) & (what[:, 2] == 0.0)
-        self._vertex = np.where(of_vertex, self.stencil[:, 0], -1)
-        self._force = self._limit = self._spring = what[:, FORCE].copy()
-        self._drops = np.zeros(n, dtype=np.bool_)
+        data = elements.data["what"].reshape(-1, COLUMNS)
+        n = len(data)
+        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
+        arrays = [np.empty((n, *shape)) for shape in shapes]
+        friction_pairs.unpack(data, *arrays)
+        self._beta, self._tangents, self._gradients, self._constant, self._slip, self._contact_point = arrays
+        self._obstacle = data[:, 1].astype(np.int64)
+        has_vertex = (data[:, 0] != EDGE_EDGE) & (data[:, 2] == 0.0)
+        self._vertex = np.where(has_vertex, self.stencil[:, 0], -1)
+        self._force = self._limit = self._stiffness = data[:, FORCE].copy()
+        self._weakens = np.zeros(n, dtype=np.bool_)
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
-            self._limit = np.where(what[:, SLID] > 0.5, kinetic, static) * self._force
-            longest = ELASTIC * self._contact.barrier.gap
-            stiffest = np.where(self._obstacle < 0, SOFTER, 1.0) * self._stiffest
-            self._spring = np.maximum(stiffest, self._limit / longest)
-            self._drops = drops = kinetic < static
-            self._spring[drops] = static[drops] * self._force[drops] / longest
-            self._limit, self._spring = (what[:, GRIP] * each for each in (self._limit, self._spring))
-        self._of: ObstacleMoves | None = None  # what is remembered of a stage
+            self._limit = np.where(data[:, SLID] > 0.5, kinetic, static) * self._force
+            max_elastic_slip = MAX_ELASTIC_SLIP * self._contact.barrier.gap
+            stiffness = np.where(self._obstacle < 0, SHEET_SOFTNESS, 1.0) * self._contact_stiffness
+            self._stiffness = np.maximum(stiffness, self._limit / max_elastic_slip)
+            self._weakens = weakens = kinetic < static
+            self._stiffness[weakens] = static[weakens] * self._force[weakens] / max_elastic_slip
+            self._limit *= data[:, FACTOR]
+            self._stiffness *= data[:, FACTOR]
+        self._stage_of: ObstacleMotion | None = None  # whose `_stage_data` are stored
 
     @property
     def n_friction_pairs(self) -> int:
@@ -171,291 +177,303 @@ class CoulombFriction(Elastic):
     # -- pairs -------------------------------------------------------------------------------------
 
     def current_elements(self) -> tuple[Ints, Array]:
-        self.stale, self._known = False, self._pairs
-        return self._pairs.stencil, self._pairs.what
+        self.stale, self._element_pairs = False, self._pairs
+        return self._pairs.stencil, self._pairs.data
 
-    def _renew(self, x: Array, places: Array, old: Pairs) -> None:
-        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
+    def _update_pairs(self, x: Array, obstacle_x: Array, old: Pairs) -> None:
+        """Store the pairs in contact at x (n_local, 3) and obstacle_x (m, 3); those in ``old`` keep their
+        elastic slip.
+        """
         contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
             return
-        beta, normal, force, at = contact.find_contacts(x, places, contact.n_owned)
-        key = np.empty((len(at), 10), dtype=np.int64)
-        pairs = contact.points, contact.number, contact.kind, contact.obstacle
-        friction_pairs.choose(x, contact.stencil, *pairs, beta, normal, at)
-        friction_pairs.keys(*pairs, beta, at, key)
+        beta, normal, force, pair = contact.find_contacts(x, obstacle_x, contact.n_owned)
+        key = np.empty((len(pair), 10), dtype=np.int64)
+        pair_data = contact.points, contact.number, contact.kind, contact.obstacle
+        friction_pairs.choose_triangles(x, contact.stencil, *pair_data, beta, normal, pair)
+        friction_pairs.write_keys(*pair_data, beta, pair, key)
         order = _order(key)
-        key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
-        friction_pairs.find(key, old.key, old.what, same)
-        touching = at[order], beta[order], normal[order], force[order]
-        friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
-        self._pairs, self.stale = Pairs(key, what, contact.number[at[order]]), True
+        key, previous, data = key[order], np.empty(len(pair), dtype=np.int64), np.empty((len(pair), COLUMNS))
+        friction_pairs.match_pairs(key, old.key, old.data, previous)
+        contacts = pair[order], beta[order], normal[order], force[order]
+        friction_pairs.fill_columns(
+            x, contact.stencil, contact.points, key, contacts, previous, old.data, data
+        )
+        self._pairs, self.stale = Pairs(key, data, contact.number[pair[order]]), True
 
-    def initialise_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
-        self._renew(x, frozen.places, self._pairs)
+    def initialise_pairs(self, x: Array, frozen: ObstacleMotion) -> None:
+        self._update_pairs(x, frozen.end_points, self._pairs)
 
     def element_state(self) -> tuple[Ints, Array]:
-        """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
-        return self._pairs.key[:, :4], self._pairs.what[:, : SLID + 1]
+        """Vertices of counted pairs; their kind, obstacle and its points, elastic slip [m], and whether they
+        slid.
+        """
+        return self._pairs.key[:, :4], self._pairs.data[:, : SLID + 1]
 
     def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
-        vertices, what = vertices.copy(), values[:, :6].astype(np.int64)
-        slip, edges, sheets = values[:, 6:9].copy(), what[:, 0] == EDGE_EDGE, what[:, 1] < 0
-        # edges are named in the order of the present numbers
+        vertices, identity = vertices.copy(), values[:, :6].astype(np.int64)
+        slip, edges, sheets = values[:, 6:9].copy(), identity[:, 0] == EDGE_EDGE, identity[:, 1] < 0
+        # the order of vertices in an edge depends on their present numbers
         for rows, first in ((edges, 0), (edges & sheets, 2)):
-            turned = rows & (vertices[:, first] > vertices[:, first + 1])
-            vertices[turned, first : first + 2] = vertices[turned, first : first + 2][:, ::-1]
+            reversed_ = rows & (vertices[:, first] > vertices[:, first + 1])
+            vertices[reversed_, first : first + 2] = vertices[reversed_, first : first + 2][:, ::-1]
         vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
         swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
-        key = np.column_stack([vertices, what])
+        key = np.column_stack([vertices, identity])
         order = _order(key)
-        # `initialise_pairs` finds the rest
-        rest = np.zeros((len(key), COLUMNS - values.shape[1]))
-        rows = np.column_stack([what, slip, values[:, 9], rest])
+        # `initialise_pairs` finds the zeros
+        zeros = np.zeros((len(key), COLUMNS - values.shape[1]))
+        rows = np.column_stack([identity, slip, values[:, 9], zeros])
         self._pairs = Pairs(key[order], rows[order], vertices[order])
 
     # -- a step ------------------------------------------------------------------------------------
 
-    def freeze(self, step: UpcomingStep) -> ObstacleMoves:
-        obstacles, part = self._contact.obstacles, 1.0
-        start = step.start if self._taken_at is None else self._taken_at
-        end = stage = obstacles.rigid_motions(start, step.end)
+    def freeze(self, step: UpcomingStep) -> ObstacleMotion:
+        obstacles, fraction = self._contact.obstacles, 1.0
+        start = step.start if self._contact_time is None else self._contact_time
+        end_motions = stage_motions = obstacles.rigid_motions(start, step.end)
         if step.start < step.at < step.end:
-            part = (step.at - step.start) / (step.end - step.start)
+            fraction = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
-            stage = obstacles.rigid_motions(start, step.at)
-        places = obstacles.positions(step.end)
-        now = obstacles.positions(step.at) if obstacles.moving else places
-        return ObstacleMoves(step.end, part, stage, end, now, places)
+            stage_motions = obstacles.rigid_motions(start, step.at)
+        end_points = obstacles.positions(step.end)
+        stage_points = obstacles.positions(step.at) if obstacles.moving else end_points
+        return ObstacleMotion(step.end, fraction, stage_motions, end_motions, stage_points, end_points)
 
-    def _along(self, vectors: Array, of: Any = slice(None)) -> Array:
-        """Components (n, 2) of vectors (n, 3) across the normals of some pairs."""
-        found: Array = np.einsum("eck,ek->ec", self._tangents[of], vectors)
-        return found
+    def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:
+        """Tangential components (n, 2) of vectors (n, 3) at some pairs."""
+        components: Array = np.einsum("eck,ek->ec", self._tangents[rows], vectors)
+        return components
 
-    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[tuple[NDArray[Any], ...], Array]:
-        """What the kernels take, with obstacles moved so, and what sticks to them; the elastic parts."""
-        still, slip = self._still, self._slip
-        for obstacle, (rotation, translation) in enumerate(moved):
+    def _kernel_data(self, motions: list[tuple[Array, Array]]) -> tuple[tuple[NDArray[Any], ...], Array]:
+        """Arguments of the kernels after ``motions`` of the obstacles, and the elastic slip rotated with
+        them.
+        """
+        constant, slip = self._constant, self._slip
+        for obstacle, (rotation, translation) in enumerate(motions):
             if not translation.any() and (rotation == np.eye(3)).all():
                 continue
-            if still is self._still:
-                still, slip = still.copy(), slip.copy()
-            mine = self._obstacle == obstacle
-            side, foot, before = self._beta[mine].sum(axis=1), self._foot[mine], slip[mine]
-            slip[mine] = before @ rotation.T
-            way = side[:, None] * (foot @ rotation.T + translation - foot)
-            still[mine] += self._along(slip[mine] - before - way, mine)
-        return (self.stencil, self._ways, still, self._spring, self._limit), slip
+            if constant is self._constant:
+                constant, slip = constant.copy(), slip.copy()
+            rows = self._obstacle == obstacle
+            side, contact, old_slip = self._beta[rows].sum(axis=1), self._contact_point[rows], slip[rows]
+            slip[rows] = old_slip @ rotation.T
+            moved = side[:, None] * (contact @ rotation.T + translation - contact)
+            constant[rows] += self._tangential(slip[rows] - old_slip - moved, rows)
+        return (self.stencil, self._gradients, constant, self._stiffness, self._limit), slip
 
-    def _at_stage(self, frozen: ObstacleMoves) -> tuple[NDArray[Any], ...]:
-        """The same for positions of the stage, a part a of the way to the end: a D, with D there, has the
-        gradient of D there. What sticks would else tremble under the midpoint rule for ever.
+    def _stage_data(self, frozen: ObstacleMotion) -> tuple[NDArray[Any], ...]:
+        """Arguments of the kernels for positions of the stage.
+
+        The stage is at a fraction a of the step. The potential is a D, with D at the positions at the end of
+        the step that follow from those of the stage, so that its gradient is that of D there. Otherwise
+        sticking pairs would oscillate for ever with the midpoint rule.
         """
-        if self._of is not frozen:
-            self._of, part = frozen, frozen.part
-            (stencil, ways, still, spring, limit), _ = self._state(frozen.stage)
-            if part != 1.0:
-                still = still + (1.0 / part - 1.0) * (self._still - self._along(self._slip))
-                ways, spring, limit = ways / part, part * spring, part * limit
-            self._stage = stencil, ways, still, spring, limit
+        if self._stage_of is not frozen:
+            self._stage_of, fraction = frozen, frozen.stage_fraction
+            (stencil, gradients, constant, stiffness, limit), _ = self._kernel_data(frozen.stage_motions)
+            if fraction != 1.0:
+                constant = constant + (1.0 / fraction - 1.0) * (self._constant - self._tangential(self._slip))
+                gradients, stiffness, limit = gradients / fraction, fraction * stiffness, fraction * limit
+            self._stage = stencil, gradients, constant, stiffness, limit
         return self._stage
 
-    def _slid(
+    def _return_map(
         self, x: Array, state: tuple[NDArray[Any], ...], slip: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The elastic parts of the ways at positions x (n_local, 3), what sliding takes [J], which slide."""
+        """Elastic slip (E, 3) at positions x (n_local, 3), heat of sliding [J], and which pairs slide."""
         slip, heat, slides = slip.copy(), np.empty(len(slip)), np.empty(len(slip), dtype=np.bool_)
-        friction_pairs.slide(x, *state, self._tangents, slip, heat, slides)
+        friction_pairs.return_map(x, *state, self._tangents, slip, heat, slides)
         return slip, heat, slides
 
-    def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
+    def energies(self, x: Array, frozen: ObstacleMotion) -> Array:
         out = np.empty(self.n_owned)
         if not self.n_elements:
             return out
-        friction_pairs.energies(x, *self._at_stage(frozen), out)
+        friction_pairs.energies(x, *self._stage_data(frozen), out)
         return out
 
     def work_of_targets(
-        self, ends: tuple[Array, Array], frozen: tuple[ObstacleMoves, ObstacleMoves]
+        self, ends: tuple[Array, Array], frozen: tuple[ObstacleMotion, ObstacleMotion]
     ) -> float:
-        # by forces: an obstacle goes many times as far as what sticks, over which energies tell nothing
+        # by forces: an obstacle moves by many times the elastic slip, so that energies would not do
         work = 0.0
         if self._contact.obstacles.moving and self.n_elements:
-            (_, _, before, *_), (_, _, after, *_) = (self._at_stage(at) for at in frozen)
-            for x, at in zip(ends, frozen, strict=True):
-                stencil, ways, still, spring, limit = self._at_stage(at)
-                u = np.einsum("ecik,eik->ec", ways, x[stencil]) + still
-                pull = np.minimum(spring, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))[:, None] * u
-                work += 0.5 * float(np.vdot(pull[: self.n_owned], (after - before)[: self.n_owned]))
+            (_, _, before, *_), (_, _, after, *_) = (self._stage_data(each) for each in frozen)
+            for x, each in zip(ends, frozen, strict=True):
+                stencil, gradients, constant, stiffness, limit = self._stage_data(each)
+                u = np.einsum("ecik,eik->ec", gradients, x[stencil]) + constant
+                secant = np.minimum(stiffness, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))
+                force = secant[:, None] * u
+                work += 0.5 * float(np.vdot(force[: self.n_owned], (after - before)[: self.n_owned]))
         return work
 
-    def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: ObstacleMotion, out: Array) -> None:
         if self.n_elements:
-            friction_pairs.add_gradient(x, *self._at_stage(frozen), out)
+            friction_pairs.add_gradient(x, *self._stage_data(frozen), out)
 
     def add_hessian(
         self,
         x: Array,
-        frozen: ObstacleMoves,
+        frozen: ObstacleMotion,
         blend: float,
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        state = self._at_stage(frozen)
-        # it is convex as it is; a secant for what slides lets equilibria converge linearly
+        data = self._stage_data(frozen)
+        # the potential is convex; with a secant for sliding pairs equilibria would converge only linearly
         blend = 0.0 if self._contact.static else blend
-        friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
+        friction_pairs.add_hessians(x, *data, weight, blend, offsets[self.name], values)
 
-    def count_sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
-        """How many pairs that this rank counts stick and slide at positions x (n_local, 3), and the sum of
-        the normal forces [N] that they are given in the step.
+    def count_sticking(self, x: Array, frozen: ObstacleMotion) -> tuple[float, float, float]:
+        """Numbers of sticking and of sliding pairs of this rank at x (n_local, 3), and the sum of their
+        normal forces [N] in the step's equations.
         """
-        mine, state = slice(self.n_owned), self._at_stage(frozen)
-        *_, slides = self._slid(x, state, self._slip)
-        sliding = float(np.count_nonzero(slides[mine]))
-        return self.n_owned - sliding, sliding, float(self._force[mine].sum())
+        owned, data = slice(self.n_owned), self._stage_data(frozen)
+        *_, slides = self._return_map(x, data, self._slip)
+        sliding = float(np.count_nonzero(slides[owned]))
+        return self.n_owned - sliding, sliding, float(self._force[owned].sum())
 
     def force_scale(self, size: float) -> Array:
-        return self._spring * size
+        return self._stiffness * size
 
-    def accept(self, x: Array, frozen: ObstacleMoves) -> None:
-        self._taken_at = None
-        self._heat[:, OWED], self._owed = (0.0 if self._owed is None else self._owed), None
+    def accept(self, x: Array, frozen: ObstacleMotion) -> None:
+        self._contact_time = None
+        self._vertex_data[:, OWED] = 0.0 if self._next_owed is None else self._next_owed
+        self._next_owed = None
         if not self.n_elements:
-            self._on_obstacles = np.zeros_like(self._on_obstacles)
-            self._renew(x, frozen.places, self._known)
+            self._obstacle_loads = np.zeros_like(self._obstacle_loads)
+            self._update_pairs(x, frozen.end_points, self._element_pairs)
             return
-        state, slip = self._state(frozen.end)
-        self._on_obstacles = self._forces(x, state)
-        slip, heat, slides = self._slid(x, state, slip)
+        data, slip = self._kernel_data(frozen.end_motions)
+        self._obstacle_loads = self._forces(x, data)
+        slip, heat, slides = self._return_map(x, data, slip)
         first = self.stencil[: self.n_owned, 0]
-        np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
-        old = self._known.what.copy()
+        np.add.at(self._vertex_data[:, WORK], first, heat[: self.n_owned])
+        old = self._element_pairs.data.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
-        self._renew(x, frozen.places, self._known._replace(what=old))
+        self._update_pairs(x, frozen.end_points, self._element_pairs._replace(data=old))
 
     def friction_corrections(
         self,
         stage: Array,
         x: Array,
         v: Array,
-        frozen: ObstacleMoves,
+        frozen: ObstacleMotion,
         damping: Array,
         dt: float,
         *,
         sheets: bool,
     ) -> FrictionCorrections:
         contact = self._contact
-        *_, force, at = contact.find_contacts(stage, frozen.now, contact.n_owned)
-        vertex = contact.vertex_of(at)
-        on = (vertex >= 0) & (sheets | (contact.obstacle[at] >= 0))
-        slip, _, slides = self._slid(x, *self._state(frozen.end))
-        led = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
-        rub = led[slides[led]]
-        # normal forces on vertices: that acted, that pairs were given, and those among them that slide
-        acted, given, rubs = (
-            np.bincount(first, each, minlength=len(self._heat))
+        *_, force, pair = contact.find_contacts(stage, frozen.stage_points, contact.n_owned)
+        vertex = contact.vertex_of(pair)
+        counted = (vertex >= 0) & (sheets | (contact.obstacle[pair] >= 0))
+        slip, _, slides = self._return_map(x, *self._kernel_data(frozen.end_motions))
+        considered = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
+        sliding = considered[slides[considered]]
+        # normal forces of vertices: at the stage; in the step's equations; in these of sliding pairs
+        acted, given, slid = (
+            np.bincount(first, each, minlength=len(self._vertex_data))
             for first, each in (
-                (vertex[on], force[on]),
-                (self._vertex[led], self._force[led]),
-                (self._vertex[rub], self._force[rub]),
+                (vertex[counted], force[counted]),
+                (self._vertex[considered], self._force[considered]),
+                (self._vertex[sliding], self._force[sliding]),
             )
         )
-        owed = self._heat[:, OWED] / dt + acted + damping[: len(acted)] - given
-        pays = np.where(rubs > 0.0, np.where(acted > 0.0, PAID, 1.0) * owed, 0.0)
-        # what sticks is owed nothing, what has just come is given all later
-        goes_on = (acted > 0.0) & ((rubs > 0.0) | (given == 0.0))
-        self._owed = np.where(goes_on, dt * (owed - pays), 0.0)
-        lacks = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
-        # what sticks comes to rest at once: swinging, its springs would pull by twice what holds it still
-        held = np.flatnonzero((self._drops & ~slides)[: self.n_owned])
-        pull = self._spring[held] * np.linalg.norm(slip[held], axis=1)
-        room = (1.0 + BESIDE) * self._limit[held] - pull
-        these = np.concatenate([rub, held])
-        points, beta, obstacle, ways = (
-            of[these] for of in (self.stencil, self._beta, self._obstacle, self._ways)
-        )
-        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end)
-        rate = np.einsum("ecik,eik->ec", ways, v[points]) - self._along(moved / dt, these)
-        rate[: len(rub)] = self._along(slip[rub], rub)
-        length = np.linalg.norm(rate, axis=1, keepdims=True)
-        rate = np.divide(rate, length, out=np.zeros_like(rate), where=length > 0.0)
-        along, ways = (
-            np.einsum("ec,eck->ek", rate, self._tangents[these]),
-            np.einsum("ec,ecim->eim", rate, ways),
-        )
-        return FrictionCorrections(points, beta, along, ways, np.concatenate([lacks, room]), obstacle, moved)
+        owed = self._vertex_data[:, OWED] / dt + acted + damping[: len(acted)] - given
+        paid = np.where(slid > 0.0, np.where(acted > 0.0, PAID_FRACTION, 1.0) * owed, 0.0)
+        # sticking pairs are owed nothing, new contacts get everything later
+        goes_on = (acted > 0.0) & ((slid > 0.0) | (given == 0.0))
+        self._next_owed = np.where(goes_on, dt * (owed - paid), 0.0)
+        paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
+        missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
+        # sticking pairs are stopped at once: oscillating springs would pull with twice the static force
+        sticking = np.flatnonzero((self._weakens & ~slides)[: self.n_owned])
+        elastic_force = self._stiffness[sticking] * np.linalg.norm(slip[sticking], axis=1)
+        available = (1.0 + OVERSHOOT) * self._limit[sticking] - elastic_force
+        rows = np.concatenate([sliding, sticking])
+        arrays = self.stencil, self._beta, self._obstacle, self._gradients
+        points, beta, obstacle, gradients = (array[rows] for array in arrays)
+        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
+        tangential = np.einsum("ecik,eik->ec", gradients, v[points]) - self._tangential(moved / dt, rows)
+        tangential[: len(sliding)] = self._tangential(slip[sliding], sliding)
+        length = np.linalg.norm(tangential, axis=1, keepdims=True)
+        unit = np.divide(tangential, length, out=np.zeros_like(tangential), where=length > 0.0)
+        direction = np.einsum("ec,eck->ek", unit, self._tangents[rows])
+        gradient = np.einsum("ec,ecim->eim", unit, gradients)
+        change = np.concatenate([missing, available])
+        return FrictionCorrections(points, beta, direction, gradient, change, obstacle, moved)
 
-    def moments(self, x: Array, frozen: ObstacleMoves) -> tuple[Ints, Array]:
-        of = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
-        stencil, *state = (part[of] for part in self._at_stage(frozen))
-        moments = np.zeros((len(of), 3))
+    def moments(self, x: Array, frozen: ObstacleMotion) -> tuple[Ints, Array]:
+        rows = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
+        stencil, *state = (part[rows] for part in self._stage_data(frozen))
+        moments = np.zeros((len(rows), 3))
         friction_pairs.add_moments(x, stencil, *state, moments)
         return stencil, -moments
 
-    def accept_substep(self, x: Array, frozen: ObstacleMoves) -> None:
+    def accept_substep(self, x: Array, frozen: ObstacleMotion) -> None:
         self.accept(x, frozen)
-        self._taken_at = frozen.time  # else what obstacles take along would go that way twice
+        self._contact_time = frozen.time  # otherwise the obstacles' motion would count twice
 
-    def friction_lag(self, x: Array, frozen: ObstacleMoves) -> dict[str, Array]:
+    def friction_lag(self, x: Array, frozen: ObstacleMotion) -> dict[str, Array]:
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
-        (slip, _, slides), count = self._slid(x, *self._state(frozen.end)), len(names)
-        mine, pull = slice(self.n_owned), self._spring * np.linalg.norm(slip, axis=1)
-        *_, force, at = self._contact.find_contacts(x, frozen.places, self._contact.n_owned)
+        (slip, _, slides), count = self._return_map(x, *self._kernel_data(frozen.end_motions)), len(names)
+        owned, friction = slice(self.n_owned), self._stiffness * np.linalg.norm(slip, axis=1)
+        *_, force, pair = self._contact.find_contacts(x, frozen.end_points, self._contact.n_owned)
 
         def by_vertex(vertex: NDArray[np.int32], obstacle: Ints, each: Array) -> Array:
-            places, size = vertex.astype(np.int64) * count + obstacle % count, len(self._heat) * count
-            return np.bincount(places, each, size).reshape(-1, count).astype(np.float64)
+            bins, n_bins = vertex.astype(np.int64) * count + obstacle % count, len(self._vertex_data) * count
+            return np.bincount(bins, each, n_bins).reshape(-1, count).astype(np.float64)
 
-        acting = by_vertex(self._contact.stencil[at, 0], self._contact.obstacle[at], force)
-        given, limit, pull, sliding = (
-            by_vertex(self.stencil[mine, 0], self._obstacle[mine], each[mine])
-            for each in (self._force, self._limit, pull, np.where(slides, pull, 0.0))
+        acted = by_vertex(self._contact.stencil[pair, 0], self._contact.obstacle[pair], force)
+        given, limit, friction, sliding = (
+            by_vertex(self.stencil[owned, 0], self._obstacle[owned], each[owned])
+            for each in (self._force, self._limit, friction, np.where(slides, friction, 0.0))
         )
-        more = acting / np.maximum(given, np.finfo(float).tiny)
-        wrong = np.maximum(pull - more * limit, np.maximum(more - 1.0, 0.0) * sliding)
-        sums = np.stack([wrong.sum(axis=0), pull.sum(axis=0), (more * limit).sum(axis=0)], axis=1)
+        ratio = acted / np.maximum(given, np.finfo(float).tiny)
+        error = np.maximum(friction - ratio * limit, np.maximum(ratio - 1.0, 0.0) * sliding)
+        sums = np.stack([error.sum(axis=0), friction.sum(axis=0), (ratio * limit).sum(axis=0)], axis=1)
         return dict(zip(names, sums, strict=True))
 
     def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
-        return self._pairs, self._heat.copy(), self._on_obstacles, self._taken_at
+        return self._pairs, self._vertex_data.copy(), self._obstacle_loads, self._contact_time
 
-    def restore_contacts(self, touched: tuple[Pairs, Array, Array, float | None]) -> None:
-        self._pairs, self._heat, self._on_obstacles, self._taken_at = touched
+    def restore_contacts(self, state: tuple[Pairs, Array, Array, float | None]) -> None:
+        self._pairs, self._vertex_data, self._obstacle_loads, self._contact_time = state
         self.stale = True
 
-    def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
+    def _forces(self, x: Array, data: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
         number = self._obstacle[: self.n_owned]
         out = np.zeros((len(self._contact.obstacles.each), 6))
         for obstacle in np.unique(number[number >= 0]):
-            of, pull = np.flatnonzero(number == obstacle), np.zeros_like(x)
-            friction_pairs.add_gradient(x, *(part[of] for part in state), pull)
-            out[obstacle] = *pull.sum(axis=0), *np.cross(x, pull).sum(axis=0)
+            rows, force = np.flatnonzero(number == obstacle), np.zeros_like(x)
+            friction_pairs.add_gradient(x, *(part[rows] for part in data), force)
+            out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         return out
 
-    def obstacle_forces(self, x: Array, frozen: ObstacleMoves, count: int) -> Array:
-        return self._on_obstacles
+    def obstacle_forces(self, x: Array, frozen: ObstacleMotion, count: int) -> Array:
+        return self._obstacle_loads
 
     def state(self) -> dict[str, Array]:
-        # older ones had something else in the place of what is owed
-        return {"friction_work": self._heat * HEAT, "friction_owed": self._heat * ~HEAT}
+        # in older checkpoints the column of what is owed had another meaning
+        return {"friction_work": self._vertex_data * IS_WORK, "friction_owed": self._vertex_data * ~IS_WORK}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self._heat = state["friction_work"] * HEAT + state.get("friction_owed", 0.0)
+        self._vertex_data = state["friction_work"] * IS_WORK + state.get("friction_owed", 0.0)
 
-    def history(self, x: Array, frozen: ObstacleMoves) -> Mapping[str, float]:
-        return {"friction_work": float(self._heat[:, WORK].sum())}
+    def history(self, x: Array, frozen: ObstacleMotion) -> Mapping[str, float]:
+        return {"friction_work": float(self._vertex_data[:, WORK].sum())}
 
 
 def elements(rest: RestShape) -> None:
-    """There are none before anything touches."""
+    """None: there are no elements before anything is in contact."""
 
 
 def make(elements: None, scene: Scene, mass: Array) -> CoulombFriction:
-    """The term on one rank; `CoulombFriction.set_up` must follow."""
+    """The term on one rank; `CoulombFriction.set_up` must be called next."""
     return CoulombFriction(scene, len(mass))

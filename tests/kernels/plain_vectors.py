@@ -140,7 +140,7 @@ def add_triangle(blocks, offsets, e, f, three):  # type: ignore[no-untyped-def]
 
 
 @plain
-def put(blocks, k, out, at):  # type: ignore[no-untyped-def]
+def store_block(blocks, k, out, at):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[at >> 1, 3 * i + j] = blocks[k, 3 * j + i if at & 1 else 3 * i + j]

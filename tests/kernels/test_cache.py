@@ -1,4 +1,4 @@
-"""What was compiled is found again, and nothing that is stale, half written or of another type is taken."""
+"""Compiled functions are found in the cache; stale, damaged or differently typed entries are not used."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def calls(module: Any) -> Any:
     """A compiled function that calls every operation of the module, each on an array of its own."""
     gather, scatter, add_outers = module.gather, module.scatter, module.add_outers
     add_six, add_triangle = module.add_six, module.add_triangle
-    put, fetch = module.put, module.fetch
+    store_block, fetch = module.store_block, module.fetch
 
     @njit
     def products(blocks, columns, x, gathered, scattered, stored):  # type: ignore[no-untyped-def]
@@ -30,8 +30,8 @@ def calls(module: Any) -> Any:
             gathered[row, 0], gathered[row, 1], gathered[row, 2] = a, b, c
             scatter(blocks, columns, scattered, lo, hi, (x[row, 0], x[row, 1], x[row, 2]))
             fetch(blocks, row + 8)
-            put(blocks, row, stored, 4 * row)
-            put(blocks, row, stored, 4 * row + 3)
+            store_block(blocks, row, stored, 4 * row)
+            store_block(blocks, row, stored, 4 * row + 3)
 
     @njit
     def sums(offsets, rows, outer, six, triangle):  # type: ignore[no-untyped-def]

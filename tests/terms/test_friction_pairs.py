@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.friction_pairs import BETA, COLUMNS, NORMAL, SLIP, START, TURN
+from lyra_petsc.terms.friction_pairs import BETA, COLUMNS, NORMAL, ROTATION, SLIP, START
 
 Array = NDArray[np.float64]
 
@@ -23,36 +23,36 @@ def x() -> Array:
 
 
 class Pairs(NamedTuple):
-    """As a table of friction has them: stencil, β, n, d, Σ β_i c_i with Σ d_i h_i, and ξ."""
+    """Data of friction pairs: stencil, β, n, d, Σ β_i c_i with Σ d_i h_i, and ξ."""
 
     stencil: NDArray[np.int32]
     beta: Array
     normal: Array
-    turn: Array
+    rotation: Array
     start: Array
     slip: Array
 
     @property
     def unpacked(self) -> tuple[Array, ...]:
-        """Tangents, w, still and ξ, as `unpack` gives them."""
-        what = np.zeros((N, COLUMNS))
+        """Tangents, w, constant and ξ, as `unpack` gives them."""
+        data = np.zeros((N, COLUMNS))
         for at, each in ((BETA, self.beta), (NORMAL, self.normal), (START, self.start), (SLIP, self.slip)):
-            what[:, at : at + each.shape[1]] = each
-        what[:, TURN : TURN + 9] = self.turn[:, 1:].reshape(N, 9)
-        beta, tangents, ways, still = (np.empty((N, *rest)) for rest in ((4,), (2, 3), (2, 4, 3), (2,)))
-        slip = np.empty((N, 3))
-        friction_pairs.unpack(what, beta, tangents, ways, still, slip, np.empty((N, 3)))
-        return tangents, ways, still, slip
+            data[:, at : at + each.shape[1]] = each
+        data[:, ROTATION : ROTATION + 9] = self.rotation[:, 1:].reshape(N, 9)
+        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
+        arrays = [np.empty((N, *shape)) for shape in shapes]
+        friction_pairs.unpack(data, *arrays)
+        return tuple(arrays[1:5])
 
     def state(self, limit: float = 0.4) -> tuple[Array, ...]:
         """What the kernels take."""
-        _, ways, still, _ = self.unpacked
-        return self.stencil, ways, still, np.full(N, 3.0), np.full(N, limit)
+        _, gradients, constant, _ = self.unpacked
+        return self.stencil, gradients, constant, np.full(N, 3.0), np.full(N, limit)
 
 
 @pytest.fixture
 def pairs(x: Array) -> Pairs:
-    """Of them about half slide, some are between sheets."""
+    """About half of them slide; some are between sheets."""
     random = np.random.default_rng(1)
     stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
     beta = random.normal(size=(N, 4))
@@ -61,13 +61,13 @@ def pairs(x: Array) -> Pairs:
     start = np.einsum("ei,eik->ek", beta, x[stencil]) + 0.1 * random.normal(size=(N, 3))
     slip = 0.05 * random.normal(size=(N, 3))
     slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-    turn = 0.3 * random.normal(size=(N, 4, 3))
-    turn -= np.einsum("eik,ek->ei", turn, normal)[:, :, None] * normal[:, None, :]
-    turn[:, 0] = -turn[:, 1:].sum(axis=1)
-    turn[::2] = 0.0
+    rotation = 0.3 * random.normal(size=(N, 4, 3))
+    rotation -= np.einsum("eik,ek->ei", rotation, normal)[:, :, None] * normal[:, None, :]
+    rotation[:, 0] = -rotation[:, 1:].sum(axis=1)
+    rotation[::2] = 0.0
     heights = np.einsum("eik,ek->ei", x[stencil], normal)
-    start += np.einsum("ei,eik->ek", heights, turn)
-    return Pairs(stencil, beta, normal, turn, start, slip)
+    start += np.einsum("ei,eik->ek", heights, rotation)
+    return Pairs(stencil, beta, normal, rotation, start, slip)
 
 
 @pytest.fixture
@@ -98,13 +98,13 @@ def hessians(x: Array, state: tuple[Array, ...], blend: float) -> Array:
 
 def test_derivatives_are_those_of_the_potential(x: Array, state: tuple[Array, ...]) -> None:
     hessian, h = hessians(x, state, 0.0), 1e-6
-    way = np.random.default_rng(2).normal(size=x.shape)
-    slope = (energies(x + h * way, state) - energies(x - h * way, state)) / (2 * h)
+    dx = np.random.default_rng(2).normal(size=x.shape)
+    slope = (energies(x + h * dx, state) - energies(x - h * dx, state)) / (2 * h)
     np.testing.assert_allclose(
-        (gradient(x, state) * way).reshape(N, 12).sum(axis=1), slope, rtol=1e-5, atol=1e-8
+        (gradient(x, state) * dx).reshape(N, 12).sum(axis=1), slope, rtol=1e-5, atol=1e-8
     )
-    change = (gradient(x + h * way, state) - gradient(x - h * way, state)).reshape(N, 4, 3) / (2 * h)
-    expected = np.einsum("nijkm,njm->nik", hessian, way.reshape(N, 4, 3))
+    change = (gradient(x + h * dx, state) - gradient(x - h * dx, state)).reshape(N, 4, 3) / (2 * h)
+    expected = np.einsum("nijkm,njm->nik", hessian, dx.reshape(N, 4, 3))
     np.testing.assert_allclose(expected, change, rtol=1e-5, atol=1e-7)
     flat = hessian.transpose(0, 1, 3, 2, 4).reshape(N, 12, 12)
     assert np.linalg.eigvalsh(flat).min() > -1e-12
@@ -116,9 +116,9 @@ def test_no_energy_is_above_that_of_regularised_springs(x: Array, state: tuple[A
     assert np.linalg.eigvalsh(flat).min() > -1e-12
     here, slope = energies(x, state), gradient(x, state).reshape(N, 12)
     for length in (0.01, 0.1, 1.0, 10.0):
-        way = length * np.random.default_rng(3).normal(size=(N, 12))
-        bound = here + (slope * way).sum(axis=1) + 0.5 * np.einsum("ei,eij,ej->e", way, flat, way)
-        assert (energies(x + way.reshape(-1, 3), state) <= bound + 1e-12 * np.abs(bound)).all()
+        dx = length * np.random.default_rng(3).normal(size=(N, 12))
+        bound = here + (slope * dx).sum(axis=1) + 0.5 * np.einsum("ei,eij,ej->e", dx, flat, dx)
+        assert (energies(x + dx.reshape(-1, 3), state) <= bound + 1e-12 * np.abs(bound)).all()
 
 
 def test_tangents_lie_across_the_normals(pairs: Pairs) -> None:
@@ -129,12 +129,12 @@ def test_tangents_lie_across_the_normals(pairs: Pairs) -> None:
 
 
 def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, pairs: Pairs) -> None:
-    stencil, beta, normal, turn, _, _ = pairs
+    stencil, beta, normal, rotation, _, _ = pairs
     gradients, limit = gradient(x, pairs.state())[stencil], pairs.state()[-1]
     along = np.einsum("eik,ek->ei", gradients, normal)
     forces = (gradients - along[:, :, None] * normal[:, None, :]) / beta[:, :, None]
     np.testing.assert_allclose(forces, np.broadcast_to(forces[:, :1], forces.shape), atol=1e-12)
-    np.testing.assert_allclose(along, np.einsum("eik,ek->ei", turn, forces[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(along, np.einsum("eik,ek->ei", rotation, forces[:, 0]), atol=1e-12)
     size = np.linalg.norm(forces[:, 0], axis=1)
     assert size.max() <= limit[0] * (1.0 + 1e-12)
     assert 5 < (size > 0.999 * limit[0]).sum() < N - 5
@@ -144,7 +144,7 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None
     state, (tangents, *_, slip) = pairs.state(), pairs.unpacked
     before, force = energies(x, state), gradient(x, state)
     heat, slides = np.empty(N), np.empty(N, dtype=np.bool_)
-    friction_pairs.slide(x, *state, tangents, slip, heat, slides)
+    friction_pairs.return_map(x, *state, tangents, slip, heat, slides)
     *_, stiffness, limit = state
     size = np.linalg.norm(slip, axis=1)
     assert np.abs(np.einsum("ek,ek->e", slip, pairs.normal)).max() < 1e-15
@@ -153,28 +153,28 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None
     np.testing.assert_allclose(0.5 * stiffness * size**2 + heat, before, rtol=1e-12)
     heights = np.einsum("eik,ek->ei", x[pairs.stencil], pairs.normal)
     start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])
-    start += np.einsum("ei,eik->ek", heights, pairs.turn)
+    start += np.einsum("ei,eik->ek", heights, pairs.rotation)
     after = pairs._replace(start=start, slip=slip).state()
     np.testing.assert_allclose(gradient(x, after), force, atol=1e-12)
 
 
-def test_rounding_does_not_tell_which_of_two_sliding_pairs_goes_on() -> None:
-    """A vertex that comes over an edge goes on with the triangle that held it by more force."""
+def test_rounding_does_not_decide_which_sliding_pair_is_continued() -> None:
+    """A vertex that moves over an edge continues the contact with the larger normal force."""
     triangles, edge = [[7, 1, 2, 3], [7, 2, 1, 4]], [[7, 1, 2, 2]]
     keys = np.zeros((3, 10), dtype=np.int64)
     keys[:, :4], keys[:, 4], keys[:, 5] = [*triangles, *edge], VERTEX_TRIANGLE, -1
     among, key = keys[:2], keys[2:]
-    what = np.zeros((2, COLUMNS))
-    what[:, SLIP], what[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
+    data = np.zeros((2, COLUMNS))
+    data[:, SLIP], data[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
     for order in ([0, 1], [1, 0]):
         for longer in (0, 1):
-            old = what.copy()
+            old = data.copy()
             old[longer, SLIP] *= 1.0 + 1e-12
             place = np.empty(1, dtype=np.int64)
-            friction_pairs.find(key, among[order], old[order], place)
+            friction_pairs.match_pairs(key, among[order], old[order], place)
             assert order[place[0]] == 1
-    what[0, SLIP] *= 1.01  # one that sticks still
-    friction_pairs.find(key, among, what, place)
+    data[0, SLIP] *= 1.01  # one that still sticks
+    friction_pairs.match_pairs(key, among, data, place)
     assert place[0] == 0
 
 
@@ -187,18 +187,18 @@ def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, Pairs]:
     beta = np.where((kind == EDGE_EDGE)[:, None], np.stack(crossed, axis=1), np.stack(before, axis=1))
     gap = np.einsum("ei,eik->ek", beta, points)
     normal = gap / np.linalg.norm(gap, axis=1, keepdims=True)
-    turn = np.empty((N, 4, 3))
+    rotation = np.empty((N, 4, 3))
     for e in range(N):
-        friction_pairs.frame(points[e], kind[e], normal[e], turn[e])
-    turn *= np.linalg.norm(gap, axis=1)[:, None, None]
+        friction_pairs.rotation_vectors(points[e], kind[e], normal[e], rotation[e])
+    rotation *= np.linalg.norm(gap, axis=1)[:, None, None]
     stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
-    start = gap + np.einsum("eik,ek,eim->em", points, normal, turn)
+    start = gap + np.einsum("eik,ek,eim->em", points, normal, rotation)
     slip = random.normal(size=(N, 3))
     slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-    return points.reshape(-1, 3), Pairs(stencil, beta, normal, turn, start, slip)
+    return points.reshape(-1, 3), Pairs(stencil, beta, normal, rotation, start, slip)
 
 
-def test_two_sheets_that_turn_together_do_not_slip() -> None:
+def test_a_common_rotation_of_two_sheets_is_no_slip() -> None:
     """To first order in the angle; and forces have neither a resultant nor a moment."""
     random = np.random.default_rng(4)
     x, pairs = pairs_between_sheets(random)
@@ -220,27 +220,27 @@ def test_two_sheets_that_turn_together_do_not_slip() -> None:
     turned = x + np.cross(h * axis, x) + [0.1, 0.2, 0.3]
     assert np.sqrt(energies(turned, rest.state(np.inf))).max() < 1e-11
     start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])
-    without = rest._replace(turn=np.zeros((N, 4, 3)), start=start)
+    without = rest._replace(rotation=np.zeros((N, 4, 3)), start=start)
     assert np.sqrt(energies(turned, without.state(np.inf))).max() > 1e-7
 
 
-def test_without_a_lever_there_is_none() -> None:
-    """Nearly parallel edges, and a vertex beside a triangle, have a small one, and that on a line none."""
-    turn, up = np.empty((4, 3)), np.array([0.0, 0.0, 1.0])
+def test_levers() -> None:
+    """The lever is small for nearly parallel edges and a vertex beside a triangle, and 0 on a line."""
+    rotation, up = np.empty((4, 3)), np.array([0.0, 0.0, 1.0])
     edges = np.array([[-1.0, 0.0, 0.1], [1.0, 0.0, 0.1], [-1.0, -0.01, 0.0], [1.0, 0.01, 0.0]])
-    assert 0.0 < friction_pairs.frame(edges, EDGE_EDGE, up, turn) < 2e-4
-    assert np.isfinite(turn).all()
+    assert 0.0 < friction_pairs.rotation_vectors(edges, EDGE_EDGE, up, rotation) < 2e-4
+    assert np.isfinite(rotation).all()
     edges[:, 1] = 0.0
-    assert friction_pairs.frame(edges, EDGE_EDGE, up, turn) == 0.0
-    assert not turn.any()
+    assert friction_pairs.rotation_vectors(edges, EDGE_EDGE, up, rotation) == 0.0
+    assert not rotation.any()
     triangle = np.array([[0.0, 0.0, 0.1], [0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
-    assert friction_pairs.frame(triangle, VERTEX_TRIANGLE, up, turn) == 0.0
+    assert friction_pairs.rotation_vectors(triangle, VERTEX_TRIANGLE, up, rotation) == 0.0
     triangle[3, 0] = 0.3
-    assert friction_pairs.frame(triangle, VERTEX_TRIANGLE, up, turn) == pytest.approx(0.06)
+    assert friction_pairs.rotation_vectors(triangle, VERTEX_TRIANGLE, up, rotation) == pytest.approx(0.06)
 
 
-def test_what_turns_with_an_edge_or_a_vertex_is_a_triangle_in_line_with_them() -> None:
-    """Of those that are the one farthest along a direction, whatever their order; else the one most so."""
+def test_triangle_that_defines_the_rotation_at_an_edge_or_vertex() -> None:
+    """Of several the one farthest along a direction, in any order; else the one with the nearest normal."""
     x = np.array([[0.2, 0.0, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, -1.0]])
     triangles = [[1, 2, 3], [4, 2, 1], [2, 1, 5]]
     cases = [
@@ -260,7 +260,7 @@ def test_what_turns_with_an_edge_or_a_vertex_is_a_triangle_in_line_with_them() -
             at, flat = np.array([first]), np.zeros(len(order), dtype=np.int64)
             towards = np.array([normal], dtype=float)
             pairs = rows.astype(np.int32), rows, rows, flat + VERTEX_TRIANGLE, flat - 1
-            friction_pairs.choose(x, *pairs, beta, towards, at)
+            friction_pairs.choose_triangles(x, *pairs, beta, towards, at)
             assert order[at[0]] == expected
             assert dict(zip(rows[at[0]].tolist(), beta[0].tolist(), strict=True)) == {
                 **dict.fromkeys(rows[at[0]].tolist(), 0.0), 0: 1.0, **share,
