@@ -1,6 +1,6 @@
-"""Kernels of the impulses between nearest points: shares of masses, dashpots, and what keeps moments.
+"""Kernels for impulses between nearest points: mass shares, dashpots, and couples that conserve moments.
 
-Pairs of dashpots are as `term.Elastic.dashpots` gives them; only those of this rank, ``mine``, count.
+Pairs are those from `term.Elastic.dashpots`; only those of this rank, ``mine``, are used.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ LINE = 1e-12
 
 @kernel()
 def find_own(points, beta, vertex, number, n, mine):  # type: ignore[no-untyped-def]
-    """Which pairs are this rank's: it owns their vertex, or of pairs without one that with the least global
-    number (n_local,) that a nearest point is on or beside; its own rows come first, ``n`` of them.
+    """Which pairs belong to this rank: it owns their vertex, or for pairs without one the nearest vertex with
+    the lowest global number (n_local,); its own rows come first, ``n`` of them.
     """
     for e in range(len(points)):
-        first = vertex[e]
-        if first < 0:
-            least = np.iinfo(np.int64).max
+        vertex_row = vertex[e]
+        if vertex_row < 0:
+            lowest = np.iinfo(np.int64).max
             for i in range(4):
                 row = points[e, i]
-                if row >= 0 and beta[e, i] != 0.0 and number[Index(row)] < least:
-                    least, first = number[Index(row)], row
-        mine[e] = 0 <= first < n
+                if row >= 0 and beta[e, i] != 0.0 and number[Index(row)] < lowest:
+                    lowest, vertex_row = number[Index(row)], row
+        mine[e] = 0 <= vertex_row < n
 
 
 @kernel()
@@ -48,24 +48,26 @@ def share(points, beta, mine, out):  # type: ignore[no-untyped-def]
 
 @kernel()
 def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping, push, out):  # type: ignore[no-untyped-def]
-    """Add the impulses [N s] of dashpots in dt [s] to out (n_local, 3), and keep each in push (m,).
+    """Add the impulses [N s] of dashpots in dt [s] to out (n_local, 3), and write the impulse of each to push
+    (m,).
 
-    By velocities v (n_local, 3) [m/s] and 1/m (n_local, 3) [1/kg] of the parts of the masses that a pair may
-    move; ``damping`` is over the critical one, ``pushed`` (m,) [m] how far obstacles came nearer.
+    v (n_local, 3) [m/s] are velocities, ``inverse`` (n_local, 3) [1/kg] is 1/m for the part of the mass that
+    a pair may move, ``damping`` the ratio to critical damping, ``pushed`` (m,) [m] the approach of obstacles.
     """
     for e in range(len(points)):
         push[e] = 0.0
         if not mine[e]:
             continue
-        most, rate = 0.0, -pushed[e] / dt
+        inverse_mass, rate = 0.0, -pushed[e] / dt
         for i in range(4):
             if points[e, i] >= 0 and beta[e, i] != 0.0:
                 row = Index(points[e, i])
                 for k in range(3):
-                    most = max(most, inverse[row, k])
+                    inverse_mass = max(inverse_mass, inverse[row, k])
                     rate += beta[e, i] * v[row, k] * normal[e, k]
-        if most > 0.0:
-            push[e] = math.expm1(-2.0 * damping * dt * math.sqrt(stiffness[e] * most)) / most * rate
+        if inverse_mass > 0.0:
+            q = 2.0 * damping * dt * math.sqrt(stiffness[e] * inverse_mass)
+            push[e] = math.expm1(-q) / inverse_mass * rate
             for i in range(4):
                 if points[e, i] >= 0:
                     for k in range(3):
@@ -74,8 +76,8 @@ def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping,
 
 @kernel()
 def add_couples(x, points, moment, out):  # type: ignore[no-untyped-def]
-    """Add impulses [N s] with these moments (m, 3) [N m s] and without resultant to out (n_local, 3): as in a
-    rigid rotation of each four points of equal masses. Points on a line get none.
+    """Add impulses [N s] with given moments (m, 3) [N m s] and no resultant to out (n_local, 3): those of a
+    rigid rotation of four points of equal masses. Points on a line get none.
     """
     for e in range(len(points)):
         mean = 0.0, 0.0, 0.0
@@ -89,12 +91,12 @@ def add_couples(x, points, moment, out):  # type: ignore[no-untyped-def]
             xy, xz, yz = xy - a * b, xz - a * c, yz - b * c
         one, two, three = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
         u, v, w = cross(two, three), cross(three, one), cross(one, two)
-        det, given = dot(one, u), (moment[e, 0], moment[e, 1], moment[e, 2])
+        det, target = dot(one, u), (moment[e, 0], moment[e, 1], moment[e, 2])
         if not det > LINE * (xx + yy + zz) ** 3:
             continue
-        turn = dot(u, given) / det, dot(v, given) / det, dot(w, given) / det
+        rotation = dot(u, target) / det, dot(v, target) / det, dot(w, target) / det
         for i in range(4):
             row = Index(points[e, i])
-            push = cross(turn, minus(point(x, row), mean))
+            push = cross(rotation, minus(point(x, row), mean))
             for k in range(3):
                 out[row, k] += push[k]

@@ -1,14 +1,15 @@
-"""Dry friction in bending by directors on edges: a fabric's hysteresis and lasting folds.
+"""Dry friction in bending with directors on edges, which gives a fabric's hysteresis and lasting folds.
 
-As in ``coulomb``, of the curvature κ of a triangle (``midedge``) less that, κ_p, to which it has slid, in the
-norm that weights directions by their limits M1 and M2 [N m/m] ::
+As in ``coulomb``, for the curvature κ of a triangle (``midedge``) less the curvature κ_p to which it has
+slid, in a norm that weights directions by their limits M1 and M2 [N m/m] ::
 
     |u|² = (M1² u11² + M2² u22² + 2 M1 M2 u12²) / (M1 M2),   u = κ − κ_p
     energy = ½ A √(M1 M2) |u|² / κ_y  for |u| ≤ κ_y,   A √(M1 M2) (|u| − κ_y/2)  beyond
 
-With directors' tangents T, of which κ is a linear function, and constants K it is a function of the quadratic
-form Q of ``midedge_energy``, E = ½ Q up to r = √Q = r_y and r_y (r − r_y/2) beyond, whose gradient is that of
-the form with K r_y/r in place of K, and whose Hessian is less by p pᵀ / (r r_y), of its pulls p.
+κ is a linear function of the directors' tangents T, so that with constants K the energy is a function of the
+quadratic form Q of ``midedge_energy``: E = ½ Q up to r = √Q = r_y and r_y (r − r_y/2) beyond. Its gradient
+there is that of the form with K r_y/r in place of K, and its Hessian is less by p pᵀ / (r r_y) with the
+gradient p.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
 
-GIVE = 2.0
-"""κ_y [1/m]: change of curvature at which friction is at its limit."""
+YIELD_CURVATURE = 2.0
+"""κ_y [1/m]: change of curvature at which friction reaches its limit."""
 
 
 class Sliding(NamedTuple):
-    """What triangles have at positions.
+    """Sliding of the triangles at given positions.
 
     Attributes
     ----------
     part : (E,)
-        r_y/r where they slide, else 1.
+        r_y/r for sliding triangles, otherwise 1.
     friction : (E, 2)
-        As ``midedge_energy`` takes it.
+        As `midedge_energy` expects it.
     tangent : (E, 4)
-        As of ``midedge_shape.tangents``.
+        As from `midedge_shape.tangents`.
     """
 
     part: Array
@@ -52,17 +53,17 @@ class Sliding(NamedTuple):
 
 
 class MidEdgeFriction(Elastic):
-    """Friction of all triangles; `connect` must follow.
+    """Friction of all triangles; `connect` must be called next.
 
     Parameters
     ----------
     elements : Elements
-        As of `MidEdge`, with K for ``stiffness`` and data ``reach`` (E,), r_y [√J].
+        As of `MidEdge`, with K for ``stiffness`` and data ``r_y`` (E,) [√J].
 
     Attributes
     ----------
     bent : (E, 3)
-        Tangents of directors, to which triangles have slid.
+        Directors' tangents to which the triangles have slid.
     """
 
     def __init__(self, elements: Elements) -> None:
@@ -101,14 +102,14 @@ class MidEdgeFriction(Elastic):
         tangent = self._sheet.bent(x, frames)[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
         midedge_energy.energies(tangent, *constants, half)
-        reach, size = data["reach"], np.sqrt(2.0 * np.maximum(half, 0.0))
-        far = np.maximum(size, reach)  # those that stick have no more than their form
-        more = np.where(size > reach, 0.5 * reach * (far - reach), 0.0)
-        bend = np.where(size > reach, -1.0 / (reach * far), 0.0)
-        return Sliding(reach / far, np.column_stack([bend, more]), tangent)
+        r_y, r = data["r_y"], np.sqrt(2.0 * np.maximum(half, 0.0))
+        larger = np.maximum(r, r_y)
+        offset = np.where(r > r_y, 0.5 * r_y * (larger - r_y), 0.0)
+        curvature = np.where(r > r_y, -1.0 / (r_y * larger), 0.0)
+        return Sliding(r_y / larger, np.column_stack([curvature, offset]), tangent)
 
     def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
-        """Tangents of directors, and K, T̄, limits and friction."""
+        """Directors' tangents, K, tangents of rest, limits and friction: arguments of kernels."""
         data = self.elements.data
         stiffness = data["stiffness"] * sliding.part[:, None]
         return sliding.tangent, stiffness, self.bent, data["limit"], sliding.friction
@@ -148,10 +149,11 @@ class MidEdgeFriction(Elastic):
         self.accept(x, self._sheet.frames)
 
     def _bent_at(self, x: Array, frames: Frames) -> Array:
-        """What ``bent`` is to be where the step ends at x."""
+        """The value of ``bent`` after a step that ends at x."""
         sliding = self._sliding(x, frames)
-        found, part = sliding.tangent[:, :3], sliding.part[:, None]
-        return np.where((part < 1.0) & np.isfinite(found), found - part * (found - self.bent), self.bent)
+        tangent, part = sliding.tangent[:, :3], sliding.part[:, None]
+        slid = tangent - part * (tangent - self.bent)
+        return np.where((part < 1.0) & np.isfinite(tangent), slid, self.bent)
 
     def _become(self, bent: Array) -> None:
         self.bent, self._slides = bent, None
@@ -177,31 +179,32 @@ class MidEdgeFriction(Elastic):
 
 
 def elements(rest: RestShape) -> Elements:
-    """The triangles with friction that bend by this model (rank 0)."""
+    """The triangles that bend by this model and have friction (rank 0)."""
     notes = list(rest.notes)
-    found = midedge.elements(rest)
-    rest.notes = notes  # which are the sheet's
-    data = dict(found.data)
+    triangles = midedge.elements(rest)
+    rest.notes = notes  # those of the sheet only
+    data = dict(triangles.data)
     moments = np.array([shell.friction_moment for shell in rest.shells])
-    one, two = moments[rest.shell_of[data["triangle"].astype(np.int64)]].T
-    rubs = one > 0.0
+    m1, m2 = moments[rest.shell_of[data["triangle"].astype(np.int64)]].T
+    has_friction = m1 > 0.0
     weight = np.stack(
-        [one / np.where(rubs, two, 1.0), two / np.where(rubs, one, 1.0), 0.5 + 0.0 * one], axis=1
+        [m1 / np.where(has_friction, m2, 1.0), m2 / np.where(has_friction, m1, 1.0), 0.5 + 0.0 * m1], axis=1
     )
-    mean, curvature = np.sqrt(one * two), midedge.curvatures_of_tangents(data["material"])
+    mean, curvature = np.sqrt(m1 * m2), midedge.curvatures_of_tangents(data["material"])
     area = midedge.areas(data["material"])
-    form = (area * mean / GIVE)[:, None, None] * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
+    scale = (area * mean / YIELD_CURVATURE)[:, None, None]
+    form = scale * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
-    data["reach"] = np.sqrt(area * mean * GIVE)
+    data["r_y"] = np.sqrt(area * mean * YIELD_CURVATURE)
     for name in ("tangent", "director", "material", "length", "tilt", "damping"):
         del data[name]
-    assert found.edges is not None
-    kept = {name: values[rubs] for name, values in data.items()}
-    return Elements(found.stencil[rubs], kept, edges=found.edges[rubs])
+    assert triangles.edges is not None
+    chosen = {name: values[has_friction] for name, values in data.items()}
+    return Elements(triangles.stencil[has_friction], chosen, edges=triangles.edges[has_friction])
 
 
 def coarse_elements(rest: RestShape) -> Elements:
-    """Hinges between the same triangles, which bend as it does while nothing slides."""
+    """Hinges between the same triangles, which bend like them while nothing slides."""
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     moments = np.array([shell.friction_moment for shell in rest.shells])
     limit, bends = np.full(len(quad), np.inf), np.ones(len(quad), dtype=bool)
@@ -210,10 +213,10 @@ def coarse_elements(rest: RestShape) -> Elements:
         across = edge[:, ::-1] ** 2 / np.sum(edge * edge, axis=1, keepdims=True)
         limit = np.minimum(limit, np.sum(across * moments[rest.shell_of[faces[:, side]]], axis=1))
         bends &= stiffness > 0.0
-    found, limit = bending.elements(rest, "midedge"), limit[bends]
-    rubs, data = limit > 0.0, dict(found.data)
-    data["k"] = limit * data["length"] / (GIVE * data["rest_height"])
-    return Elements(found.stencil[rubs], {name: values[rubs] for name, values in data.items()})
+    hinges, limit = bending.elements(rest, "midedge"), limit[bends]
+    rows, data = limit > 0.0, dict(hinges.data)
+    data["k"] = limit * data["length"] / (YIELD_CURVATURE * data["rest_height"])
+    return Elements(hinges.stencil[rows], {name: values[rows] for name, values in data.items()})
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> MidEdgeFriction:

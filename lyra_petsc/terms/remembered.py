@@ -1,4 +1,4 @@
-"""A function of an array that is often asked twice at the same place."""
+"""A function of an array that is often called repeatedly with the same values."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ Result = TypeVar("Result", bound="Array | tuple[Array, ...]")
 
 
 def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """These arrays, which cannot be written to from here on.
+    """The arrays, made read-only.
 
-    Kernels are compiled for arrays of either kind: what stands for remembered results is to be as they are.
+    Kernels are compiled separately for read-only arrays, so that arrays used in place of remembered results
+    must be read-only, too.
     """
     for array in arrays:
         array.flags.writeable = False
@@ -24,9 +25,9 @@ def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
 
 
 class Remembered(Generic[Result]):
-    """``function`` of an array, computed where it was not computed last.
+    """``function`` of an array, computed again only if the values differ from those of the last call.
 
-    Its results, an array or several, cannot be written to: they are given out again.
+    Its results, an array or several, are made read-only, since they are returned repeatedly.
     """
 
     def __init__(self, function: Callable[[Array], Result]) -> None:
@@ -34,12 +35,12 @@ class Remembered(Generic[Result]):
         self._last: tuple[Array, Result] | None = None
 
     def forget(self) -> None:
-        """Let the function be another from here on."""
+        """Compute again at the next call, because the function has changed."""
         self._last = None
 
-    def __call__(self, at: Array) -> Result:
-        if self._last is None or not np.array_equal(at, self._last[0]):
-            result = self._function(at)
+    def __call__(self, x: Array) -> Result:
+        if self._last is None or not np.array_equal(x, self._last[0]):
+            result = self._function(x)
             unwritable(*((result,) if isinstance(result, np.ndarray) else result))
-            self._last = at.copy(), result
+            self._last = x.copy(), result
         return self._last[1]

@@ -1,7 +1,7 @@
-"""Dry friction in shear between warp and weft: a fabric's hysteresis, see ``coulomb``.
+"""Dry friction in shear between warp and weft, which gives a fabric's hysteresis; see ``coulomb``.
 
-Per triangle of rest area A with the shear strain γ = 2 E_uv of ``membrane``: A times the energy of
-``coulomb``, with the limit F_f [N/m] and the give `GIVE`.
+For each triangle of rest area A with the shear strain γ = 2 E_uv of ``membrane``: A times the energy of
+``coulomb``, with the limit F_f [N/m] and the yield strain `YIELD_SHEAR`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from lyra_petsc.terms.coulomb import Friction
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 
-GIVE = 0.002
-"""γ_y: change of shear at which friction is at its limit."""
+YIELD_SHEAR = 0.002
+"""γ_y: change of shear at which friction reaches its limit."""
 
 
 class ShearFriction(Elastic):
-    """Friction of all triangles.
+    """Shear friction of all triangles.
 
     Parameters
     ----------
@@ -33,14 +33,14 @@ class ShearFriction(Elastic):
     Attributes
     ----------
     sheared : (E,)
-        Shear to which triangles have slid.
+        Shear to which the triangles have slid.
     """
 
     def __init__(self, elements: Elements) -> None:
         super().__init__(elements)
         data = elements.data
         self._shape, area = data["shape"], data["area"]
-        self._friction = Friction(area * data["friction"], np.full(self.n_elements, GIVE))
+        self._friction = Friction(area * data["friction"], np.full(self.n_elements, YIELD_SHEAR))
         self.sheared: Array = np.zeros(self.n_elements)
 
     def _shear(self, x: Array, rows: slice = slice(None)) -> tuple[Array, Array]:
@@ -73,7 +73,7 @@ class ShearFriction(Elastic):
         out += (turned + turned.transpose(0, 2, 1))[..., None, None] * np.eye(3)
 
     def force_scale(self, size: float) -> Array:
-        stiffness = self._friction.limit / self._friction.give
+        stiffness = self._friction.limit / self._friction.yield_strain
         return stiffness * size * np.sum(self._shape**2, axis=(1, 2))
 
     # -- state -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What is asked for twice at one place is computed once, unless something else has changed."""
+"""Results for the same argument are computed once, unless something else has changed."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def test_a_function_is_called_where_it_was_not_called_last() -> None:
     assert len(calls) == 3
 
 
-def test_kernels_are_compiled_for_what_is_remembered_alone() -> None:
-    """Nothing that meets, and a sheet without friction, are arrays of the same types."""
+def test_kernels_are_compiled_for_remembered_arrays_only() -> None:
+    """Placeholders (no active pairs, a sheet without friction) have the types of remembered arrays."""
     floor = {"floor": {"plane": {"point": [0, 0, -0.01], "normal": [0, 0, 1]}}}
     scene = {"mesh": grid(1, 1, 1, 1), "contact": {"gap": 0.02}, "obstacles": floor}
     with Simulation(scene, MPI.COMM_SELF) as simulation:
@@ -52,8 +52,8 @@ def test_kernels_are_compiled_for_what_is_remembered_alone() -> None:
     assert typeof(NO_FRICTION) == typeof(unwritable(np.zeros((1, 2)))[0])
 
 
-def test_one_weight_is_as_many() -> None:
-    """Of one number for all elements kernels are given what they are given of several."""
+def test_one_weight_has_the_type_of_many() -> None:
+    """For one weight of all elements kernels get an array of the same type as for several."""
     given = []
 
     class Term:
