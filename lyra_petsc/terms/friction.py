@@ -140,8 +140,8 @@ class CoulombFriction(Elastic):
         self._on_obstacles = np.zeros((len(contact.obstacles.each), 6))  # in the last step
         self._stiffest = HALFWAY_CURVATURE * contact.barrier.stiffness
 
-    def take(self, elements: Elements) -> None:
-        super().take(elements)
+    def set_elements(self, elements: Elements) -> None:
+        super().set_elements(elements)
         what = elements.data["what"].reshape(-1, COLUMNS)
         n = len(what)
         self._beta, self._tangents, self._ways = np.empty((n, 4)), np.empty((n, 2, 3)), np.empty((n, 2, 4, 3))
@@ -221,12 +221,12 @@ class CoulombFriction(Elastic):
         obstacles, part = self._contact.obstacles, 1.0
         start = step.start if self._taken_at is None else self._taken_at
         end = stage = obstacles.rigid_motions(start, step.end)
-        if step.start < step.at < step.end:
-            part = (step.at - step.start) / (step.end - step.start)
-        elif step.at < step.end:
-            stage = obstacles.rigid_motions(start, step.at)
+        if step.start < step.target_time < step.end:
+            part = (step.target_time - step.start) / (step.end - step.start)
+        elif step.target_time < step.end:
+            stage = obstacles.rigid_motions(start, step.target_time)
         places = obstacles.positions(step.end)
-        now = obstacles.positions(step.at) if obstacles.moving else places
+        now = obstacles.positions(step.target_time) if obstacles.moving else places
         return ObstacleMoves(step.end, part, stage, end, now, places)
 
     def _along(self, vectors: Array, of: Any = slice(None)) -> Array:
