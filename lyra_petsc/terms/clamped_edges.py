@@ -179,12 +179,12 @@ def elements(rest: RestShape) -> dict[int, Elements]:
     by_edge = np.argsort(sides, kind="stable")
     edges, first, count = np.unique(sides[by_edge], return_index=True, return_counts=True)
     one, two = (triangles[by_edge[first + k * (count - 1)] // 3] for k in (0, 1))
-    ends, found = rest.edges[edges], {}
+    ends, by_handle = rest.edges[edges], {}
     for handle, each in enumerate(rest.scene.handles):
         if each.holds_slope:
             held = select_vertices(rest.mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
             row = np.flatnonzero(np.isin(ends, held).all(axis=1))
-            found[handle] = Elements(
+            by_handle[handle] = Elements(
                 np.concatenate([ends[row], one[row], two[row]], axis=1), edges=edges[row][:, None]
             )
-    return found
+    return by_handle

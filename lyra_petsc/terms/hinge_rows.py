@@ -48,7 +48,7 @@ def _same_block(at, swapped):  # type: ignore[no-untyped-def]
 def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
     """Write the offsets of all couplings of hinge h into out (10,)."""
     one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3
-    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs along the edge the other way
+    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs against the edge
     out[0] = within[one, _pair_index(i, i)]
     out[1] = _same_block(within[one, _pair_index(i, j)], s[h, 0] < s[h, 1])
     out[2] = _same_block(within[one, _pair_index(i, p)], s[h, 0] < s[h, 2])

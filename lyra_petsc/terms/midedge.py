@@ -198,10 +198,10 @@ class MidEdge(Elastic):
         if not far.any():
             return None
         direction = self._edge_directions(x)[far]
-        found = Frames(frozen.direction.copy(), frozen.reference.copy())
-        found.reference[far] = transported(Frames(frozen.direction[far], frozen.reference[far]), direction)
-        found.direction[far] = direction
-        return found
+        frames = Frames(frozen.direction.copy(), frozen.reference.copy())
+        frames.reference[far] = transported(Frames(frozen.direction[far], frozen.reference[far]), direction)
+        frames.direction[far] = direction
+        return frames
 
     def edge_increments(
         self, x: Array, increment: Array, frozen: Frames, displacement: Array | None = None
@@ -431,28 +431,24 @@ def rest_rotation_of(data: Mapping[str, Array]) -> Array:
 
 
 def mean_directors(
-    x: Array,
-    triangles: AnyInts,
-    number: AnyInts,
-    n_edges: int,
-    rest_rotation: Array,
-    max_triangles: float = np.inf,
+    x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, rotation: Array, limit: float = np.inf
 ) -> Array:
     """Unit mean (n_edges, 3) of the triangles' rest directors on each edge.
 
-    A rest director is the triangle's unit normal rotated about the edge by ᾱ. Triangles (F, 3) have the edges
-    ``number`` (F, 3). Where rest directors cancel, as in a fold of 180° or a cross, and on edges of more than
-    ``max_triangles`` triangles, it is that of the first triangle.
+    A rest director is the triangle's unit normal rotated about the edge by ᾱ; ``rotation`` (F, 3, 2) holds
+    cos ᾱ and sin ᾱ, or is empty. Triangles (F, 3) have the edges ``number`` (F, 3). Where rest directors
+    cancel, as in a fold of 180° or a cross, and on edges of more than ``limit`` triangles, the rest director
+    of the first triangle is taken.
     """
     normals = np.repeat(normals_of(x, triangles)[:, None, :], 3, axis=1)
-    if len(rest_rotation):
+    if len(rotation):
         along = unit(x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]])
-        normals = rest_rotation[..., :1] * normals + rest_rotation[..., 1:] * np.cross(along, normals)
+        normals = rotation[..., :1] * normals + rotation[..., 1:] * np.cross(along, normals)
     normals, edges = normals.reshape(-1, 3), number.ravel()
     total: Array = np.stack([np.bincount(edges, normals[:, i], n_edges) for i in range(3)], axis=1)
-    found, first, count = np.unique(edges, return_index=True, return_counts=True)
-    undefined = (np.linalg.norm(total[found], axis=1) < SMALLEST_SUM) | (count > max_triangles)
-    total[found[undefined]] = normals[first[undefined]]
+    present, first, count = np.unique(edges, return_index=True, return_counts=True)
+    undefined = (np.linalg.norm(total[present], axis=1) < SMALLEST_SUM) | (count > limit)
+    total[present[undefined]] = normals[first[undefined]]
     return unit(total)
 
 
@@ -497,7 +493,7 @@ def elements(rest: RestShape) -> Elements:
     if surface.any():
         # where three or more triangles meet the first one keeps its normal as director
         on_surface = triangles[surface], number[surface]
-        director = mean_directors(mesh.rest, *on_surface, n_edges, NO_REST_ROTATION, max_triangles=2)
+        director = mean_directors(mesh.rest, *on_surface, n_edges, NO_REST_ROTATION, limit=2)
         _align_with_symmetry(director, rest, triangles, number, mesh.rest)
         angle[surface] = _angles_at(mesh.rest, triangles[surface], director[number[surface]])
         rest.notes += midedge_mesh.coarse_surface_notes(rest, chosen, number, size, curvature, angle)

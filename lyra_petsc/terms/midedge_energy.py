@@ -115,10 +115,8 @@ def energies(tangent, stiffness, rest, limit, friction, out):  # type: ignore[no
             continue
         k, bar = _stiffness_of(stiffness, e), _rest_tangents(rest, e)
         s0, s1, s2 = coupling_tangent(t0), coupling_tangent(t1), coupling_tangent(t2)
-        out[e] = 0.5 * (
-            _twice_energy(_diagonal(k, bar, t0, t1, t2), _coupling(k, bar, s0, s1, s2))
-            + _twice_friction(friction, e)
-        )
+        diagonal, coupling = _diagonal(k, bar, t0, t1, t2), _coupling(k, bar, s0, s1, s2)
+        out[e] = 0.5 * (_twice_energy(diagonal, coupling) + _twice_friction(friction, e))
         if square < limit[e]:
             out[e] *= fade(square, limit[e])[0]
         if not out[e] < np.inf:
@@ -180,17 +178,13 @@ def _unpack(batch, i):  # type: ignore[no-untyped-def]
     e0, e1, e2 = load(batch, 0, i), load(batch, 3, i), load(batch, 6, i)
     normal = cross(e1, e2)
     spins = spin(load(batch, 9, i), e0), spin(load(batch, 12, i), e1), spin(load(batch, 15, i), e2)
-    tangent = load(batch, 18, i)
-    slopes = (
-        derivatives_below_45(tangent[0]),
-        derivatives_below_45(tangent[1]),
-        derivatives_below_45(tangent[2]),
-    )
+    t0, t1, t2 = load(batch, 18, i)
+    slopes = derivatives_below_45(t0), derivatives_below_45(t1), derivatives_below_45(t2)
     (k0, k1, k2), (k3, k4, k5) = load(batch, 21, i), load(batch, 24, i)
     (u0, u1, u2), (u3, u4, u5) = load(batch, 27, i), load(batch, 30, i)
     k, rest, q = (k0, k1, k2, k3, k4, k5), (u0, u1, u2, u3, u4, u5), load(batch, 33, i)
     c = batch[Index(BATCH * 36) + i]
-    return e0, e1, e2, normal, dot(normal, normal), tangent, slopes, spins, k, rest, q, c
+    return e0, e1, e2, normal, dot(normal, normal), (t0, t1, t2), slopes, spins, k, rest, q, c
 
 
 @kernel(inline="always")
@@ -198,13 +192,8 @@ def _moments(k, rest, tangent, slopes):  # type: ignore[no-untyped-def]
     """The moments p of a triangle, and the results of `_diagonal` and `_coupling`."""
     t0, t1, t2 = tangent
     (a0, _, s0, b0, _), (a1, _, s1, b1, _), (a2, _, s2, b2, _) = slopes
-    diagonal, coupling = _diagonal(k, rest, t0, t1, t2), _coupling(k, rest, s0, s1, s2)
-    p0, p1, p2 = (
-        diagonal[0] * a0 + coupling[0] * b0,
-        diagonal[1] * a1 + coupling[1] * b1,
-        diagonal[2] * a2 + coupling[2] * b2,
-    )
-    return (p0, p1, p2), diagonal, coupling
+    d, c = _diagonal(k, rest, t0, t1, t2), _coupling(k, rest, s0, s1, s2)
+    return (d[0] * a0 + c[0] * b0, d[1] * a1 + c[1] * b1, d[2] * a2 + c[2] * b2), d, c
 
 
 @kernel(inline="always")
@@ -238,7 +227,7 @@ def _compute_gradients(batch):  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_gradient(  # type: ignore[no-untyped-def]
-    x, stencil, edges, places, sign, frame, tangent, stiffness, rest, limit, friction, length, out
+    x, stencil, edges, indices, sign, frame, tangent, stiffness, rest, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
     flat, batch = out.reshape(-1), np.zeros(46 * BATCH)
@@ -270,11 +259,11 @@ def add_gradient(  # type: ignore[no-untyped-def]
             out[stencil[e, 0], j] -= one[j] + two[j]
             out[stencil[e, 1], j] += one[j]
             out[stencil[e, 2], j] += two[j]
-            flat[places[e, j]] += edge_forces[j]
+            flat[indices[e, j]] += edge_forces[j]
 
 
 @kernel(inline="always")
-def _outer_sum(g, w):  # type: ignore[no-untyped-def]
+def _outers(g, w):  # type: ignore[no-untyped-def]
     """Σ_i g_i w_iᵀ of three vectors g and three w, a 3 × 3 block by rows."""
     (a, b, c), (d, e, f) = g, w
     return (
@@ -291,7 +280,7 @@ def _outer_sum(g, w):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _symmetric_sum(a, b, c, d):  # type: ignore[no-untyped-def]
+def _symmetric(a, b, c, d):  # type: ignore[no-untyped-def]
     """a bᵀ + b aᵀ + c dᵀ + d cᵀ, a 3 × 3 block by rows."""
     xx, yy, zz = (
         2.0 * (a[0] * b[0] + c[0] * d[0]),
@@ -324,7 +313,7 @@ def _times(f, u):  # type: ignore[no-untyped-def]
 def _second_derivative(spin, e, square, n, scale, moment):  # type: ignore[no-untyped-def]
     """moment (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of edge e, square = |e|²; s ρ = 2 e / |e|² + γ × t."""
     about = _axpy(2.0 / square, e, cross(spin, scaled(1.0 / math.sqrt(square), e)))
-    return _symmetric_sum(n, scaled(scale, cross(e, n)), scaled(-0.5 * moment, spin), about)
+    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * moment, spin), about)
 
 
 @kernel()
@@ -346,9 +335,9 @@ def _fade_hessian(x0, x1, x2, normal, square, limit, energy, exact, moments, g1,
     t1, t2 = scaled(energy * second, s1), scaled(energy * second, s2)
     p1, p2 = _axpy(first, f1, t1), _axpy(first, f2, t2)
     r1, r2 = scaled(first, s1), scaled(first, s2)
-    added11 = _outer_sum((p1, r1, r1), (s1, f1, (0.0, 0.0, 0.0)))
-    added12 = _outer_sum((p1, r1, r1), (s2, f2, (0.0, 0.0, 0.0)))
-    added22 = _outer_sum((p2, r2, r2), (s2, f2, (0.0, 0.0, 0.0)))
+    added11 = _outers((p1, r1, r1), (s1, f1, (0.0, 0.0, 0.0)))
+    added12 = _outers((p1, r1, r1), (s2, f2, (0.0, 0.0, 0.0)))
+    added22 = _outers((p2, r2, r2), (s2, f2, (0.0, 0.0, 0.0)))
     three = (
         _sum(_sum(_times(weight, three[0]), added11), _block(bent, 1, 1)),
         _sum(_sum(_times(weight, three[1]), added12), _block(bent, 1, 2)),
@@ -470,24 +459,16 @@ def _hessian(e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, slidin
     u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
     v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
     nothing = (0.0, 0.0, 0.0)
-    b11 = _sum(
-        _outer_sum(g1, w1), _sum(_sum(bend2, bend0), _symmetric_sum(scaled(-v1, n), u1, nothing, nothing))
-    )
-    b22 = _sum(
-        _outer_sum(g2, w2), _sum(_sum(bend0, bend1), _symmetric_sum(scaled(-v2, n), u2, nothing, nothing))
-    )
-    turned = _outer_sum((scaled(-v2, n), scaled(-v1, u2), nothing), (u1, n, nothing))
-    b12 = _sum(_outer_sum(g1, w2), _sum(turned, _times(-1.0, bend0)))
+    b11 = _sum(_outers(g1, w1), _sum(_sum(bend2, bend0), _symmetric(scaled(-v1, n), u1, nothing, nothing)))
+    b22 = _sum(_outers(g2, w2), _sum(_sum(bend0, bend1), _symmetric(scaled(-v2, n), u2, nothing, nothing)))
+    turned = _outers((scaled(-v2, n), scaled(-v1, u2), nothing), (u1, n, nothing))
+    b12 = _sum(_outers(g1, w2), _sum(turned, _times(-1.0, bend0)))
     q0, q1, q2 = q
     one = scaled(q0, w1[0]), scaled(q1, w1[1]), scaled(q2, w1[2])
     two = scaled(q0, w2[0]), scaled(q1, w2[1]), scaled(q2, w2[2])
     numbers = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02, q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
-    return ((b11, b12, b22), one, two, numbers), (
-        0.5 * _twice_energy(diagonal, coupling),
-        (p0, p1, p2),
-        g1,
-        g2,
-    )
+    energy = 0.5 * _twice_energy(diagonal, coupling)
+    return ((b11, b12, b22), one, two, numbers), (energy, (p0, p1, p2), g1, g2)
 
 
 @kernel(inline="always")

@@ -111,17 +111,17 @@ def _irregular_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array, s
     valence = 2.0 * np.pi / opening * np.bincount(triangles.ravel(), minlength=n)
     isolated = mean(valence[sides.ends].sum(axis=2)) - valence < 7.0
     isolated[sides.ends[sides.boundary & ~sides.clamped]] = False
-    found = np.flatnonzero(isolated & (valence > 2.5) & (valence < 4.5))
-    half = np.pi / valence[found]
-    load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * valence[found]
-    error = LOAD_FACTOR * load * (mean(size) ** 2 * mean(np.repeat(sharpness[:, None], 3, axis=1)))[found]
+    vertices = np.flatnonzero(isolated & (valence > 2.5) & (valence < 4.5))
+    half = np.pi / valence[vertices]
+    load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * valence[vertices]
+    error = LOAD_FACTOR * load * (mean(size) ** 2 * mean(np.repeat(sharpness[:, None], 3, axis=1)))[vertices]
     if not (error > NOTED_ERROR).any():
         return []
     worst = int(np.argmax(error))
-    count = np.sum(error > NOTED_ERROR)
+    vertex, count = vertices[worst], np.sum(error > NOTED_ERROR)
     more = f" (and {count - 1} more)" if count > 1 else ""
     return [
-        f"at vertex {found[worst]}{more} only {valence[found[worst]]:.0f} triangles of a curved shell meet: "
+        f"at vertex {vertex}{more} only {valence[vertex]:.0f} triangles of a curved shell meet: "
         f"under pressure it moves by about {min(error[worst], 1.0):.0%} too little; let five to seven meet, "
         "or refine"
     ]
@@ -150,8 +150,8 @@ def narrow_sheet_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array,
     if lost < NOTED_LOSS:
         return []
     return [
-        f"sheets as thick for their width as these resist twist by {lost:.0%} too much: without transverse "
-        "shear, which is left out, they are not softer beside free edges"
+        f"these sheets are narrow for their thickness: their torsional stiffness is about {lost:.0%} too "
+        "large, since transverse shear, which softens them at free edges, is neglected"
     ]
 
 
@@ -175,18 +175,18 @@ def corner_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array, area:
     simple = np.bincount(ends[boundary & supported & ~clamped].ravel(), minlength=n) == 2
     simple &= np.bincount(ends[boundary].ravel(), minlength=n) == 2
     simple &= np.bincount(ends[~boundary & ~supported].ravel(), minlength=n) > 0  # no sheet held in its plane
-    found = np.flatnonzero(simple & (opening > LARGEST_CORNER) & (turn > np.maximum(CORNER, 2.0 * nearby)))
-    length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[found]
-    part = np.where(opening[found] < np.pi, COARSE_CORNER, COARSE_REENTRANT)
-    fine = np.sqrt(area.sum()) * part ** (0.5 / np.abs(1.0 - np.pi / opening[found]))
+    vertices = np.flatnonzero(simple & (opening > LARGEST_CORNER) & (turn > np.maximum(CORNER, 2.0 * nearby)))
+    length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[vertices]
+    part = np.where(opening[vertices] < np.pi, COARSE_CORNER, COARSE_REENTRANT)
+    fine = np.sqrt(area.sum()) * part ** (0.5 / np.abs(1.0 - np.pi / opening[vertices]))
     long = length > 1.5 * fine
-    found, length, fine = (values[long] for values in (found, length, fine))
-    if not len(found):
+    vertices, length, fine = (values[long] for values in (vertices, length, fine))
+    if not len(vertices):
         return []
-    worst, more = int(np.argmin(fine)), f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    worst, more = int(np.argmin(fine)), f" (and {len(vertices) - 1} more)" if len(vertices) > 1 else ""
     return [
-        f"the corner of {np.degrees(opening[found[worst]]):.0f}° between supported edges at vertex "
-        f"{found[worst]}{more} has unbounded moments, for which edges of {length[worst]:.2g} m are long: "
+        f"the corner of {np.degrees(opening[vertices[worst]]):.0f}° between supported edges at vertex "
+        f"{vertices[worst]}{more} has unbounded moments, for which edges of {length[worst]:.2g} m are long: "
         f"refine the mesh towards it, to {fine[worst]:.1g} m"
     ]
 
@@ -205,8 +205,8 @@ def _sides(rest: RestShape, triangles: Ints, number: Ints) -> Sides:
     mesh, scene = rest.mesh, rest.scene
     axes, ends = np.zeros((mesh.n_vertices, 3), dtype=bool), triangles[:, [[1, 2], [2, 0], [0, 1]]]
     slope = np.zeros(triangles.shape, dtype=bool)
-    for place, handle in enumerate(scene.handles):
-        held = select_vertices(mesh, handle, key=f"handles[{place}]", file=scene.source)
+    for i, handle in enumerate(scene.handles):
+        held = select_vertices(mesh, handle, key=f"handles[{i}]", file=scene.source)
         if is_exact(handle):
             axes[held[:, None], list(handle.axis_numbers)] = True
         if handle.holds_slope:

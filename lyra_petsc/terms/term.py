@@ -339,7 +339,7 @@ class Elastic(Term):
     """Whether it is friction of contacts, whose force changes too abruptly for one linear solve per step."""
 
     partner: Elastic | None = None
-    """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
+    """The term whose ``frozen`` data this one is given as well, as it depends on them (friction)."""
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
@@ -436,15 +436,16 @@ class Elastic(Term):
         return None
 
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
-        """Of a term that moves and does not push, for this rank's elements: where its targets stand [m], and
-        the energy's gradient by them [N], (n, 3) each.
+        """Target positions [m] of this rank's owned elements, and the energy's gradient by them [N], (n, 3)
+        each; of a ``moving`` term whose work follows from its energy.
         """
         raise NotImplementedError
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
-        """Work [J] that what moves does on this rank's elements on its way from one time [s] to another.
+        """Work [J] of moving obstacles on this rank's elements between the times ``start`` and ``end`` [s].
 
-        By the forces at positions x (n_local, 3) where it stands at time ``at``; of a term that ``pushes``.
+        The forces are those at positions x (n_local, 3) with obstacles at time ``at``; of a term that
+        ``pushes``.
         """
         raise NotImplementedError
 

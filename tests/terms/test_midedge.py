@@ -704,7 +704,7 @@ def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     }
     found = noted(content, "transverse shear")
     assert len(found) == (1 if thickness == 0.1 else 0)
-    assert all("resist twist by 6% too much" in note for note in found)
+    assert all("torsional stiffness is about 6% too large" in note for note in found)
     everywhere = [{"group": "sheet", "clamp": True}]
     assert not noted(content | {"handles": everywhere}, "transverse shear")
 
