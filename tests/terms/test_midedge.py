@@ -191,7 +191,12 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 sign, at = data["sign"][part], term.edges[part]
                 bent = np.empty((len(triangles), 4))
                 tangents(x, triangles, edges, director, midedge.NO_REST_ROTATION, bent)
-                constants = data["stiffness"][part], midedge.NO_REST_TANGENTS, data["limit"][part], midedge.NO_FRICTION
+                constants = (
+                    data["stiffness"][part],
+                    midedge.NO_REST_TANGENTS,
+                    data["limit"][part],
+                    midedge.NO_FRICTION,
+                )
                 midedge_energy.energies(bent, *constants, energies[part])
                 given = edges, at, sign, frames.direction, bent, *constants, length
                 midedge_energy.add_gradient(x, triangles, *given, pull)
