@@ -121,8 +121,8 @@ class Multipliers(ContactBarrier):
         at = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
         return np.where(self.keys[at] == key, self.multipliers[at], 0.0)
 
-    def take(self, elements: Elements) -> None:
-        super().take(elements)
+    def set_elements(self, elements: Elements) -> None:
+        super().set_elements(elements)
         self._alone = (self.kind == EDGE_EDGE) | (self.points[:, 0] < 0)
 
     def _distance(self, at: Ints, derivatives: Array) -> Array:
@@ -199,7 +199,7 @@ def in_use(ratio: float) -> Iterator[None]:
     if ratio:
         Multipliers.ratio = ratio
         registry.REGISTRY[:] = [
-            dataclasses.replace(entry, home=__name__) if entry.name == "contact" else entry
+            dataclasses.replace(entry, module_name=__name__) if entry.name == "contact" else entry
             for entry in entries
         ]
     try:

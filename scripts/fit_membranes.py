@@ -57,10 +57,11 @@ def at_rest(shell: ShellMaterial) -> Array:
 def slopes(e: Array) -> Array:
     """Stress (n, 3, 6) of each a_k = 1 at strains e (n, 3)."""
     columns = []
-    for forms in measured.FORMS:
+    for forms in measured.FIBRES:
         n = np.array(forms)
         s = np.maximum(e @ n.T, 0.0)
-        rise = np.where(s < measured.FULL, 0.5 * s * s / measured.FULL, s - 0.5 * measured.FULL)
+        full = measured.FULL_STRAIN
+        rise = np.where(s < full, 0.5 * s * s / full, s - 0.5 * full)
         columns.append(rise @ n)
     return np.stack(columns, axis=2)
 

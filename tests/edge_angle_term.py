@@ -14,7 +14,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import bending
-from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_slopes, point
+from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_gradients, point
 from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
@@ -29,7 +29,7 @@ def angles(x, s, theta, slopes):  # type: ignore[no-untyped-def]
     for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
         theta[e] = angle(x0, x1, x2, x3)[0]
-        gradient = angle_slopes(x0, x1, x2, x3)[0]
+        gradient = angle_gradients(x0, x1, x2, x3)[0]
         for a in range(4):
             slopes[e, a, 0], slopes[e, a, 1], slopes[e, a, 2] = gradient[a]
 
@@ -98,7 +98,7 @@ def make(elements: Elements, scene: Scene, mass: Array) -> EdgeAngle:
 
 
 EDGE_ANGLE = Registration(
-    "edge-angle", lambda scene, shells: True, Role.ELASTIC, "angle_energy", bends=True, home=__name__
+    "edge-angle", lambda scene, shells: True, Role.ELASTIC, "angle_energy", bends=True, module_name=__name__
 )
 
 IN_PLACE_OF_HINGES = [entry for entry in REGISTRY if entry.name != "bending"] + [EDGE_ANGLE]

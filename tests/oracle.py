@@ -14,9 +14,16 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.midedge import UPRIGHT, MidEdge, mean_directors
+from lyra_petsc.terms.midedge import NO_REST_ROTATION, MidEdge, mean_directors
 from lyra_petsc.terms.midedge_friction import MidEdgeFriction
-from lyra_petsc.terms.midedge_shape import Frames, carried, derivatives, fading_tangent, tangent_of, unit
+from lyra_petsc.terms.midedge_shape import (
+    Frames,
+    coupling_tangent,
+    derivatives,
+    tangent_of,
+    transported,
+    unit,
+)
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
 
@@ -101,8 +108,8 @@ def directors_along_normals(term: MidEdge, x: Array) -> Array:
     """Unknowns (n,) of edges that let directors be the means of the normals of their triangles."""
     edges = term.of_edges
     tangent = unit(x[edges.ends[:, 1]] - x[edges.ends[:, 0]])
-    across = carried(term.frames, tangent)
-    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length), UPRIGHT)
+    across = transported(term.frames, tangent)
+    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length), NO_REST_ROTATION)
     sine = np.sum(np.cross(tangent, across) * mean, axis=1)
     return np.asarray(edges.length * np.arctan2(sine, np.sum(across * mean, axis=1)))
 
@@ -164,11 +171,12 @@ def midedge_blocks(
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
         (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
-        sheet, tilt = term, term._tilt
+        sheet, rotation = term, term._rest_rotation
     else:
         _, stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
         edges, sheet = term._edges, term._sheet
-        tilt = sheet._tilt[term._rows] if len(sheet._tilt) else sheet._tilt
+        rotation = sheet._rest_rotation
+        rotation = rotation[term._rows] if len(rotation) else rotation
     directors, length = sheet._directors(x, frames), sheet.of_edges.length
     rest = rest if len(rest) else np.zeros((term.n_elements, 3))
     for e, points in enumerate(term.stencil):
@@ -179,10 +187,10 @@ def midedge_blocks(
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
         director = directors[edges[e]]
-        if len(tilt):
-            cosine, sine = tilt[e].T[:, :, None]
+        if len(rotation):
+            cosine, sine = rotation[e].T[:, :, None]
             director = cosine * director - sine * np.cross(sides / along[:, None], director)
-        tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
+        tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.direction[edges[e]]
         beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
         spin = -np.cross(before, tangent) / (along[:, None] * beside)
         about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)
@@ -191,7 +199,7 @@ def midedge_blocks(
         omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double
         ends = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
         own, between = np.diag(np.diag(k)), k - np.diag(np.diag(k))
-        further = s - [fading_tangent(tangent) for tangent in rest[e]]
+        further = s - [coupling_tangent(tangent) for tangent in rest[e]]
         pull = own @ (t - rest[e]) * t1 + between @ further * s1
         gradients, curved = np.zeros((3, 12)), np.zeros((12, 12))
         for i in range(3):

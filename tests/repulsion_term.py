@@ -101,5 +101,5 @@ REPULSION = Registration(
     neighbours=True,
     limits_step=True,
     state=("touched",),
-    home=__name__,
+    module_name=__name__,
 )

@@ -133,7 +133,7 @@ class Trial:
         for term in problem.system.active.elastic if x is not None else ():
             if isinstance(term, MidEdge):
                 own = term.edge_indices < 3 * problem.points.n_owned
-                directors = term.anew(problem.system.x)
+                directors = term.reset_frames(problem.system.x)
                 problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
                 problem.system.active.refreeze({term: term.frames})

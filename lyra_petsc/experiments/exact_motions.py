@@ -31,7 +31,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.registry import active
+from lyra_petsc.terms.registry import needed_terms
 from lyra_petsc.terms.rest import RestShape
 
 
@@ -145,7 +145,7 @@ class Body:
     @property
     def is_bent(self) -> bool:
         """Whether some hinge does not start at its rest angle."""
-        if not any(entry.name == "bending" for entry in active(self.scene, self.rest.shells)):
+        if not any(entry.name == "bending" for entry in needed_terms(self.scene, self.rest.shells)):
             return False
         from lyra_petsc.terms import bending
 

@@ -169,7 +169,7 @@ class Discretisation:
             elements = self._local_elements(*self._global_elements[term])
             if others or not np.array_equal(elements.stencil, term.stencil):
                 self._located.discard(term.name)
-            term.take(elements)
+            term.set_elements(elements)
         return others
 
     def _terms_to_update(self, here: Array, to: Array) -> list[Elastic]:

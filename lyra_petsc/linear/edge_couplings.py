@@ -26,7 +26,7 @@ from lyra_petsc.linear.pattern import MISSING, BlockPattern, block_of, index_typ
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lyra_petsc.terms.term import Offsets, WithEdges
+    from lyra_petsc.terms.term import MixedStencil, Offsets
 
 
 GROUP = 4
@@ -89,7 +89,7 @@ class EdgeCouplings:
 
     Parameters
     ----------
-    elements : sequence of WithEdges
+    elements : sequence of MixedStencil
     n_owned : int
         Block rows that this rank owns.
 
@@ -101,12 +101,12 @@ class EdgeCouplings:
     numbers : Numbers
     """
 
-    def __init__(self, elements: Sequence[WithEdges], n_owned: int) -> None:
+    def __init__(self, elements: Sequence[MixedStencil], n_owned: int) -> None:
         self._n, beyond = n_owned, 3 * n_owned
         least = (int(part.edges.min(initial=beyond)) for part in elements)
         self.n_vertices = first = min(beyond, *least) // 3
 
-        def keys(part: WithEdges) -> tuple[list[Ints], list[Ints]]:
+        def keys(part: MixedStencil) -> tuple[list[Ints], list[Ints]]:
             """Keys of vertex-edge and edge-edge couplings: row · ``beyond`` + place of the column."""
             mixed, edges = [], []
             places = part.edges.astype(np.int64)
@@ -171,7 +171,7 @@ class EdgeCouplings:
         blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
         return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
 
-    def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> Offsets:
+    def offsets_of(self, elements: MixedStencil, pattern: BlockPattern) -> Offsets:
         """Positions of the couplings (a, b), b ≥ a, of elements for edges b; edges come after vertices.
 
         For a vertex and an edge 4 · position of the first of three values + their stride − 1; for two edges

@@ -300,7 +300,7 @@ class SweepsWithEdges:
             self._clean = True
         begin(b, self.r[:n])
         self.of_edges[n:n_owned] = b[n:n_owned]
-        self.r[n_owned:] = 0.0  # ``EdgeTurns.gather`` adds to ghosts
+        self.r[n_owned:] = 0.0  # ``mult_transpose_add`` adds to ghosts
 
     def add(self, rows: Ints, more: Floats) -> None:
         """Add to the residual of rows (n,)."""

@@ -17,7 +17,7 @@ from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.edge_turns import EdgeTurns
+    from lyra_petsc.terms.director_rotations import DirectorRotations
 
 
 COARSEST = 100
@@ -71,12 +71,12 @@ class WithoutEdges(Protocol):
     ----------
     pattern : BlockPattern
         Has the same rows as the finest level's; those of edges are empty.
-    turns : EdgeTurns
+    turns : DirectorRotations
         Interpolation from displacements of vertices to the unknowns of edges.
     """
 
     pattern: BlockPattern
-    turns: EdgeTurns
+    turns: DirectorRotations
 
     def values(self, held: Mask, memory: Array) -> Array:
         """Current block rows (n_blocks, 3, 3), in ``memory``; updates ``turns``.
@@ -94,13 +94,13 @@ class Level:
     pattern : BlockPattern
     galerkin : Galerkin or None
         Interpolation from the next coarser level, and its block rows; None on the coarsest one.
-    turns : EdgeTurns or None
+    turns : DirectorRotations or None
         Interpolation from displacements of vertices to the unknowns of edges.
     memory : (n,) float64 or None
         With unknowns on edges, work array of the sweeps, and before them of the next level's block rows.
     """
 
-    def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
+    def __init__(self, points: Points, pattern: BlockPattern, turns: DirectorRotations | None = None) -> None:
         self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
         self.memory: Array | None = None

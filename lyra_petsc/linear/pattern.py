@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.terms.term import Across, Coupling, Couplings, WithEdges
+from lyra_petsc.terms.term import Coupling, Couplings, MixedStencil, OffDiagonal
 
 if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import EdgeCouplings
@@ -82,7 +82,7 @@ class BlockPattern:
 
     Parameters
     ----------
-    couplings : mapping of name → (E, n) int, Across or WithEdges
+    couplings : mapping of name → (E, n) int, OffDiagonal or MixedStencil
         Local rows that elements couple; the pattern has their blocks and the diagonal.
     n_owned, n_local : int
     n_diagonal : int, optional
@@ -100,8 +100,8 @@ class BlockPattern:
     offsets : dict of name → (E, n (n + 1) / 2) int32, or int64 if needed
         Block of each coupling (a, b), b ≥ a, of an element, ordered as (0, 0), (0, 1), …, (n − 1, n − 1):
         2 · index of the block, + 1 if the block holds the transpose of (a, b); −1 if other ranks own both
-        rows. (E,) for `Across`; for `WithEdges` see ``EdgeCouplings.offsets_of``.
-    edges : dict of name → WithEdges
+        rows. (E,) for `OffDiagonal`; for `MixedStencil` see ``EdgeCouplings.offsets_of``.
+    edges : dict of name → MixedStencil
         Elements that couple edges.
     edge_couplings : EdgeCouplings or None
         Couplings of owned edges, if there are any.
@@ -110,7 +110,7 @@ class BlockPattern:
     def __init__(
         self, couplings: Couplings, n_owned: int, n_local: int, n_diagonal: int | None = None
     ) -> None:
-        self.edges = {name: part for name, part in couplings.items() if isinstance(part, WithEdges)}
+        self.edges = {name: part for name, part in couplings.items() if isinstance(part, MixedStencil)}
         self.edge_couplings: EdgeCouplings | None = None
         self.n_diagonal = n_owned if n_diagonal is None else n_diagonal
         if self.edges:
@@ -146,14 +146,14 @@ class BlockPattern:
 
     def offsets_of(self, coupling: Coupling) -> Offsets:
         """Offsets of elements; `MISSING` for couplings without a block."""
-        if isinstance(coupling, WithEdges):
+        if isinstance(coupling, MixedStencil):
             assert self.edge_couplings is not None
             return self.edge_couplings.offsets_of(coupling, self)
         stencil = _stencil(coupling)
         n = stencil.shape[1]
         out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
         _look_up(self.indptr, self.columns, stencil, out)
-        return out[:, 1].copy() if isinstance(coupling, Across) else out
+        return out[:, 1].copy() if isinstance(coupling, OffDiagonal) else out
 
     def extended(self, more: Ints, n_local: int) -> tuple[BlockPattern, Ints]:
         """The pattern with further blocks ``more``, keys of `missing`, for an n_local with further ghosts.
@@ -253,20 +253,20 @@ def index_type(largest: int) -> np.dtype[Any]:
 
 def _pairs(coupling: Coupling) -> list[tuple[int, int]]:
     """Pairs (a, b), b ≥ a, of an element's rows that are coupled."""
-    if isinstance(coupling, Across):
+    if isinstance(coupling, OffDiagonal):
         return [(0, 1)]
     n = _stencil(coupling).shape[1]
     return [(a, b) for a in range(n) for b in range(a, n)]
 
 
 def _stencil(coupling: Coupling) -> NDArray[np.int32]:
-    return coupling.stencil if isinstance(coupling, Across | WithEdges) else coupling
+    return coupling.stencil if isinstance(coupling, OffDiagonal | MixedStencil) else coupling
 
 
 def _same(one: Coupling | None, other: Coupling) -> bool:
     if one is None or type(one) is not type(other) or not np.array_equal(_stencil(one), _stencil(other)):
         return False
-    return not (isinstance(one, WithEdges) and isinstance(other, WithEdges)) or np.array_equal(
+    return not (isinstance(one, MixedStencil) and isinstance(other, MixedStencil)) or np.array_equal(
         one.edges, other.edges
     )
 
@@ -282,7 +282,7 @@ def _all_keys(couplings: Couplings, n_diagonal: int, n_owned: int, n_local: int)
 
     def stored(part: Ints) -> Ints:
         part = part[part < n_owned * n_local]
-        if not any(isinstance(coupling, WithEdges) for coupling in couplings.values()):
+        if not any(isinstance(coupling, MixedStencil) for coupling in couplings.values()):
             return part
         column = part % n_local
         return part[(column < n_diagonal) | (column >= n_owned)]

@@ -160,7 +160,7 @@ class Smoother:
         with TRANSFER:
             if self._turns is not None:
                 assert not isinstance(self._sweeps, sweeps.BlockSweeps)
-                self._turns.gather(self._sweeps.of_edges, self._sweeps.r)
+                self._turns.mult_transpose_add(self._sweeps.of_edges, self._sweeps.r)
             sweeps.restrict(*self._parents, self._free, self._sweeps.r, coarse)
             PETSc.Log.logFlops(self._transfer_flops)
             self._coarse.add_to_owners(coarse)
@@ -211,7 +211,7 @@ class Smoother:
             correction = self._sweeps.increment
             correction[:] = 0.0
             sweeps.add_interpolated(*self._all_parents, self._free, coarse, correction)
-            self._turns.follow(correction)
+            self._turns.mult_add(correction)
             self.x += correction
         if self._sweeps.correct(self.x):
             self.points.update_ghosts(self.x)  # only owners know the corrections of edges

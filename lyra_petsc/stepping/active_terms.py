@@ -40,7 +40,7 @@ class ActiveTerms:
         self.elastic = [term for term in terms if isinstance(term, Elastic)]
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
-        self.following = [load for load in self.loads if load.follows]
+        self.following = [load for load in self.loads if load.is_follower]
         roles = {term: term.registration.role for term in self.elastic}
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
@@ -65,7 +65,7 @@ class ActiveTerms:
         self.frozen = {**self.frozen, **found, **following}
 
     def turn_targets(self, step: UpcomingStep) -> None:
-        """Let targets that move with handles stand where they do at ``step.at``."""
+        """Let targets that move with handles stand where they do at ``step.target_time``."""
         self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
 
     def gradient(self, terms: Sequence[Elastic | Viscous], at: Array, layout: Layout) -> Array:

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
-from lyra_petsc.terms.term import Pulling
+from lyra_petsc.terms.term import HandleTerm
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
@@ -246,7 +246,7 @@ class Ledger:
         for number, forces, _ in system.held.shares(system.t0, system.t1, self.reaction):
             local[number] = forces.sum(axis=0)
         for term in system.active.elastic:
-            if isinstance(term, Pulling):
+            if isinstance(term, HandleTerm):
                 local += term.handle_forces(system.x, system.active.frozen[term], count)
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)

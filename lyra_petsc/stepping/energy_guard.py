@@ -246,9 +246,9 @@ class EnergyGuard:
         force = np.zeros_like(x1)
         for x, v in ((x0, v0), (x1, v1)):
             for load in self._forces:
-                if load.follows or x is x1:
+                if load.is_follower or x is x1:
                     load.add_force(x, t0, t1, force)
-                    if not load.follows:
+                    if not load.is_follower:
                         load.add_force(x, t0, t1, force)
             wind = np.zeros_like(force)
             for term in system.active.viscous:

@@ -18,7 +18,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.newton_trace import FailedSolve
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.prescribed_handles import Held
+from lyra_petsc.terms.prescribed_handles import ExactHandles
 
 Result = TypeVar("Result")
 
@@ -121,7 +121,7 @@ class Diagnosis:
 def diagnose(
     points: Layout,
     membrane: Membrane,
-    held: Held,
+    held: ExactHandles,
     stuck: FailedSolve,
     x: Array,
     mass: Array,
@@ -134,7 +134,7 @@ def diagnose(
     points : Layout
     membrane : Membrane
         For its triangles.
-    held : Held
+    held : ExactHandles
     stuck : FailedSolve
     x : (n_owned, 3) or more rows
         Positions before the step [m].
@@ -265,7 +265,7 @@ def _stretches(corners: Array, inverse: Array) -> tuple[float, ...]:
     return _numbers(np.linalg.svd(gradient, compute_uv=False)[::-1])
 
 
-def _furthest(comm: MPI.Comm, held: Held, stuck: FailedSolve, x: Array) -> tuple[int | None, float]:
+def _furthest(comm: MPI.Comm, held: ExactHandles, stuck: FailedSolve, x: Array) -> tuple[int | None, float]:
     """The handle that moves its vertices furthest, and how far [m]."""
     ways = _size(np.where(stuck.prescribed, stuck.goal - x, 0.0))
     numbers = held.numbers

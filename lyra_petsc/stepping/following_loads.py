@@ -49,7 +49,7 @@ def following_stiffness(
     n_elements, n = term.stencil.shape
     separate = copy.copy(term)
     numbers = np.arange(n_elements * n, dtype=np.int32).reshape(n_elements, n)
-    separate.take(Elements(numbers, term.elements.data, term.n_owned))
+    separate.set_elements(Elements(numbers, term.elements.data, term.n_owned))
     corners = x[term.stencil]
     step = STEP * float(np.ptp(corners, axis=1).max(initial=0.0)) or STEP
     out = np.empty((n_elements, n, n, 3, 3))

@@ -64,7 +64,7 @@ class Objective:
             stiffness = self.stiffnesses.get(term)
             if stiffness is None:
                 stiffness = term.stiffness(x, of.active.frozen[term])[: term.n_owned]
-            sizes = term.sizes(self._size)
+            sizes = term.coordinate_scale(self._size)
             of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
             # `**` would raise an error where the square is infinite
             square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))

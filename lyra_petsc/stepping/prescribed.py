@@ -8,7 +8,7 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.block_rows import BlockRows, ConstrainedEntries
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
-from lyra_petsc.terms.prescribed_handles import Held
+from lyra_petsc.terms.prescribed_handles import ExactHandles
 
 
 class Prescribed:
@@ -31,7 +31,9 @@ class Prescribed:
         Their velocities [m/s] at the stage.
     """
 
-    def __init__(self, discretisation: Discretisation, held: Held, reference: ReferencePositions) -> None:
+    def __init__(
+        self, discretisation: Discretisation, held: ExactHandles, reference: ReferencePositions
+    ) -> None:
         self._discretisation, self.held, self._reference = discretisation, held, reference
         self._active: tuple[int, ...] | None = None
         self._span = (0.0, 0.0)

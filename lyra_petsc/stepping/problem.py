@@ -35,8 +35,8 @@ from lyra_petsc.stepping.near_pairs import nearest_pair
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.motion import Motion, Window, motion_of
-from lyra_petsc.terms.prescribed_handles import Held, Selection, disagreements, is_exact, select_held
-from lyra_petsc.terms.registry import Role, active, made, registered
+from lyra_petsc.terms.prescribed_handles import ExactHandles, Selection, conflicts, is_exact, select_exact
+from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
 
@@ -176,7 +176,7 @@ def events(scene: Scene) -> list[float]:
     jumps = [
         t
         for number, window in enumerate(windows)
-        for t in motion_of(scene, number).jumps
+        for t in motion_of(scene, number).velocity_jumps
         if window.start < t < window.until + window.fade
     ]
     windows += [Window(load.start, load.until) for load in scene.loads]
@@ -196,7 +196,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         )
     elements: dict[str, Elements] = {}
     names: list[str] = []
-    for entry in active(scene, rest.shells):
+    for entry in needed_terms(scene, rest.shells):
         found = entry.module().elements(rest)
         if found is not None and len(found.stencil) == 0:
             continue
@@ -205,12 +205,12 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
             elements[entry.name] = found
     spacing, reach = mean_edge_length(mesh), float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, reach, scene)
-    held = select_held(scene, mesh)
+    held = select_exact(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
     _check_symmetry(rest, held)
     _check_sliding(rest, held)
-    for entry in map(registered, names):
+    for entry in map(registration_of, names):
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
         if entry.edge_state and any(handle.holds_slope for handle in scene.handles):
@@ -243,7 +243,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         terms=names,
         sources=mesh.sources,
         barrier=_barrier(rest),
-        notes=[*mesh.notes, *rest.notes, *disagreements(scene, mesh, held)],
+        notes=[*mesh.notes, *rest.notes, *conflicts(scene, mesh, held)],
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
@@ -337,7 +337,9 @@ def _set_up_contact(
 def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
-    terms = {n: made(registered(n), part.elements.get(n), scene, on_vertices) for n in outline.terms}
+    terms = {
+        n: make_term(registration_of(n), part.elements.get(n), scene, on_vertices) for n in outline.terms
+    }
     _set_up_contact(scene, outline, terms, layout, mesh)
     for term in terms.values():
         if isinstance(term, (Elastic, Load)):
@@ -347,7 +349,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     coupling = [term for term in terms.values() if term.registration.role in roles]
     discretisation = Discretisation(layout, coupling)
     _check_indices(layout, discretisation.rows.pattern.n_couplings)
-    held = Held(
+    held = ExactHandles(
         scene,
         {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
         _clamped_edges(scene, part, terms),
@@ -365,12 +367,12 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     )
     for term in system.active.elastic:
         if term.registration.coarse:
-            entry, name = registered(term.registration.coarse), f"coarse {term.name}"
+            entry, name = registration_of(term.registration.coarse), f"coarse {term.name}"
             # which are for forces and files, as the angles at rest, that regularised Hessians do not know
             elements = part.elements[name].without("length", "rest_height")
             data = {**elements.data, "rest_angle": elements.data["k"]}
             elements = replace(elements, data=data, index=np.empty(0, dtype=np.int32))
-            coarse = cast("Elastic", made(entry, elements, scene, on_vertices))
+            coarse = cast("Elastic", make_term(entry, elements, scene, on_vertices))
             coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
             system.active.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
@@ -386,7 +388,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     system.state.update_ghosts()
     system.stage_positions[:] = system.x
     for term in system.active.elastic:
-        term.begin(system.x)
+        term.initialise(system.x)
     system.hold_targets(0.0)
     refuse_contact(system, scene, "at the start", TOO_NEAR * outline.barrier.gap if outline.barrier else 0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}

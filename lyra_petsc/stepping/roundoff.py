@@ -25,7 +25,7 @@ def contact_roundoff(system: StageEquations) -> float:
     points, (x, _) = system.points, system.evaluated
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
     for term in system.active.limiting:
-        amount = term.stiffness(x, system.active.frozen[term]) * term.sizes(size)
+        amount = term.stiffness(x, system.active.frozen[term]) * term.coordinate_scale(size)
         scale += np.bincount(term.stencil.ravel(), np.repeat(amount, term.stencil.shape[1]), points.n_local)
     return _norm(system, scale[: points.n_owned])
 

@@ -42,7 +42,7 @@ from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import Frames, carried
+from lyra_petsc.terms.midedge_shape import Frames, transported
 from lyra_petsc.terms.term import Term
 
 CENTRAL = {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
@@ -306,7 +306,7 @@ class Sensitivities:
         system.integrator.restore(memory, before.numbers)
         for term, frames in zip(_edged(system), before.frames, strict=True):
             term.frames = frames
-            term.begin(system.x)
+            term.initialise(system.x)
         system.begin_step(before.time, end)
         self._use_frames(system, before.frames)
         if self._semi:
@@ -386,7 +386,7 @@ class Sensitivities:
                 continue
             across = system.x[ends[:, 1]] - system.x[ends[:, 0]]
             tangent = across / np.linalg.norm(across, axis=1, keepdims=True)
-            first, second = carried(old, tangent), carried(new, tangent)
+            first, second = transported(old, tangent), transported(new, tangent)
             sine = np.sum(np.cross(tangent, first) * second, axis=1)
             angle = np.arctan2(sine, np.sum(first * second, axis=1))
             own = places < 3 * system.points.n_owned

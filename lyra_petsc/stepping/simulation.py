@@ -192,7 +192,7 @@ class SteppedScene:
             self.notes.append("the moments on the edges of the start shape do not balance")
         for term in system.active.elastic:
             if term.registration.element_vertices:  # friction, which knows of no way before the start
-                term.begin(system.x)
+                term.initialise(system.x)
         self._equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = outline.spacing, outline.size, floor

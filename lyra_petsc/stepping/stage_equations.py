@@ -38,9 +38,9 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, resized
-from lyra_petsc.terms.prescribed_handles import Held
+from lyra_petsc.terms.prescribed_handles import ExactHandles
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import LARGEST_TURN, Elastic, StepInterval, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import LARGEST_ROTATION, Elastic, StepInterval, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import ContactImpulses
@@ -91,7 +91,7 @@ class StageEquations:
     mass : (n_owned,) [kg]
         Mass of each block row: the lumped mass of a vertex, 0 for an edge.
     terms : sequence of Term
-    held : Held
+    held : ExactHandles
     integrator : Integrator
     starts : list of float
         Times [s] at which handles start to act.
@@ -134,7 +134,7 @@ class StageEquations:
         discretisation: Discretisation,
         mass: Array,
         terms: Sequence[Term],
-        held: Held,
+        held: ExactHandles,
         *,
         integrator: Integrator,
         starts: list[float],
@@ -426,7 +426,7 @@ class StageEquations:
         """
         found: dict[Term, Any] = {}
         for term in () if self._solving_edges else self.active.with_edges:
-            updated = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
+            updated = term.updated_frames(self._xs, self.active.frozen[term], self.prescribed.mask)
             found |= {} if updated is None else {term: updated}
         if not self.points.comm.allreduce(len(found), MPI.MAX):
             return False
@@ -440,12 +440,12 @@ class StageEquations:
         Changes ``increment``; returns whether it did; collective. The linear increment leads vertices off
         their circles, and directors much too far.
         """
-        if not self.active.with_edges or self.stage.c * self.largest_turn(increment) <= LARGEST_TURN:
+        if not self.active.with_edges or self.stage.c * self.largest_turn(increment) <= LARGEST_ROTATION:
             return False
         x, displacement = self.displacement(v, increment)
         changed, frozen = 0, self.active.frozen
         for term in self.active.with_edges:
-            changed += self._set_increments(increment, *term.followed(x, displacement, frozen[term]))
+            changed += self._set_increments(increment, *term.edge_increments(x, displacement, frozen[term]))
         return bool(self.points.comm.allreduce(changed, MPI.MAX))
 
     def match_directors(self, v: Array, increment: Array, curved: Array) -> None:
@@ -456,7 +456,9 @@ class StageEquations:
         along = self.displacement(v, curved)[1]
         x, displacement = self.displacement(v, increment)
         for term in self.active.with_edges:
-            self._set_increments(curved, *term.followed(x, displacement, self.active.frozen[term], along))
+            self._set_increments(
+                curved, *term.edge_increments(x, displacement, self.active.frozen[term], along)
+            )
 
     def _set_increments(self, increment: Array, places: Ints, values: Array) -> bool:
         """Put displacements (m,) [m] of the free unknowns ``places`` (m,) into ``increment`` (n_owned, 3).
@@ -640,7 +642,7 @@ class StageEquations:
 
     def largest_turn(self, displacement: Array) -> float:
         """Largest angle [rad] by which directors turn in a displacement (n_owned, 3) [m]; collective."""
-        turn = max((term.largest_turn(displacement) for term in self.active.with_edges), default=0.0)
+        turn = max((term.largest_rotation(displacement) for term in self.active.with_edges), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
 
     def _global_minimum(self, number: float) -> float:
@@ -921,7 +923,7 @@ class StageEquations:
     def forget_directors(self) -> None:
         """Discard the remembered directors, whose memory the linear solve needs."""
         for term in self.active.with_edges:
-            term.forget()
+            term.clear_cache()
 
     def forget_rows(self) -> None:
         """Drop all references to the rows that `jacobian` was given, so that their owner can free them."""

@@ -13,7 +13,7 @@ from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.edge_turns import EdgeTurns
+from lyra_petsc.terms.director_rotations import DirectorRotations
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.term import Coupling, Elastic, Viscous
 
@@ -29,7 +29,7 @@ class VertexEquations:
     Attributes
     ----------
     pattern : BlockPattern
-    turns : EdgeTurns
+    turns : DirectorRotations
         The edges' unknowns as functions of the vertices.
     """
 
@@ -45,7 +45,7 @@ class VertexEquations:
             couplings |= term.couplings
         self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local, layout.n_vertices))
         self.pattern = self._rows.pattern
-        self.turns = EdgeTurns(self._bent, layout.n_owned)
+        self.turns = DirectorRotations(self._bent, layout.n_owned)
         self._hold(np.zeros((layout.n_local, 3), dtype=bool))
 
     def _hold(self, held: Mask) -> None:
@@ -54,7 +54,7 @@ class VertexEquations:
         assert term.edges is not None
         self._held, self._constrained = held.copy(), self._rows.constrained_entries(held)
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
-        self.turns.hold(held)
+        self.turns.exclude(held)
 
     def values(self, held: Mask, memory: Array) -> Array:
         """Block rows (n_blocks, 3, 3) at the stage last evaluated, stored in ``memory``.
@@ -65,7 +65,7 @@ class VertexEquations:
         (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
-        self.turns.set(x)
+        self.turns.update(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
         rows.set_diagonal(stage.sigma * equations.mass, values)
         for term in self._elastic:

@@ -6,7 +6,7 @@ Per hinge with rest edge length l, rest areas A0 and A1, rest angle θ̄::
 
 Source: Grinspun et al., Discrete Shells, SCA 2003, with the stiffness calibrated so that B [N·m] is
 the cylindrical bending stiffness on meshes whose lines run along the bend (k ‖ē‖/h̄ with k = B/6).
-Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy``.
+The energy of a hinge fades out if a triangle's area is below a tenth of its rest area, see ``hinge_energy``.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from lyra_petsc.terms.hinge_rows import add_across, add_within
 from lyra_petsc.terms.hinge_triangles import triangles_of
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Across, Couplings, Elastic, Offsets
+from lyra_petsc.terms.term import Couplings, Elastic, OffDiagonal, Offsets
 
 Stencil = NDArray[np.int32] | NDArray[np.int64]
 
 
-class Bent(NamedTuple):
-    """Triangles and hinges of a shape.
+class HingeGeometry(NamedTuple):
+    """Geometry of triangles and hinges at given positions.
 
     Attributes
     ----------
     triangles : (T, 7)
-        As by ``hinge_shape.triangles``.
+        Output of ``hinge_shape.triangles``.
     angles : (E,)
         Dihedral angles [rad] in [−π, π], 0 where a triangle has no normal.
     lengths : (E,)
-        Of the edges [m].
+        Edge lengths [m].
     """
 
     triangles: Array
@@ -53,7 +53,7 @@ def dihedral_angles(x: Array, stencil: Stencil) -> Array:
     """Dihedral angles θ [rad] in [−π, π] of hinges (E, 4), (E,); 0 where a triangle has no normal."""
     sine, cosine = np.empty(len(stencil)), np.empty(len(stencil))
     hinge_shape.angle_parts_of_points(x, stencil, sine, cosine)
-    # all at once: NumPy's are several at a time where the processor can
+    # NumPy's functions of whole arrays use SIMD instructions
     return np.arctan2(sine, cosine, out=sine)
 
 
@@ -65,37 +65,36 @@ class Bending(Elastic):
     elements : Elements
         Stencil (E, 4) as in ``hinge``; data ``k`` (E,) [N·m], ``rest_angle`` (E,) [rad],
         ``rest_height`` (E,) sum of the two heights on the edge [m], ``length`` (E,) of the rest edge [m],
-        ``limit`` (E, 2) of |n|² of both triangles [m⁴], ``damping`` (E,) [s], and the ``places`` (E, 2) that
-        the opposite vertices have among the corners of their triangles (0, 1, 2).
+        ``limit`` (E, 2) of |n|² of both triangles [m⁴], ``damping`` (E,) [s], ``opposite_corners`` (E, 2) of
+        the opposite vertices in their triangles (0, 1, 2).
     """
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("limit", "places"))
+        super().__init__(elements.without("limit", "opposite_corners"))
         self._k, self._rest = data["k"], data["rest_angle"]
-        self._triangles = triangles_of(self.stencil, data["places"].astype(np.int64))
-        # those of a triangle are the same in all of its hinges
+        self._triangles = triangles_of(self.stencil, data["opposite_corners"].astype(np.int64))
+        # all hinges of a triangle have the same limit for it
         self._limit = np.empty(len(self._triangles.corners))
         self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
-        # energy, gradient and Hessian are asked for at one place after the other
-        self._bent = Remembered(self._bend)
+        # energy, gradient and Hessian are usually computed at the same positions
+        self._geometry = Remembered(self._compute_geometry)
 
-    def _bend(self, x: Array) -> Bent:
+    def _compute_geometry(self, x: Array) -> HingeGeometry:
         corners, sides, _ = self._triangles
-        bent = Bent(np.empty((len(corners), 7)), np.empty(self.n_elements), np.empty(self.n_elements))
-        cosine = np.empty(self.n_elements)
-        hinge_shape.triangles(x, corners, self._limit, bent.triangles)
-        hinge_shape.angle_parts(x, self.stencil, sides, bent.triangles, bent.angles, cosine, bent.lengths)
-        # all at once: NumPy's are several at a time where the processor can
-        np.arctan2(bent.angles, cosine, out=bent.angles)
-        return bent
+        triangles = np.empty((len(corners), 7))
+        sine, cosine, length = (np.empty(self.n_elements) for _ in range(3))
+        hinge_shape.triangles(x, corners, self._limit, triangles)
+        hinge_shape.angle_parts(x, self.stencil, sides, triangles, sine, cosine, length)
+        # NumPy's functions of whole arrays use SIMD instructions
+        return HingeGeometry(triangles, np.arctan2(sine, cosine, out=sine), length)
 
     def angles(self, x: Array) -> Array:
-        """Dihedral angles of all hinges of this rank [rad], (E,), not to be written to."""
-        return self._bent(x).angles
+        """Dihedral angles of all hinges of this rank [rad], (E,), a read-only array."""
+        return self._geometry(x).angles
 
     def weights(self, x: Array) -> Array:
-        """Part of its energy that each hinge of this rank has left, (E,): 1 but for collapsed triangles."""
+        """Factor of each hinge's energy by which it fades, (E,); 1 unless a triangle has nearly collapsed."""
         out = np.empty(self.n_elements)
         hinge_forces.weights(x, self.stencil, self._triangles.sides, self._limit, out)
         return out
@@ -105,21 +104,22 @@ class Bending(Elastic):
 
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
-        out, (triangles, angles, _) = np.empty(n), self._bent(x)
+        out, (triangles, angles, _) = np.empty(n), self._geometry(x)
         hinges = self.stencil, self._triangles.sides
         hinge_forces.energies(x, *hinges, triangles, self._limit, angles, self._k, self._rest, out)
         return out
 
     def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
         corners, sides, hinges = self._triangles
-        triangles, angles, lengths = self._bent(x)
-        pulls, law = np.empty(self.n_elements + 1), (self._k, self._rest)
-        hinge_forces.pulls(x, self.stencil, sides, triangles, self._limit, angles, lengths, *law, pulls, out)
-        hinge_forces.add_gradient(corners, hinges, triangles, pulls, out)
+        triangles, angles, lengths = self._geometry(x)
+        geometry, law = (triangles, self._limit, angles, lengths), (self._k, self._rest)
+        forces = np.empty(self.n_elements + 1)
+        hinge_forces.edge_forces(x, self.stencil, sides, *geometry, *law, forces, out)
+        hinge_forces.add_gradient(corners, hinges, triangles, forces, out)
 
     @property
     def couplings(self) -> Couplings:
-        return {self.name: self._triangles.corners, f"{self.name} across": Across(self.stencil[:, 2:])}
+        return {self.name: self._triangles.corners, f"{self.name} across": OffDiagonal(self.stencil[:, 2:])}
 
     def add_hessian(
         self,
@@ -132,19 +132,19 @@ class Bending(Elastic):
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         corners, sides, hinges = self._triangles
-        within, across, bent = offsets[self.name], offsets[f"{self.name} across"], self._bent(x)
+        within, across, shape = offsets[self.name], offsets[f"{self.name} across"], self._geometry(x)
         factors = np.empty((self.n_elements + 1, 2))
         law = self._k, self._rest, self._limit, weight
-        add_across(x, self.stencil, sides, *bent, blend, *law, within, across, values, factors)
-        add_within(x, corners, hinges, sides, bent.triangles, factors, within, values)
-        self._bent.forget()  # what comes next is a linear solve, which needs the room
+        add_across(x, self.stencil, sides, *shape, blend, *law, within, across, values, factors)
+        add_within(x, corners, hinges, sides, shape.triangles, factors, within, values)
+        self._geometry.forget()  # frees memory for the linear solve that follows
 
     def force_scale(self, size: float) -> Array:
         return self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2
 
 
 def _corners_of(triangles: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Which corner (0, 1, 2) of each triangle (n, 3) each vertex (n,) is."""
+    """Corner (0, 1, 2) of each triangle (n, 3) that is the given vertex (n,)."""
     return np.argmax(triangles == vertices[:, None], axis=1)
 
 
@@ -155,14 +155,14 @@ def edge_in_material(
     head: NDArray[np.int64],
     model: str = "hinge",
 ) -> tuple[Array, Array]:
-    """An edge (tail → head) of each triangle in its material plane.
+    """The edge tail → head of each triangle in material axes, and the bending stiffness for its direction.
 
     Returns
     -------
     edge : (n, 2) float64
-        Its material vector [m], warp axis first.
+        Material vector of the edge [m], warp axis first.
     stiffness : (n,) float64
-        B [N·m] of the triangle's hinges for that direction, 0 for materials of other bending models.
+        B [N·m] of a hinge on that edge, 0 for materials of other bending models.
     """
     corners, uv = rest.mesh.triangles[triangle], rest.mesh.triangle_uv[triangle]
     row = np.arange(len(triangle))
@@ -191,7 +191,7 @@ def edge_in_material(
 def _foot_and_height(
     rest: RestShape, triangle: NDArray[np.int64], quad: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Of the opposite vertex over the edge: distance of its foot from the tail and its height [m]."""
+    """Foot, as distance from the tail, and height [m] of the opposite vertex over the edge, (n,) each."""
     tail, head, opposite = quad.T
     edge, _ = edge_in_material(rest, triangle, tail, head)
     side, _ = edge_in_material(rest, triangle, tail, opposite)
@@ -202,9 +202,10 @@ def _foot_and_height(
 
 
 def _angles_from_curvature(rest: RestShape, quad: NDArray[np.int64], triangles: NDArray[np.int64]) -> Array:
-    """Rest angles of the piecewise linear interpolant of z = ½ rᵀ κ r, κ the materials' rest curvature.
+    """Dihedral angles (E,) [rad] of the piecewise linear interpolant of z = ½ rᵀ κ r.
 
-    Positive curvature raises the sheet towards its normal, which makes the angle negative.
+    κ is the materials' rest curvature. Positive curvature raises the sheet towards its normal, which makes
+    the angles negative.
     """
     ee, nn, en = _rest_curvature(rest, triangles[:, 0], quad)
     edge, _ = edge_in_material(rest, triangles[:, 0], quad[:, 0], quad[:, 1])
@@ -220,7 +221,7 @@ def _angles_from_curvature(rest: RestShape, quad: NDArray[np.int64], triangles: 
 def _rest_curvature(
     rest: RestShape, triangle: NDArray[np.int64], edge: NDArray[np.int64]
 ) -> tuple[Array, Array, Array]:
-    """The materials' κ in the frame of an edge (tail, head, …): along, across and mixed [1/m], (n,) each."""
+    """Rest curvature κ of triangles along, across and mixed to edges (tail, head, …), (n,) [1/m] each."""
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells])
     k11, k22, k12 = curved[rest.shell_of[triangle]].T
     vector, _ = edge_in_material(rest, triangle, edge[:, 0], edge[:, 1])
@@ -240,10 +241,10 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
 
 
 def elements(rest: RestShape, model: str = "hinge") -> Elements:
-    """All interior edges of materials of a bending model, with their constants (rank 0).
+    """All interior edges between materials of this bending model, with their constants (rank 0).
 
-    Between two materials the smaller B counts, as in the original; rest lengths are means over the
-    two faces where a seam makes them differ.
+    Between two materials the smaller B is taken, as in the original Lyra. The rest length is the mean over
+    the two triangles, which differ at a seam.
     """
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     edges, stiffnesses = zip(
@@ -266,7 +267,7 @@ def elements(rest: RestShape, model: str = "hinge") -> Elements:
         "rest_height": 2.0 * areas / length,
         "length": length,
         "limit": fading_limit(rest.area[faces]),
-        "places": np.stack(
+        "opposite_corners": np.stack(
             [_corners_of(rest.mesh.triangles[faces[:, i]], quad[:, 2 + i]) for i in (0, 1)], 1
         ),
         "damping": damping,

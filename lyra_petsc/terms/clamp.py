@@ -1,12 +1,12 @@
-"""Clamped edges: half a hinge between each held boundary edge's triangle and its plane at the start.
+"""Clamped edges: half a hinge between the triangle of each held boundary edge and its plane at the start.
 
-Per held boundary edge of rest length l with a triangle of rest area A, φ its rotation about the edge::
+Per held boundary edge of rest length l, with a triangle of rest area A that is rotated by φ about the edge::
 
     energy = ½ B l² (2φ − 2φ̄)² / (2 · 2A) = k (φ − φ̄)²,   k = B l² / (2 A)
 
-that is, half a hinge against the mirror image of the triangle, which moves with the handle; φ̄ comes from
-the material's rest curvature. Below a tenth of its rest area a triangle's energy fades out, see
-``hinge_energy``; the rigid mirror image does not.
+This is half the energy of a hinge between the triangle and its mirror image at the start, which moves with
+the handle. φ̄ follows from the material's rest curvature. The energy fades out as the triangle loses the last
+tenth of its rest area, see ``hinge_energy``.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 NO_LIMIT = 0.0
-"""Of the mirror image, which is rigid."""
+"""Limit of |n|² [m⁴] for the mirror image, which is rigid and never fades."""
 
 
 @kernel()
 def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Energy [J] of the first len(out) edges."""
+    """Write the energy [J] of the first len(out) edges."""
     for e in range(out.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
         theta, square1, square2 = angle(x0, x1, x2, x3)
@@ -44,8 +44,8 @@ def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _gradient(x, s, mirror, k, rest, limit, e, g):  # type: ignore[no-untyped-def]
-    """A moment [N·m] by which g (4, 3) [1/m] is to be multiplied: the gradient [N] of the energy of edge e by
-    its three vertices and the mirror image.
+    """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the gradient [N] of the energy of
+    edge e by its three vertices and the mirror image.
     """
     x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
     theta = angle(x0, x1, x2, x3)[0]
@@ -65,7 +65,7 @@ def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-
 
 @kernel()
 def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
+    """Write the Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
     g, o = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
@@ -75,8 +75,8 @@ def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[
 
 
 @kernel()
-def pulls(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Gradient [N] by the mirror images of the first len(out) edges, (n, 3)."""
+def mirror_gradients(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
+    """Write the energy's gradient [N] by the mirror images of the first len(out) edges into out (n, 3)."""
     g = np.empty((4, 3))
     for e in range(out.shape[0]):
         moment = _gradient(x, s, mirror, k, rest, limit, e, g)
@@ -85,14 +85,14 @@ def pulls(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
 
 
 class Mirrors(NamedTuple):
-    """Clamps in one step.
+    """Targets of the clamps in one step.
 
     Attributes
     ----------
     mirror : (E, 3)
-        The opposite vertices' mirror images [m].
+        Mirror images of the opposite vertices [m].
     k : (E,)
-        Stiffness [N·m]; 0 of handles that do not hold.
+        Stiffness [N·m]; 0 for handles that are not active.
     """
 
     mirror: Array
@@ -113,7 +113,7 @@ class Clamp(Elastic):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 3): edge's tail and head, opposite vertex; data ``k`` (E,) [N·m], ``rest_angle`` (E,)
+        Stencil (E, 3): tail and head of the edge, opposite vertex; data ``k`` (E,) [N·m], ``rest_angle`` (E,)
         [rad], ``height`` (E,) [m], ``limit`` (E,) of |n|² [m⁴], ``handle`` (E,) number of the handle,
         ``damping`` (E,) [s].
     handles : mapping of handle number → (Motion, Window)
@@ -137,8 +137,8 @@ class Clamp(Elastic):
                 k[mine] = self.elements.data["k"][mine]
             corners = self.stencil[mine].astype(np.int64)
             tail, head, opposite = step.reference(window.start, corners.T.ravel()).reshape(3, -1, 3)
-            # also while it does not hold: the angle of k = 0 must stay a number
-            mirror[mine] = motion.carried(_mirrored(tail, head, opposite), window.start, step.at)
+            # also for inactive handles, since 0 times an undefined angle is NaN
+            mirror[mine] = motion.moved(_mirrored(tail, head, opposite), window.start, step.target_time)
         return Mirrors(mirror, k)
 
     def energies(self, x: Array, frozen: Mirrors) -> Array:
@@ -157,17 +157,17 @@ class Clamp(Elastic):
 
     def targets(self, x: Array, frozen: Mirrors) -> tuple[Array, Array]:
         out = np.empty((self.n_owned, 3))
-        pulls(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        mirror_gradients(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
         out[frozen.k[: self.n_owned] == 0.0] = 0.0
         return frozen.mirror[: self.n_owned], out
 
     def force_scale(self, size: float) -> Array:
-        # of the full stiffness: the scale is asked for before the first step
+        # not ``frozen.k``, since the scale is needed before the first step
         return self.elements.data["k"] * size / self.elements.data["height"] ** 2
 
 
 def elements(rest: RestShape) -> Elements:
-    """The held boundary edges of all handles with ``clamp`` (rank 0)."""
+    """The boundary edges whose two ends are held by a handle with ``clamp`` (rank 0)."""
     edges, faces, opposite = boundary_edges(rest.mesh.triangles)
     vector, b = edge_in_material(rest, faces, edges[:, 0], edges[:, 1])
     squared = (vector**2).sum(axis=1)

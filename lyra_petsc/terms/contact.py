@@ -346,8 +346,8 @@ class ContactBarrier(Elastic):
         self.stale = False
         self._deviations, self._obstacle_boxes = np.zeros(1), None
 
-    def take(self, elements: Elements) -> None:
-        super().take(elements)
+    def set_elements(self, elements: Elements) -> None:
+        super().set_elements(elements)
         what = elements.data["what"].reshape(-1, 8).astype(np.int64)
         self.number = elements.data["number"].astype(np.int64)
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
@@ -383,9 +383,9 @@ class ContactBarrier(Elastic):
     def freeze(self, step: UpcomingStep) -> ObstaclePositions:
         if not self.moving:
             start, stage, end = self._obstacle_x
-            at_rest = self.obstacles.rigid_motions(step.start, step.at)
+            at_rest = self.obstacles.rigid_motions(step.start, step.target_time)
             return ObstaclePositions(start, stage, end, at_rest, at_rest)
-        times = step.start, step.at, step.end
+        times = step.start, step.target_time, step.end
         self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in times])
         largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
         self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and len(self.obstacles.planes) > 0))

@@ -1,4 +1,4 @@
-"""Dead loads: a total force on a selection, or a traction per rest area."""
+"""Dead loads: a total force on a selection of vertices, or a traction per rest area."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ from lyra_petsc.terms.term import Load
 
 
 class Force(Load):
-    """Parameters: elements with stencil (E, 1), data ``force`` (E, 3) [N] and ``load`` (E,)."""
+    """Forces and tractions of all loads.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 1); data ``force`` (E, 3) [N], ``load`` (E,) the number of the scene's load.
+    windows : list of Window
+        Of all loads of the scene.
+    """
 
     def __init__(self, elements: Elements, windows: list[Window]) -> None:
         super().__init__(elements)
@@ -28,9 +36,9 @@ class Force(Load):
 
 
 def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.int64], Array]:
-    """Vertices of a total force and the part of it that each carries (their sum is 1).
+    """Vertices on which a total force acts and the share of each; the shares sum to 1.
 
-    Surface groups share by rest area, curve groups by length, everything else equally.
+    They are proportional to rest area in surface groups and to length in curve groups, otherwise equal.
     """
     mesh = rest.mesh
     vertices = select_vertices(mesh, load, key=key, file=rest.scene.source)
@@ -45,8 +53,8 @@ def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.in
             np.add.at(weight, group.edges.ravel(), np.repeat(lengths, 2))
     if not weight.any():
         weight[vertices] = 1.0
-    part: Array = weight[vertices] / weight[vertices].sum()
-    return vertices, part
+    share: Array = weight[vertices] / weight[vertices].sum()
+    return vertices, share
 
 
 def elements(rest: RestShape) -> Elements:
@@ -54,8 +62,8 @@ def elements(rest: RestShape) -> Elements:
     vertices, forces, loads = [], [], []
     for number, load in enumerate(rest.scene.loads):
         if load.force is not None:
-            chosen, part = _shares(rest, load, f"loads[{number}]")
-            force = part[:, None] * np.asarray(load.force)
+            chosen, share = _shares(rest, load, f"loads[{number}]")
+            force = share[:, None] * np.asarray(load.force)
         elif load.traction is not None:
             faces = select_triangles(
                 rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source

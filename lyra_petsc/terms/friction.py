@@ -145,8 +145,8 @@ class CoulombFriction(Elastic):
         self._obstacle_loads = np.zeros((len(contact.obstacles.each), 6))  # in the last step
         self._contact_stiffness = HALFWAY_CURVATURE * contact.barrier.stiffness
 
-    def take(self, elements: Elements) -> None:
-        super().take(elements)
+    def set_elements(self, elements: Elements) -> None:
+        super().set_elements(elements)
         data = elements.data["what"].reshape(-1, COLUMNS)
         n = len(data)
         shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
@@ -233,12 +233,12 @@ class CoulombFriction(Elastic):
         obstacles, fraction = self._contact.obstacles, 1.0
         start = step.start if self._contact_time is None else self._contact_time
         end_motions = stage_motions = obstacles.rigid_motions(start, step.end)
-        if step.start < step.at < step.end:
-            fraction = (step.at - step.start) / (step.end - step.start)
-        elif step.at < step.end:
-            stage_motions = obstacles.rigid_motions(start, step.at)
+        if step.start < step.target_time < step.end:
+            fraction = (step.target_time - step.start) / (step.end - step.start)
+        elif step.target_time < step.end:
+            stage_motions = obstacles.rigid_motions(start, step.target_time)
         end_points = obstacles.positions(step.end)
-        stage_points = obstacles.positions(step.at) if obstacles.moving else end_points
+        stage_points = obstacles.positions(step.target_time) if obstacles.moving else end_points
         return ObstacleMotion(step.end, fraction, stage_motions, end_motions, stage_points, end_points)
 
     def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:

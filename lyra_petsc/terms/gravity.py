@@ -12,7 +12,13 @@ from lyra_petsc.terms.term import Load
 
 
 class Gravity(Load):
-    """Parameters: ``mass`` (n_owned,) [kg] of the owned vertices, ``acceleration`` (3,) [m/s²]."""
+    """Gravity on the owned vertices.
+
+    Parameters
+    ----------
+    mass : (n_owned,) [kg]
+    acceleration : (3,) [m/s²]
+    """
 
     def __init__(self, mass: Array, acceleration: Array) -> None:
         super().__init__(Elements(np.empty((0, 1), dtype=np.int32)))
@@ -26,7 +32,7 @@ class Gravity(Load):
 
 
 def elements(rest: RestShape) -> None:
-    """Gravity couples nothing and needs only the lumped mass."""
+    """None: gravity needs only the lumped mass."""
     return None
 
 

@@ -3,8 +3,9 @@
 Hinge vertices: edge x0-x1, x2 opposite in triangle (0, 1, 2), x3 opposite in (1, 0, 3). With
 e = x1 − x0, n1 = e × (x2 − x0), n2 = (x3 − x0) × e the angle θ = atan2((n1 × n2)·ê, n1·n2) is
 0 for a flat hinge and positive when the opposite vertices lie on the side the normals point away from.
+Also the operations on vectors, as tuples of three numbers, that the kernels of other terms use.
 Source: Grinspun et al., Discrete Shells, SCA 2003; derivatives as in Tamstorf and Grinspun,
-Discrete bending forces and their Jacobians, Graphical Models 75 (2013), derived here anew.
+Discrete bending forces and their Jacobians, Graphical Models 75 (2013), derived independently.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from lyra_petsc.kernels.element import kernel
 
 @kernel(inline="always")
 def point(x, i):  # type: ignore[no-untyped-def]
+    """Row i of x (n, 3)."""
     i = Index(i)
     return x[i, 0], x[i, 1], x[i, 2]
 
@@ -38,17 +40,19 @@ def minus(a, b):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def scaled(factor, v):  # type: ignore[no-untyped-def]
+    """factor v."""
     return factor * v[0], factor * v[1], factor * v[2]
 
 
 @kernel(inline="always")
 def combined(p, u, q, w):  # type: ignore[no-untyped-def]
+    """p u + q w."""
     return p * u[0] + q * w[0], p * u[1] + q * w[1], p * u[2] + q * w[2]
 
 
 @kernel(inline="always")
 def angle_parts(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
-    """|n1| |n2| times sine and cosine of θ, both 0 where a triangle has no normal; |n1|² and |n2|² [m⁴]."""
+    """|n1| |n2| sin θ and |n1| |n2| cos θ, both 0 where a triangle has no normal; |n1|² and |n2|² [m⁴]."""
     e = minus(x1, x0)
     n1 = cross(e, minus(x2, x0))
     n2 = cross(minus(x3, x0), e)
@@ -65,7 +69,7 @@ def angle(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def angle_slopes(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
+def angle_gradients(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """Gradients of θ at the four points [1/m]; |n1|² and |n2|² [m⁴]."""
     e, a, b = minus(x1, x0), minus(x2, x0), minus(x3, x0)
     n1, n2 = cross(e, a), cross(b, e)
@@ -79,20 +83,21 @@ def angle_slopes(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def triangle_turn(length, u, p, m):  # type: ignore[no-untyped-def]
-    """Of one triangle of a hinge: its unit normal n, ω_c and ∇b_c of its three corners, and a vector t.
+def triangle_derivatives(length, u, p, m):  # type: ignore[no-untyped-def]
+    """One triangle's part in the derivatives of θ: unit normal n, ω_c and ∇b_c of its corners, and t.
 
-    With barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the normal turns by −Σ ∇b_d (n · δx_d), so that,
-    summed over both triangles,
+    With barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the change of the normal is −Σ ∇b_d (n · δx_d).
+    Summed over both triangles
 
         ∂²θ/∂x_c∂x_d = −ω_d n ∇b_cᵀ − ω_c ∇b_d nᵀ + σ_c σ_d (n tᵀ + t nᵀ),   σ = 1, −1, 0.
 
-    It has n tᵀ twice in each alone, whose antisymmetric halves cancel. The edge x1 − x0 has the direction
-    u, p goes from x0 to the opposite corner, and m is the normal with twice the triangle's area.
+    (The derivative of one triangle alone has 2 n tᵀ; its antisymmetric part cancels in the sum.) The edge
+    x1 − x0 has the given ``length`` and direction u, p is the vector from x0 to the opposite corner, and m
+    the normal with the length of twice the triangle's area.
     """
     inverse = 1.0 / math.sqrt(dot(m, m))
     n = scaled(inverse, m)
-    # up: the direction of the height, from the edge to the opposite corner
+    # up: unit vector along the height, from the edge to the opposite corner
     steep, part = length * inverse, dot(p, u) / length
     up = combined(steep, p, -part * length * steep, u)
     # ω = (1/h − f/(L h), f/(L h), −1/h) with the height h and its foot at f
@@ -110,7 +115,7 @@ def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-de
     u = scaled(1.0 / length, e)
     for side in range(2):
         p = minus(x2, x0) if side == 0 else minus(x3, x0)
-        n, w, b, t = triangle_turn(length, u, p, cross(e, p) if side == 0 else cross(p, e))
+        n, w, b, t = triangle_derivatives(length, u, p, cross(e, p) if side == 0 else cross(p, e))
         for c in range(3):
             for d in range(3):
                 turned = 0.0 if c == 2 or d == 2 else (1.0 if c == d else -1.0)

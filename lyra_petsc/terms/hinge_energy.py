@@ -3,10 +3,10 @@
     energy = k (θ − θ̄)² w(a1) w(a2)
     a_t = (A_t / 0.1 A0_t)²,   w(a) = a³ (10 − 15 a + 6 a²), 1 from a = 1 on
 
-with the areas A and the rest areas A0 of the hinge's two triangles. A triangle without an area has no
-normal, hence no dihedral angle: as it loses its last tenth the energy fades out, with two continuous
-derivatives, where the angle's own gradient would grow like one over the height. A membrane of St.
-Venant-Kirchhoff's softens long before, at 1/√3 of a length.
+with the areas A and the rest areas A0 of the hinge's two triangles. A triangle without area has no normal,
+hence no dihedral angle, and the gradient of the angle grows like 1/height. Therefore the energy fades out,
+with two continuous derivatives, as the triangle loses the last tenth of its area. (A St. Venant-Kirchhoff
+membrane softens long before, at 1/√3 of a length.)
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.hinge import add_angle_hessian, angle_slopes, cross, dot, minus
+from lyra_petsc.terms.hinge import add_angle_hessian, angle_gradients, cross, dot, minus
 
 FADES_BELOW = 0.1
-"""Part of a triangle's rest area below which the hinges on its edges fade."""
+"""Fraction of a triangle's rest area below which the hinges on its edges fade."""
 
-GONE = 1e-30
-"""a below which nothing is left: w is 0 beside 1, and the divisions of the angle's derivatives end in inf."""
+VANISHED = 1e-30
+"""a below which w counts as 0: it is negligible, and divisions in the angle's derivatives may overflow."""
 
 
 def fading_limit(area: NDArray[np.float64]) -> NDArray[np.float64]:
-    """|n|² [m⁴] of the normal n = 2A from which triangles of these rest areas [m²] count in full."""
+    """|n|² [m⁴], |n| = 2A, above which w = 1, for triangles of these rest areas [m²]."""
     return (FADES_BELOW * 2.0 * area) ** 2
 
 
@@ -33,22 +33,22 @@ def fading_limit(area: NDArray[np.float64]) -> NDArray[np.float64]:
 def fade(square, limit):  # type: ignore[no-untyped-def]
     """w of one triangle, and its first two derivatives with respect to |n|² [1/m⁴, 1/m⁸].
 
-    Without a limit (0) a triangle counts in full as long as it has an area.
+    With limit 0 a triangle has w = 1 as long as its area is not 0.
     """
-    if square <= GONE * limit:
+    if square <= VANISHED * limit:
         return 0.0, 0.0, 0.0
     if square >= limit:
         return 1.0, 0.0, 0.0
     a = square / limit
-    left = 1.0 - a
-    first = 30.0 * (a * left) ** 2 / limit
-    second = 60.0 * a * left * (1.0 - 2.0 * a) / limit / limit
+    rest = 1.0 - a
+    first = 30.0 * (a * rest) ** 2 / limit
+    second = 60.0 * a * rest * (1.0 - 2.0 * a) / limit / limit
     return a * a * a * (10.0 - 15.0 * a + 6.0 * a * a), first, second
 
 
 @kernel()
 def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-def]
-    """w(a1) w(a2): 1 unless a triangle has lost nearly all its area."""
+    """w(a1) w(a2); 1 unless a triangle has lost nearly all its area."""
     return fade(square1, limit1)[0] * fade(square2, limit2)[0]
 
 
@@ -62,9 +62,9 @@ def hinge_energy(theta, square1, square2, k, rest, limits):  # type: ignore[no-u
 
 
 @kernel(inline="always")
-def _set_slopes(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
-    """The gradient of θ into g (4, 3); |n1|² and |n2|² [m⁴]."""
-    slopes, square1, square2 = angle_slopes(x0, x1, x2, x3)
+def _write_angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
+    """Write the gradient of θ into g (4, 3); return |n1|² and |n2|² [m⁴]."""
+    slopes, square1, square2 = angle_gradients(x0, x1, x2, x3)
     for a in range(4):
         g[a, 0], g[a, 1], g[a, 2] = slopes[a]
     return square1, square2
@@ -72,8 +72,8 @@ def _set_slopes(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[no-untyped-def]
-    """A moment [N·m] by which g (4, 3) [1/m] is to be multiplied: the energy's gradient [N]."""
-    square1, square2 = _set_slopes(x0, x1, x2, x3, g)
+    """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the energy's gradient [N]."""
+    square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
     change = theta - rest
     if not (square1 > limits[0] and square2 > limits[1]):
         change = _fade_gradient(x0, x1, x2, x3, square1, square2, limits[0], limits[1], change, g)
@@ -82,11 +82,11 @@ def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[n
 
 @kernel(inline="always")
 def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N/m] into out (4, 4, 3, 3).
+    """Write the Hessian blocks [N/m] into out (4, 4, 3, 3); g (4, 3) is work space.
 
-    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w w; g (4, 3) is overwritten.
+    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w(a1) w(a2).
     """
-    square1, square2 = _set_slopes(x0, x1, x2, x3, g)
+    square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
     change = theta - rest
     stiffness = 2.0 * k
     for a in range(4):
@@ -102,14 +102,14 @@ def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # typ
 
 @kernel()
 def _normals(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
-    """Normals [m²] of triangles (0, 1, 2) and (1, 0, 3), each twice as long as its area."""
+    """Normals [m²] of triangles (0, 1, 2) and (1, 0, 3), of length twice the area."""
     e = minus(x1, x0)
     return cross(e, minus(x2, x0)), cross(minus(x3, x0), e)
 
 
 @kernel()
-def _slopes(x0, x1, x2, x3, out):  # type: ignore[no-untyped-def]
-    """∇|n|² [m³] of both triangles into out (2, 4, 3): 2 ε × n with the edge ε opposite each corner."""
+def _square_gradients(x0, x1, x2, x3, out):  # type: ignore[no-untyped-def]
+    """Write ∇|n|² [m³] of both triangles into out (2, 4, 3): 2 ε × n with the edge ε opposite each corner."""
     n1, n2 = _normals(x0, x1, x2, x3)
     out[:] = 0.0
     _set_row(out[0, 0], cross(minus(x1, x2), n1))
@@ -130,14 +130,14 @@ def _set_row(row, values):  # type: ignore[no-untyped-def]
 def _fade_gradient(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, change, g
 ):
-    """Turn ∇θ in g (4, 3) into W ∇θ + ½ (θ − θ̄) ∇W, W = w(a1) w(a2); what θ − θ̄ counts as then."""
+    """Replace ∇θ in g (4, 3) by W ∇θ + ½ (θ − θ̄) ∇W, W = w(a1) w(a2); return θ − θ̄, or 0 where W is 0."""
     w1, d1, _ = fade(square1, limit1)
     w2, d2, _ = fade(square2, limit2)
-    if w1 * w2 == 0.0:  # where θ itself may be no number
+    if w1 * w2 == 0.0:  # g may be infinite
         g[:] = 0.0
         return 0.0
     slopes = np.empty((2, 4, 3))
-    _slopes(x0, x1, x2, x3, slopes)
+    _square_gradients(x0, x1, x2, x3, slopes)
     for a in range(4):
         for i in range(3):
             slope = d1 * w2 * slopes[0, a, i] + w1 * d2 * slopes[1, a, i]
@@ -147,10 +147,10 @@ def _fade_gradient(  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
-    """Add scale ∂²|n|²/∂y² of a triangle's corners y, points ``at`` of the hinge, to out (4, 4, 3, 3).
+    """Add scale ∂²|n|²/∂y² of a triangle with corners y to out (4, 4, 3, 3).
 
-    Of corners c and d with opposite edges ε: 2 ((ε_c·ε_d) I − ε_d ε_cᵀ − σ [n]×), σ = 1 if d follows c,
-    −1 if c follows d, 0 if they are the same.
+    ``at`` are the corners' numbers in the hinge. For corners c and d with opposite edges ε the block is
+    2 ((ε_c·ε_d) I − ε_d ε_cᵀ − σ [n]×), with σ = 1 if d follows c, −1 if c follows d, 0 if they are the same.
     """
     sides = minus(y[1], y[2]), minus(y[2], y[0]), minus(y[0], y[1])
     for c in range(3):
@@ -170,18 +170,18 @@ def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
 def _fade_hessian(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out
 ):
-    """Turn the Hessian of f = k (θ − θ̄)² in out (4, 4, 3, 3) into that of f W, W = w(a1) w(a2)."""
+    """Replace the Hessian of f = k (θ − θ̄)² in out (4, 4, 3, 3) by that of f W, W = w(a1) w(a2)."""
     w1, d1, dd1 = fade(square1, limit1)
     w2, d2, dd2 = fade(square2, limit2)
     if w1 * w2 == 0.0:
         out[:] = 0.0
         return
     out *= w1 * w2
-    # of the rest, the regularised Hessian has nothing
+    # the regularised Hessian consists of the term above only
     force, value = (1.0 - blend) * 2.0 * k * change, (1.0 - blend) * k * change * change
     n1, n2 = _normals(x0, x1, x2, x3)
     slopes, bent = np.empty((2, 4, 3)), np.zeros((4, 4, 3, 3))
-    _slopes(x0, x1, x2, x3, slopes)
+    _square_gradients(x0, x1, x2, x3, slopes)
     add_square_hessian((x0, x1, x2), n1, (0, 1, 2), d1 * w2, bent)
     add_square_hessian((x1, x0, x3), n2, (1, 0, 3), w1 * d2, bent)
     for a in range(4):

@@ -1,6 +1,6 @@
-"""Energies of hinges and their gradients. Shapes of triangles are those of ``hinge_shape``.
+"""Energies of hinges and their gradients, from the triangles' ``shape`` (T, 7) of ``hinge_shape``.
 
-The gradient is put together triangle by triangle, along whose normal all forces of its hinges act.
+The gradient is assembled by triangles, since all forces of a triangle's hinges act along its normal.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from lyra_petsc.terms.hinge_shape import fades
 
 @kernel(inline="always")
 def limits_of(limit, sides, h):  # type: ignore[no-untyped-def]
-    """The limits of |normal|² of a hinge's triangles."""
+    """The limits of |normal|² of the two triangles of hinge h."""
     return limit[sides[h, 0] >> 2], limit[sides[h, 1] >> 2]
 
 
 @kernel()
 def weights(x, s, sides, limit, out):  # type: ignore[no-untyped-def]
-    """Part of its energy that each hinge has left, 1 but for collapsed triangles, into out (E,)."""
+    """Write the factor w(a1) w(a2) of each hinge into out (E,); 1 unless a triangle has nearly collapsed."""
     for h in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
         _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
@@ -32,7 +32,7 @@ def weights(x, s, sides, limit, out):  # type: ignore[no-untyped-def]
 
 @kernel()
 def energies(x, s, sides, shape, limit, theta, k, rest, out):  # type: ignore[no-untyped-def]
-    """Energy [J] of the first len(out) hinges."""
+    """Write the energy [J] of the first len(out) hinges."""
     for h in range(out.shape[0]):
         change = theta[h] - rest[h]
         out[h] = k[h] * change * change
@@ -43,18 +43,19 @@ def energies(x, s, sides, shape, limit, theta, k, rest, out):  # type: ignore[no
 
 
 @kernel()
-def pulls(x, s, sides, shape, limit, theta, length, k, rest, pull, out):  # type: ignore[no-untyped-def]
-    """Moments over the edges' lengths [N] into pull (E + 1,), 0 of hinges that fade and in the last place.
+def edge_forces(x, s, sides, shape, limit, theta, length, k, rest, force, out):  # type: ignore[no-untyped-def]
+    """Write the hinges' moments over their edge lengths [N] into force (E + 1,).
 
-    The gradient of those that fade is added to out (n_local, 3).
+    Entries of hinges that fade, and the last one, are 0; the gradients of hinges that fade are added to out
+    (n_local, 3).
     """
     g = np.empty((4, 3))
-    pull[-1] = 0.0
+    force[-1] = 0.0
     for h in range(s.shape[0]):
         if not fades(shape, sides, h):
-            pull[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
+            force[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
         else:
-            pull[h] = 0.0
+            force[h] = 0.0
             x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
             limits = limits_of(limit, sides, h)
             moment = hinge_gradient(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, g)
@@ -64,15 +65,15 @@ def pulls(x, s, sides, shape, limit, theta, length, k, rest, pull, out):  # type
 
 
 @kernel()
-def add_gradient(corners, hinges, shape, pull, out):  # type: ignore[no-untyped-def]
-    """Add the energy's gradient [N] to out (n_local, 3).
+def add_gradient(corners, hinges, shape, force, out):  # type: ignore[no-untyped-def]
+    """Add the energy's gradient [N] to out (n_local, 3), except that of hinges that fade.
 
-    At the ends of an edge it is the pull times the cotangent at the other end.
+    At an end of an edge it is the hinge's ``force`` times the cotangent of the angle at the other end.
     """
     for t in range(corners.shape[0]):
         c0, c1, c2 = shape[t, 3], shape[t, 4], shape[t, 5]
         h0, h1, h2 = Index(hinges[t, 0] >> 1), Index(hinges[t, 1] >> 1), Index(hinges[t, 2] >> 1)
-        p0, p1, p2 = pull[h0], pull[h1], pull[h2]
+        p0, p1, p2 = force[h0], force[h1], force[h2]
         f1 = p0 * c2 + p2 * c0 - p1 * (c0 + c2)
         f2 = p0 * c1 + p1 * c0 - p2 * (c0 + c1)
         i0, i1, i2 = Index(corners[t, 0]), Index(corners[t, 1]), Index(corners[t, 2])

@@ -1,13 +1,14 @@
-"""Hessians of hinges added straight to block rows, triangle by triangle.
+"""Hessians of hinges, assembled by triangles directly into block rows.
 
-A hinge has ∂θ/∂x_c = ω_c n at the corners of each of its triangles, and its Hessian k' ∇θ ∇θᵀ + z ∂²θ, with
-k' = 2 k w w and z = 2 k (θ − θ̄), is made of blocks in either triangle and one across, of the two opposite
-vertices. All blocks of a triangle with normal n are of the form n Rᵀ + L nᵀ, whichever of its sides they come
-from: six blocks are added for the three hinges that have thirty. ∂²θ is that of ``hinge.triangle_turn``.
+A hinge has ∂θ/∂x_c = ω_c n at the corners of each of its triangles. Its Hessian k' ∇θ ∇θᵀ + z ∂²θ, with
+k' = 2 k w w and z = 2 k (θ − θ̄), consists of blocks *within* each of the two triangles and one block *across*
+the edge, which couples the two opposite vertices. All blocks within a triangle of normal n have the form
+n Rᵀ + L nᵀ, for each of its sides: six blocks are added for three hinges, which have thirty. ∂²θ is as in
+``hinge.triangle_derivatives``.
 
-With the cotangents c of the corners' angles, ℓ = c_i + c_j of the side between i and j, of length √s, and K
-opposite to it, ω is (c_j, c_i, −ℓ)/√s at (i, j, K): what the side gives is k'/s and z/√s times products of
-γ = (c_j, c_i, −ℓ).
+Let c be the cotangents of the corners' angles, i and j the ends of a side of length √s, K the corner opposite
+it, and ℓ = c_i + c_j. Then ω is (c_j, c_i, −ℓ)/√s at (i, j, K), and the side contributes k'/s and z/√s times
+products of γ = (c_j, c_i, −ℓ).
 """
 
 from __future__ import annotations
@@ -26,43 +27,43 @@ from lyra_petsc.terms.hinge_shape import fades, triangles_at
 
 @kernel(inline="always")
 def _ends(corner):  # type: ignore[no-untyped-def]
-    """The two other corners of a triangle, in its sense."""
+    """The two other corners of a triangle, in its orientation."""
     return (corner + 1 if corner < 2 else 0), (corner - 1 if corner > 0 else 2)
 
 
 @kernel(inline="always")
-def _pair(a, b):  # type: ignore[no-untyped-def]
-    """Which of a triangle's couplings (0, 0), (0, 1), …, (2, 2) is that of two corners."""
+def _pair_index(a, b):  # type: ignore[no-untyped-def]
+    """Index of the coupling of corners a and b among (0, 0), (0, 1), …, (2, 2) of a triangle."""
     low, high = min(a, b), max(a, b)
     return low * (5 - low) // 2 + high
 
 
 @kernel(inline="always")
 def _same_block(at, swapped):  # type: ignore[no-untyped-def]
-    """Offset of the same block, added transposed where ``swapped``."""
+    """Offset of the same block, to which values are added transposed if ``swapped``."""
     return 2 * (at >> 1) + int(swapped) if at >= 0 else at
 
 
 @kernel()
 def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
-    """Offsets of all couplings of hinge h, into out (10,)."""
+    """Write the offsets of all couplings of hinge h into out (10,)."""
     one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3
-    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs along the edge the other way
-    out[0] = within[one, _pair(i, i)]
-    out[1] = _same_block(within[one, _pair(i, j)], s[h, 0] < s[h, 1])
-    out[2] = _same_block(within[one, _pair(i, p)], s[h, 0] < s[h, 2])
-    out[3] = _same_block(within[two, _pair(k, q)], s[h, 0] < s[h, 3])
-    out[4] = within[one, _pair(j, j)]
-    out[5] = _same_block(within[one, _pair(j, p)], s[h, 1] < s[h, 2])
-    out[6] = _same_block(within[two, _pair(m, q)], s[h, 1] < s[h, 3])
-    out[7] = within[one, _pair(p, p)]
+    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs against the edge
+    out[0] = within[one, _pair_index(i, i)]
+    out[1] = _same_block(within[one, _pair_index(i, j)], s[h, 0] < s[h, 1])
+    out[2] = _same_block(within[one, _pair_index(i, p)], s[h, 0] < s[h, 2])
+    out[3] = _same_block(within[two, _pair_index(k, q)], s[h, 0] < s[h, 3])
+    out[4] = within[one, _pair_index(j, j)]
+    out[5] = _same_block(within[one, _pair_index(j, p)], s[h, 1] < s[h, 2])
+    out[6] = _same_block(within[two, _pair_index(m, q)], s[h, 1] < s[h, 3])
+    out[7] = within[one, _pair_index(p, p)]
     out[8] = across[h]
-    out[9] = within[two, _pair(q, q)]
+    out[9] = within[two, _pair_index(q, q)]
 
 
 @kernel()
 def _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight times the blocks of a hinge of triangles that have nearly no area."""
+    """Add weight times all blocks of hinge h, which fades."""
     gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
     hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, gradient, blocks)
@@ -73,10 +74,10 @@ def _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values):
 def add_across(  # type: ignore[no-untyped-def]
     x, s, sides, shape, theta, length, blend, k, rest, limit, weight, within, across, values, factors
 ):
-    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact.
+    """Add weight (E,) times the blocks across the hinges' edges; ``blend`` 0 is exact.
 
-    The factors (E + 1, 2) are those that ``add_within`` takes. Hinges of triangles that fade are added whole,
-    with factors 0.
+    Writes ``factors`` (E + 1, 2), k'/s and z/√s times the weight, for ``add_within``. Hinges that fade are
+    added completely and get factors 0.
     """
     offsets = np.empty(10, dtype=within.dtype)
     factors[-1, 0] = factors[-1, 1] = 0.0
@@ -99,8 +100,10 @@ def add_across(  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _beyond(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
-    """Beyond a side: its factors, the first times γ at the side's ends in our sense, and the normal."""
+def _beyond_side(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
+    """Data of the triangle beyond a side: the hinge's two factors, the first of them times γ of that triangle
+    at the side's two ends (in the order of this triangle), and the normal.
+    """
     h = Index(hinge >> 1)
     side = sides[h, Index(1 - (hinge & 1))]
     t, (i, j) = Index(side >> 2), _ends(side & 3)
@@ -110,8 +113,8 @@ def _beyond(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _own(n, g, corner, one, other):  # type: ignore[no-untyped-def]
-    """R and L of a corner and itself; of the two sides at it ``one`` and ``other``."""
+def _diagonal_block(n, g, corner, one, other):  # type: ignore[no-untyped-def]
+    """R and L of the diagonal block of a corner, with the two sides ``one`` and ``other`` at it."""
     _, _, turn, slope, _ = corner
     (p, n1, t1), (q, n2, t2) = one, other
     left = (-turn, slope), (1.0, t1), (1.0, t2)
@@ -119,8 +122,11 @@ def _own(n, g, corner, one, other):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _pair_of(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
-    """R and L of corners a and b, with the side between them; p are those beyond their opposite sides."""
+def _off_diagonal_block(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
+    """R and L of the block of corners a and b, with the side between them.
+
+    p_ab and p_ba are the values at b and a beyond the sides opposite a and b.
+    """
     ca, la, oa, slope_a, na = a
     cb, lb, ob, slope_b, nb = b
     pa, pb, nm, t = side
@@ -131,9 +137,9 @@ def _pair_of(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # type: ignore[no-untyped-def]
-    """Add the blocks of triangles with ``offsets`` (T, 6).
+    """Add the blocks within triangles at ``offsets`` (T, 6), with the ``factors`` of `add_across`.
 
-    Of the blocks n n'ᵀ and n' nᵀ of a side's ends each of its two triangles adds a half.
+    The blocks n n'ᵀ and n' nᵀ of a side's ends are shared: each of the two triangles adds one half.
     """
     for t in range(corners.shape[0]):
         fetch_ahead(t, offsets, values, 6)
@@ -147,9 +153,9 @@ def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # t
         l0, l1, l2 = inverse * dot(e0, e0), inverse * dot(e1, e1), inverse * dot(e2, e2)
         m = scaled(inverse, n)
         b0, b1, b2 = cross(m, e0), cross(m, e1), cross(m, e2)  # gradients of the barycentric coordinates
-        w0, z0, p01, p02, n0 = _beyond(hinges[t, 0], sides, shape, factors)
-        w1, z1, p12, p10, n1 = _beyond(hinges[t, 1], sides, shape, factors)
-        w2, z2, p20, p21, n2 = _beyond(hinges[t, 2], sides, shape, factors)
+        w0, z0, p01, p02, n0 = _beyond_side(hinges[t, 0], sides, shape, factors)
+        w1, z1, p12, p10, n1 = _beyond_side(hinges[t, 1], sides, shape, factors)
+        w2, z2, p20, p21, n2 = _beyond_side(hinges[t, 2], sides, shape, factors)
         t0, t1, t2 = scaled(0.5 * z0 / l0, b0), scaled(0.5 * z1 / l1, b1), scaled(0.5 * z2 / l2, b2)
         one = c0, l0, z1 * c2 + z2 * c1 - z0 * l0, b0, n0
         two = c1, l1, z0 * c2 + z2 * c0 - z1 * l1, b1, n1
@@ -161,11 +167,11 @@ def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # t
         g12 = w0 * c1 * c2 - w1 * l1 * c0 - w2 * l2 * c0
         g22 = w0 * c1 * c1 + w1 * c0 * c0 + w2 * l2 * l2
         blocks = (
-            _own(n, g00, one, (c2 * p10, n1, t1), (c1 * p20, n2, t2)),
-            _pair_of(n, g01, one, two, (p20, p21, n2, t2), p01, p10),
-            _pair_of(n, g02, one, three, (p10, p12, n1, t1), p02, p20),
-            _own(n, g11, two, (c2 * p01, n0, t0), (c0 * p21, n2, t2)),
-            _pair_of(n, g12, two, three, (p01, p02, n0, t0), p12, p21),
-            _own(n, g22, three, (c1 * p02, n0, t0), (c0 * p12, n1, t1)),
+            _diagonal_block(n, g00, one, (c2 * p10, n1, t1), (c1 * p20, n2, t2)),
+            _off_diagonal_block(n, g01, one, two, (p20, p21, n2, t2), p01, p10),
+            _off_diagonal_block(n, g02, one, three, (p10, p12, n1, t1), p02, p20),
+            _diagonal_block(n, g11, two, (c2 * p01, n0, t0), (c0 * p21, n2, t2)),
+            _off_diagonal_block(n, g12, two, three, (p01, p02, n0, t0), p12, p21),
+            _diagonal_block(n, g22, three, (c1 * p02, n0, t0), (c0 * p12, n1, t1)),
         )
         add_six(values, offsets, t, n, blocks)

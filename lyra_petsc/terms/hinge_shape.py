@@ -1,4 +1,4 @@
-"""The shape that hinges and their triangles have: normals, cotangents, dihedral angles."""
+"""Geometry of hinges and their triangles: normals, cotangents, dihedral angles."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lyra_petsc.terms.hinge import cross, dot, minus, point
 
 @kernel()
 def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
-    """Of triangles with limits of |normal|² (T,) what their hinges' derivatives are made of, into out (T, 7).
+    """Write the geometry of triangles into out (T, 7), from which derivatives of hinges are computed.
 
-    Unit normal, cotangents of the corners' angles, |normal| [m²], which is twice the area. Zeros for those
-    that have no area left, or so little that their hinges fade.
+    Unit normal (3), cotangents of the corners' angles (3), |normal| [m²] (twice the area). All are 0 for
+    triangles whose hinges fade, that is, |normal|² is not above ``limit`` (T,).
     """
     for t in range(corners.shape[0]):
         a, b, c = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
@@ -36,21 +36,21 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def triangles_at(sides, h):  # type: ignore[no-untyped-def]
-    """Numbers of a hinge's two triangles."""
+    """Numbers of the two triangles of hinge h."""
     return Index(sides[h, 0] >> 2), Index(sides[h, 1] >> 2)
 
 
 @kernel(inline="always")
 def fades(shape, sides, h):  # type: ignore[no-untyped-def]
-    """Whether one of a hinge's triangles has hardly an area left, or none."""
-    # no ``or``: a jump would have numba count references to the arrays here, for each hinge
+    """Whether hinge h fades, because one of its triangles has hardly any area."""
+    # no ``or``: with a branch numba counts references to the arrays here, for each hinge
     one, two = triangles_at(sides, h)
     return (shape[one, 6] == 0.0) | (shape[two, 6] == 0.0)
 
 
 @kernel()
 def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-untyped-def]
-    """Of hinges' dihedral angles, up to a factor, and lengths [m] of the edges, into (E,) each."""
+    """Write sines and cosines (E,) of dihedral angles, up to a common factor, and edge lengths (E,) [m]."""
     for h in range(s.shape[0]):
         x0, x1 = point(x, s[h, 0]), point(x, s[h, 1])
         e = minus(x1, x0)
@@ -66,7 +66,7 @@ def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-un
 
 @kernel()
 def angle_parts_of_points(x, s, sine, cosine):  # type: ignore[no-untyped-def]
-    """Of hinges' dihedral angles, up to a factor, into (E,) each."""
+    """Write sines and cosines (E,) of dihedral angles, up to a common factor, of hinges s (E, 4)."""
     for h in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
         sine[h], cosine[h], _, _ = hinge.angle_parts(x0, x1, x2, x3)

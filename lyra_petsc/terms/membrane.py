@@ -1,4 +1,4 @@
-"""Membrane: an energy of the Green strain of the constant-strain triangle, by a law of ``membrane_laws``.
+"""Membrane: an energy of the Green strain of constant-strain triangles, with a law of ``membrane_laws``.
 
 Per triangle of rest area A, with F = ∂x/∂u (3×2) and the Green strain E = (FᵀF − I)/2::
 
@@ -36,7 +36,7 @@ Stencil = NDArray[np.int32]
 
 @kernel(inline="always")
 def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
-    """Columns fu, fv of the deformation gradient of triangle e."""
+    """Columns fu and fv of the deformation gradient of triangle e, six numbers."""
     a, b, c = Index(s[e, 0]), Index(s[e, 1]), Index(s[e, 2])
     px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
     qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
@@ -49,7 +49,7 @@ def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _green(f):  # type: ignore[no-untyped-def]
-    """Green strain (E_uu, E_vv, 2 E_uv)."""
+    """Green strain (E_uu, E_vv, 2 E_uv) of a deformation gradient."""
     ux, uy, uz, vx, vy, vz = f
     return (
         0.5 * (ux * ux + uy * uy + uz * uz - 1.0),
@@ -59,8 +59,8 @@ def _green(f):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _linearised(f, g):  # type: ignore[no-untyped-def]
-    """Green strain as in `_green`, linear in the way from deformation gradient g to f."""
+def _linearised_green(f, g):  # type: ignore[no-untyped-def]
+    """Green strain of deformation gradient f, linearised at g: without the terms quadratic in f − g."""
     ux, uy, uz, vx, vy, vz = f
     ax, ay, az, bx, by, bz = g
     px, py, pz, qx, qy, qz = ux - ax, uy - ay, uz - az, vx - bx, vy - by, vz - bz
@@ -73,7 +73,10 @@ def _linearised(f, g):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _factors(s, c, ga, gb):  # type: ignore[no-untyped-def]
-    """Of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
+    """Factors (uu, uv, vu, vv, geometric) of a Hessian block of two vertices with gradients ga and gb.
+
+    The block is uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I.
+    """
     (au, av), (bu, bv) = ga, gb
     c11, c12, c22, c33, c13, c23 = c
     uu, vv = au * bu, av * bv
@@ -90,7 +93,7 @@ def _factors(s, c, ga, gb):  # type: ignore[no-untyped-def]
 
 
 class Kernels(NamedTuple):
-    """What a law's membrane is computed with."""
+    """The compiled functions of a membrane law."""
 
     energies: Callable[..., None]
     add_gradient: Callable[..., None]
@@ -100,13 +103,13 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels_of(law: str) -> Kernels:
-    """The kernels of a law, compiled where they are called first."""
+    """The kernels of a law, compiled at their first call."""
     module = law_of(law)
     density, stress, tangent = module.energy, module.stress, module.tangent
 
     @kernel()
     def energies(x, s, lo, hi, inverse, area, c, law, out):  # type: ignore[no-untyped-def]
-        """Energy [J] of triangles lo..hi into out (hi − lo,)."""
+        """Write the energy [J] of triangles lo..hi into out (hi − lo,)."""
         for e in range(lo, hi):
             e0, e1, e2 = _green(_deformation(x, s, e, inverse))
             out[e - lo] = area[e] * density(e0, e1, e2, c, Index(law[e]))
@@ -119,7 +122,7 @@ def kernels_of(law: str) -> Kernels:
             ux, uy, uz, vx, vy, vz = f
             e0, e1, e2 = _green(f)
             s0, s1, s2 = stress(e0, e1, e2, c, Index(law[e]))
-            # columns of the first Piola-Kirchhoff stress P = F S, times the area
+            # columns of the first Piola-Kirchhoff stress P = F S times the area
             w = area[e]
             pux, puy, puz = w * (ux * s0 + vx * s2), w * (uy * s0 + vy * s2), w * (uz * s0 + vz * s2)
             pvx, pvy, pvz = w * (ux * s2 + vx * s1), w * (uy * s2 + vy * s1), w * (uz * s2 + vz * s1)
@@ -141,11 +144,12 @@ def kernels_of(law: str) -> Kernels:
     def add_hessian(  # type: ignore[no-untyped-def]
         x, y, z, s, blend, inverse, area, c, law, weight, offsets, values
     ):
-        """Add weight (E,) times the Hessian blocks [N/m] to the block rows, where ``offsets`` say.
+        """Add weight (E,) times the Hessian blocks [N/m] to block rows at ``offsets`` (E, 6).
 
-        Their geometric part has the stress of the strain at z, linearised at y; without these, at x. The
-        regularised one has in its place what extension along the material axes alone makes, none of it
-        compressive, as the original Lyra. A translation does nothing, so that three blocks are enough.
+        The geometric part contains the stress of the strain at z linearised at y, or of that at x if y and z
+        are None. The regularised Hessian replaces this stress by the tensile part of the stress of extensions
+        along the material axes, as the original Lyra. Three blocks are computed; those with the first vertex
+        follow from invariance under translation.
         """
         for e in range(s.shape[0]):
             fetch_ahead(e, offsets, values, 6)
@@ -154,7 +158,7 @@ def kernels_of(law: str) -> Kernels:
             if y is None:
                 e0, e1, e2 = _green(f)
             else:
-                e0, e1, e2 = _linearised(_deformation(z, s, e, inverse), _deformation(y, s, e, inverse))
+                e0, e1, e2 = _linearised_green(_deformation(z, s, e, inverse), _deformation(y, s, e, inverse))
             s0, s1, s2 = stress(e0, e1, e2, c, m)
             c11, c12, c22, c33, c13, c23 = tangent(e0, e1, e2, c, m)
             if blend > 0.0:
@@ -172,7 +176,7 @@ def kernels_of(law: str) -> Kernels:
 
     @kernel()
     def strain_and_stress(x, s, inverse, c, law, strain, out):  # type: ignore[no-untyped-def]
-        """Green strain (E_uu, E_vv, E_uv) and second Piola-Kirchhoff stress [N/m] into (E, 3) arrays."""
+        """Write Green strain (E_uu, E_vv, E_uv) and 2nd Piola-Kirchhoff stress [N/m] into (E, 3) arrays."""
         for e in range(s.shape[0]):
             e0, e1, e2 = _green(_deformation(x, s, e, inverse))
             strain[e, 0], strain[e, 1], strain[e, 2] = e0, e1, 0.5 * e2
@@ -188,16 +192,16 @@ class Membrane(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3); data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
-        ``material`` (E,) number of the scene's, ``damping`` (E,) [s].
+        ``material`` (E,) index of the scene's material, ``damping`` (E,) [s].
     shells : sequence of ShellMaterial
-        The scene's materials, all of one law.
+        The scene's materials, all with the same law.
 
     Attributes
     ----------
     laws : (m, n), (E,) int32
-        The parameters of each material, and which of them each triangle has.
+        Parameters of the m materials, and the index of each triangle's material.
     softens : bool
-        Whether it gives way under compression.
+        Whether the law softens under compression.
     """
 
     def __init__(self, elements: Elements, shells: Sequence[ShellMaterial]) -> None:
@@ -251,7 +255,7 @@ def elements(rest: RestShape) -> Elements:
     Raises
     ------
     InputError
-        Where materials have different laws.
+        If materials have different laws.
     """
     laws = sorted({shell.law for shell in rest.shells})
     if len(laws) > 1:

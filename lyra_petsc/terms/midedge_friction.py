@@ -76,7 +76,7 @@ class MidEdgeFriction(Elastic):
     def connect(self, terms: Iterable[Term]) -> None:
         self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
         assert self.edges is not None
-        self._edges = np.searchsorted(sheet.of_edges.places, self.edges).astype(np.int32)
+        self._edges = np.searchsorted(sheet.of_edges.indices, self.edges).astype(np.int32)
         theirs = sheet.elements.data["triangle"]
         order = np.argsort(theirs)
         self._rows = order[np.searchsorted(theirs, self.elements.data["triangle"], sorter=order)]
@@ -99,7 +99,7 @@ class MidEdgeFriction(Elastic):
 
     def _computed(self, x: Array, frames: Frames) -> Sliding:
         half, data = np.empty(self.n_elements), self.elements.data
-        tangent = self._sheet.bent(x, frames)[self._rows]
+        tangent = self._sheet.angle_tangents(x, frames)[self._rows]
         constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
         midedge_energy.energies(tangent, *constants, half)
         r_y, r = data["r_y"], np.sqrt(2.0 * np.maximum(half, 0.0))
@@ -122,7 +122,7 @@ class MidEdgeFriction(Elastic):
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
         numbers = self.stencil, self._edges, self.edges, self.elements.data["sign"]
         constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
-        midedge_energy.add_gradient(x, *numbers, frozen.tangent, *constants, out)
+        midedge_energy.add_gradient(x, *numbers, frozen.direction, *constants, out)
 
     def add_hessian(
         self,
@@ -135,7 +135,7 @@ class MidEdgeFriction(Elastic):
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
-        numbers = self._edges, self.elements.data["sign"], frozen.tangent
+        numbers = self._edges, self.elements.data["sign"], frozen.direction
         at = offsets[f"{self.name} vertices"], offsets[self.name]
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
@@ -145,7 +145,7 @@ class MidEdgeFriction(Elastic):
 
     # -- state -------------------------------------------------------------------------------------
 
-    def begin(self, x: Array) -> None:
+    def initialise(self, x: Array) -> None:
         self.accept(x, self._sheet.frames)
 
     def _bent_at(self, x: Array, frames: Frames) -> Array:
@@ -196,7 +196,7 @@ def elements(rest: RestShape) -> Elements:
     form = scale * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
     data["r_y"] = np.sqrt(area * mean * YIELD_CURVATURE)
-    for name in ("tangent", "director", "material", "length", "tilt", "damping"):
+    for name in ("direction", "director", "material", "length", "rest_rotation", "damping"):
         del data[name]
     assert triangles.edges is not None
     chosen = {name: values[has_friction] for name, values in data.items()}

@@ -1,4 +1,4 @@
-"""What the mesh of sheets that bend by directors does not resolve: notes for ``check`` and runs."""
+"""Notes for ``check`` and runs on meshes that are too coarse for sheets with directors on edges."""
 
 from __future__ import annotations
 
@@ -13,57 +13,59 @@ from lyra_petsc.terms.midedge_shape import unit
 from lyra_petsc.terms.prescribed_handles import is_exact
 from lyra_petsc.terms.rest import RestShape
 
-NARROW = 0.02
-"""Part of the stiffness against twist from which on it is said that free edges would have less."""
+NOTED_LOSS = 0.02
+"""Relative error of the torsional stiffness, due to missing transverse shear, from which it is noted."""
 
 CREASED = np.radians(30.0)
-"""α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
+"""Angle α [rad] in the rest shape from which an edge counts as a crease, not part of a smooth surface."""
 
 CORNER = np.radians(20.0)
-"""Turn of a boundary from which on it has a corner there, if it turns half as much beside it at most."""
+"""Smallest turn [rad] of a boundary at a corner; at the neighbours it turns at most half as much."""
 
-OBTUSE = np.radians(100.0)
-"""Angle between supported edges from which on moments in the corner matter."""
+LARGEST_CORNER = np.radians(100.0)
+"""Angle [rad] between supported edges up to which singular moments in the corner are negligible."""
 
-LOCAL = 1.8
-"""Measured at the vertices of four triangles in spheres of two meshes."""
+LOAD_FACTOR = 1.8
+"""Factor in the error at an irregular vertex, measured at vertices of four triangles on two spheres."""
 
-NOTABLE = 0.03
-"""Error of a vertex's displacement from which on it is noted."""
+NOTED_ERROR = 0.03
+"""Relative error of a vertex's displacement from which it is noted."""
 
-UNRESOLVED, REENTRANT = 0.065, 0.008
-"""(h/L)^p from which on it is said that edges h at a corner are long for a sheet of size L, below and beyond
-180 degrees: about 1 % of the deflection of skew plates of 30 and 60 degrees, and of an L."""
+COARSE_CORNER, COARSE_REENTRANT = 0.065, 0.008
+"""(h/L)^p from which edges of length h at a corner are noted as too long for a sheet of size L, for angles
+below and above 180°: about 1 % error in the deflection of skew plates of 30° and 60°, and of an L."""
 
 
 class Sides(NamedTuple):
-    """Of triangles, opposite their corners.
+    """The sides of triangles, opposite their corners.
 
     Attributes
     ----------
     ends : (F, 3, 2) int64
         Vertices.
-    alone : (F, 3) bool
-        Whether no other of the triangles has the edge.
+    boundary : (F, 3) bool
+        Whether no other triangle has the edge.
     supported, clamped : (F, 3) bool
-        Whether handles hold it against deflection, and whether they keep its slope.
+        Whether handles hold the edge against deflection, and whether they hold its slope.
     """
 
     ends: Ints
-    alone: Mask
+    boundary: Mask
     supported: Mask
     clamped: Mask
 
 
-def coarse(
+def coarse_surface_notes(
     rest: RestShape, chosen: Ints, number: Ints, size: Array, of_tangents: Array, angle: Array
 ) -> list[str]:
-    """What to say of triangles ``chosen`` with these edges, their lengths (n, 3) [m], curvatures of tangents
-    (n, 3, 3) and angles (n, 3) at rest.
+    """Notes on curved rest shapes that the mesh does not resolve.
 
-    Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
-    that of a sheet of bending stiffness B and membrane stiffness C. Where walls meet they count as a crease:
-    a smooth surface bends at most triangles about each corner.
+    ``chosen`` are the triangles (n,), ``number`` (n, 3) their edges, ``size`` (n, 3) the edges' lengths [m],
+    ``of_tangents`` (n, 3, 3) as by `midedge.curvatures_of_tangents`, and ``angle`` (n, 3) the angles ᾱ [rad].
+
+    Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) for
+    bending stiffness B and membrane stiffness C. Folds between plane walls are not counted as curvature: on a
+    smooth surface most triangles around each vertex are bent.
     """
     creased, longest = np.abs(angle).max(axis=1) >= CREASED, size.max(axis=1)
     curvature = np.einsum("eki,ei->ek", of_tangents, np.tan(np.where(creased[:, None], 0.0, angle)))
@@ -74,11 +76,11 @@ def coarse(
     )[rest.shell_of[chosen]]
     bent = largest * longest > 1e-3
     corners, n = rest.mesh.triangles[chosen], rest.mesh.n_vertices
-    about = np.bincount(corners.ravel(), minlength=n), np.bincount(corners[bent].ravel(), minlength=n)
-    bent &= (2 * about[1] > about[0])[corners].all(axis=1)
+    n_around, n_bent = (np.bincount(c.ravel(), minlength=n) for c in (corners, corners[bent]))
+    bent &= (2 * n_bent > n_around)[corners].all(axis=1)
     coarse = bent & (largest * longest**2 > thickness)
     if not 2 * coarse.sum() > bent.sum():
-        return _irregular(rest, chosen, number, size, np.where(bent, largest / thickness, 0.0))
+        return _irregular_notes(rest, chosen, number, size, np.where(bent, largest / thickness, 0.0))
     fine = float(np.median(np.sqrt(thickness[coarse] / largest[coarse])))
     return [
         f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
@@ -87,14 +89,14 @@ def coarse(
     ]
 
 
-def _irregular(rest: RestShape, chosen: Ints, number: Ints, size: Array, sharpness: Array) -> list[str]:
-    """What to say of vertices where three or four triangles of a curved surface meet, among others where six
-    do; ``sharpness`` (n,) is 1/(t R) [1/m²], 0 where the surface is flat.
+def _irregular_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array, sharpness: Array) -> list[str]:
+    """Notes on vertices of three or four triangles on a curved surface, among others of six.
 
-    In a sphere under pressure p the tension of n alike triangles holds 3 p / (4 cos²(π/n)) a vertex, p where
-    n = 6. The rest acts as a force on a point: of the shell's displacement the vertex lacks that force over
-    p h² times ``LOCAL`` h²/(t R). Where vertices of four and eight triangles take turns, as in patterns of
-    grids, the forces cancel.
+    ``sharpness`` (n,) is 1/(t R) [1/m²], 0 where the surface is flat. In a sphere under pressure p the
+    tension of n equal triangles balances the load 3 p / (4 cos²(π/n)) at their vertex, which is p for n = 6.
+    The difference acts as a point force F: the error of the vertex's displacement, relative to that of the
+    shell, is F / (p h²) times ``LOAD_FACTOR`` h²/(t R). Where vertices of four and eight triangles alternate,
+    as in patterns of grids, the forces cancel.
     """
     mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
     n, sides = mesh.n_vertices, _sides(rest, triangles, number)
@@ -105,30 +107,32 @@ def _irregular(rest: RestShape, chosen: Ints, number: Ints, size: Array, sharpne
         return np.bincount(sides.ends.ravel(), np.repeat(values.ravel(), 2), n) / count
 
     opening = np.maximum(_openings(triangles, size, n), 1e-9)
-    meet = 2.0 * np.pi / opening * np.bincount(triangles.ravel(), minlength=n)  # images by symmetry, too
-    alone = mean(meet[sides.ends].sum(axis=2)) - meet < 7.0
-    alone[sides.ends[sides.alone & ~sides.clamped]] = False
-    found = np.flatnonzero(alone & (meet > 2.5) & (meet < 4.5))
-    half = np.pi / meet[found]
-    load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * meet[found]
-    error = LOCAL * load * (mean(size) ** 2 * mean(np.repeat(sharpness[:, None], 3, axis=1)))[found]
-    if not (error > NOTABLE).any():
+    # number of triangles around each vertex, including mirror images in symmetry planes
+    valence = 2.0 * np.pi / opening * np.bincount(triangles.ravel(), minlength=n)
+    isolated = mean(valence[sides.ends].sum(axis=2)) - valence < 7.0
+    isolated[sides.ends[sides.boundary & ~sides.clamped]] = False
+    vertices = np.flatnonzero(isolated & (valence > 2.5) & (valence < 4.5))
+    half = np.pi / valence[vertices]
+    load = (0.75 / np.cos(half) ** 2 - 1.0) * np.sin(2.0 * half) / 6.0 * valence[vertices]
+    error = LOAD_FACTOR * load * (mean(size) ** 2 * mean(np.repeat(sharpness[:, None], 3, axis=1)))[vertices]
+    if not (error > NOTED_ERROR).any():
         return []
     worst = int(np.argmax(error))
-    count = np.sum(error > NOTABLE)
+    vertex, count = vertices[worst], np.sum(error > NOTED_ERROR)
     more = f" (and {count - 1} more)" if count > 1 else ""
     return [
-        f"at vertex {found[worst]}{more} only {meet[found[worst]]:.0f} triangles of a curved shell meet: "
+        f"at vertex {vertex}{more} only {valence[vertex]:.0f} triangles of a curved shell meet: "
         f"under pressure it moves by about {min(error[worst], 1.0):.0%} too little; let five to seven meet, "
         "or refine"
     ]
 
 
-def narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
-    """What to say of sheets with free edges that are hardly wider than thick.
+def narrow_sheet_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
+    """Notes on sheets with free edges that are narrow for their thickness.
 
-    Beside a free edge a shell of thickness t twists as if 0.315 t of its width were missing, which needs
-    transverse shear: a strip of width b has the torsional stiffness G b t³/3 (1 − 0.63 t/b).
+    Due to transverse shear, which is neglected here, a shell of thickness t is softer in torsion at a free
+    edge, as if 0.315 t of its width were missing: a strip of width b has the torsional stiffness
+    G b t³/3 (1 − 0.63 t/b).
 
     Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity, 3rd ed. 1970, § 109.
     """
@@ -140,24 +144,24 @@ def narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array
             for shell, material in zip(rest.shells, rest.scene.material, strict=True)
         ]
     )[rest.shell_of[chosen]]
-    _, alone, supported, clamped = _sides(rest, rest.mesh.triangles[chosen], number)
-    free = alone & ~supported & ~clamped
+    _, boundary, supported, clamped = _sides(rest, rest.mesh.triangles[chosen], number)
+    free = boundary & ~supported & ~clamped
     lost = 0.315 * float(thickness @ np.sum(size * free, axis=1)) / float(area[thickness > 0.0].sum() or 1.0)
-    if lost < NARROW:
+    if lost < NOTED_LOSS:
         return []
     return [
-        f"sheets as thick for their width as these resist twist by {lost:.0%} too much: without transverse "
-        "shear, which is left out, they are not softer beside free edges"
+        f"these sheets are narrow for their thickness: their torsional stiffness is about {lost:.0%} too "
+        "large, since transverse shear, which softens them at free edges, is neglected"
     ]
 
 
-def corners(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
-    """What to say of obtuse corners between supported edges of triangles ``chosen`` with these edges, their
-    lengths (n, 3) and areas (n,).
+def corner_notes(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
+    """Notes on obtuse corners between supported edges of triangles ``chosen``, with long edges.
 
-    At a corner of angle ω moments grow as r^(π/ω − 2), or r^(−π/ω) where it is re-entrant, and deflections
-    converge with the power p = 2 |1 − π/ω| of the length of edges there. A polygon in place of a curve turns
-    alike at neighbouring vertices and has no such corners.
+    ``size`` (n, 3) [m] and ``area`` (n,) [m²] are those of the triangles. At a corner of angle ω moments grow
+    as r^(π/ω − 2), or r^(−π/ω) where it is re-entrant, and deflections converge with the power
+    p = 2 |1 − π/ω| of the edge length there. A polygon that approximates a curve turns by similar angles at
+    neighbouring vertices and has no such corners.
 
     Source: M. L. Williams, Proceedings of the First US National Congress of Applied Mechanics (1951) 325-329.
     """
@@ -171,24 +175,24 @@ def corners(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
     simple = np.bincount(ends[boundary & supported & ~clamped].ravel(), minlength=n) == 2
     simple &= np.bincount(ends[boundary].ravel(), minlength=n) == 2
     simple &= np.bincount(ends[~boundary & ~supported].ravel(), minlength=n) > 0  # no sheet held in its plane
-    found = np.flatnonzero(simple & (opening > OBTUSE) & (turn > np.maximum(CORNER, 2.0 * nearby)))
-    length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[found]
-    part = np.where(opening[found] < np.pi, UNRESOLVED, REENTRANT)
-    fine = np.sqrt(area.sum()) * part ** (0.5 / np.abs(1.0 - np.pi / opening[found]))
+    vertices = np.flatnonzero(simple & (opening > LARGEST_CORNER) & (turn > np.maximum(CORNER, 2.0 * nearby)))
+    length = 0.5 * np.bincount(ends[boundary].ravel(), np.repeat(size[boundary], 2), n)[vertices]
+    part = np.where(opening[vertices] < np.pi, COARSE_CORNER, COARSE_REENTRANT)
+    fine = np.sqrt(area.sum()) * part ** (0.5 / np.abs(1.0 - np.pi / opening[vertices]))
     long = length > 1.5 * fine
-    found, length, fine = (values[long] for values in (found, length, fine))
-    if not len(found):
+    vertices, length, fine = (values[long] for values in (vertices, length, fine))
+    if not len(vertices):
         return []
-    worst, more = int(np.argmin(fine)), f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    worst, more = int(np.argmin(fine)), f" (and {len(vertices) - 1} more)" if len(vertices) > 1 else ""
     return [
-        f"the corner of {np.degrees(opening[found[worst]]):.0f}° between supported edges at vertex "
-        f"{found[worst]}{more} has unbounded moments, for which edges of {length[worst]:.2g} m are long: "
+        f"the corner of {np.degrees(opening[vertices[worst]]):.0f}° between supported edges at vertex "
+        f"{vertices[worst]}{more} has unbounded moments, for which edges of {length[worst]:.2g} m are long: "
         f"refine the mesh towards it, to {fine[worst]:.1g} m"
     ]
 
 
 def _openings(triangles: Ints, size: Array, n: int) -> Array:
-    """Sum (n,) of the angles at rest of triangles with edges ``size`` (F, 3) [m] about each vertex."""
+    """Sum (n,) [rad] of the rest angles around each vertex of triangles with edge lengths ``size`` (F, 3)."""
     square = size * size
     cosine = (square.sum(axis=1, keepdims=True) - 2.0 * square) * size
     cosine /= 2.0 * size.prod(axis=1, keepdims=True)
@@ -197,12 +201,12 @@ def _openings(triangles: Ints, size: Array, n: int) -> Array:
 
 
 def _sides(rest: RestShape, triangles: Ints, number: Ints) -> Sides:
-    """Of ``triangles`` (F, 3), whose edges opposite corners have the numbers (F, 3)."""
+    """The sides of ``triangles`` (F, 3), whose edges opposite the corners have the numbers (F, 3)."""
     mesh, scene = rest.mesh, rest.scene
     axes, ends = np.zeros((mesh.n_vertices, 3), dtype=bool), triangles[:, [[1, 2], [2, 0], [0, 1]]]
     slope = np.zeros(triangles.shape, dtype=bool)
-    for place, handle in enumerate(scene.handles):
-        held = select_vertices(mesh, handle, key=f"handles[{place}]", file=scene.source)
+    for i, handle in enumerate(scene.handles):
+        held = select_vertices(mesh, handle, key=f"handles[{i}]", file=scene.source)
         if is_exact(handle):
             axes[held[:, None], list(handle.axis_numbers)] = True
         if handle.holds_slope:
@@ -210,5 +214,5 @@ def _sides(rest: RestShape, triangles: Ints, number: Ints) -> Sides:
     x = mesh.positions[triangles]
     normal = unit(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]))
     across = np.sum(axes[ends] * normal[:, None, None, :] ** 2, axis=3)
-    alone = np.bincount(number.ravel())[number] == 1
-    return Sides(ends, alone, (across > 0.9).all(axis=2), slope)
+    boundary = np.bincount(number.ravel())[number] == 1
+    return Sides(ends, boundary, (across > 0.9).all(axis=2), slope)

@@ -1,10 +1,9 @@
-"""Moments on boundary edges: M per rest length about the edge, which they follow.
+"""Moments on boundary edges: M per rest length about the edge, as a follower load.
 
-A moment M [N·m/m] on an edge of rest length L does the work M L times the angle by which the edge's director
-turns about it. In the frame that follows the edge that angle is φ̇ + γ · ė (``midedge_shape``), so that the
-load is M L on φ and M L γ at the ends; γ vanishes where the frames are those of the present shape. M > 0
-lifts the free side of the edge towards the normal of its triangle: it turns against the counter-clockwise
-direction of the edge, with which κ grows.
+The power of a moment M [N·m/m] on an edge of rest length L is M L times the rate φ̇ + γ · ė at which the
+edge's director rotates about it (``midedge_shape``). The load is therefore M L on φ, and ± M L γ at the ends;
+γ vanishes where the frame has the edge's present direction. M > 0 lifts the free side of the edge towards the
+normal of its triangle: it acts about the clockwise direction of the edge, so that κ increases.
 """
 
 from __future__ import annotations
@@ -32,8 +31,10 @@ class Moment(Load):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 2) and edges (E, 1); data ``moment`` (E,) [N·m/m] about the edge from its lesser vertex,
-        ``load`` (E,) the number of the scene's load.
+        Stencil (E, 2) and edges (E, 1); data ``moment`` (E,) [N·m/m] about the edge, directed from its
+        smaller vertex number, ``load`` (E,) the number of the scene's load.
+    windows : list of Window
+        Of all loads of the scene.
     """
 
     def __init__(self, elements: Elements, windows: list[Window]) -> None:
@@ -44,21 +45,21 @@ class Moment(Load):
     def connect(self, terms: Iterable[Term]) -> None:
         assert self.edges is not None
         self._term = term = next(term for term in terms if isinstance(term, MidEdge))
-        self._places = self.edges[:, 0]
-        self._numbers = np.searchsorted(term.of_edges.places, self._places)
+        self._indices = self.edges[:, 0]
+        self._numbers = np.searchsorted(term.of_edges.indices, self._indices)
 
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
         strength = np.array([window.strength(t0, t1) for window in self._windows])
         moment = self.elements.data["moment"] * strength[self._load]
-        np.add.at(out.reshape(-1), self._places, moment)
+        np.add.at(out.reshape(-1), self._indices, moment)
         tail, head = self.stencil.T
-        edge, from_frame = x[head] - x[tail], self._term.frames.tangent[self._numbers]
+        edge, direction = x[head] - x[tail], self._term.frames.direction[self._numbers]
         tangent = unit(edge)
-        size = np.linalg.norm(edge, axis=1) * (1.0 + np.sum(from_frame * tangent, axis=1))
-        turn = -moment * self._term.of_edges.length[self._numbers] / size
-        pull = turn[:, None] * np.cross(from_frame, tangent)
-        np.add.at(out, head, pull)
-        np.subtract.at(out, tail, pull)
+        size = np.linalg.norm(edge, axis=1) * (1.0 + np.sum(direction * tangent, axis=1))
+        factor = -moment * self._term.of_edges.length[self._numbers] / size
+        force = factor[:, None] * np.cross(direction, tangent)
+        np.add.at(out, head, force)
+        np.subtract.at(out, tail, force)
 
 
 def elements(rest: RestShape) -> Elements:
@@ -67,13 +68,13 @@ def elements(rest: RestShape) -> Elements:
     Raises
     ------
     InputError
-        A group without boundary edges, or where the sheet does not bend by ``midedge``.
+        If a group has no boundary edges, or a material at it does not bend by ``midedge``.
     """
     mesh, scene = rest.mesh, rest.scene
     ends, faces, _ = boundary_edges(mesh.triangles)
     n = mesh.n_vertices
-    lesser, greater = ends.min(axis=1), ends.max(axis=1)
-    keys, sign = lesser * n + greater, np.where(ends[:, 0] < ends[:, 1], -1.0, 1.0)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    keys, sign = low * n + high, np.where(ends[:, 0] < ends[:, 1], -1.0, 1.0)
     number = np.searchsorted(rest.edges[:, 0] * n + rest.edges[:, 1], keys)
     rows, moments, loads = [], [], []
     for each, load in enumerate(scene.loads):
@@ -108,7 +109,7 @@ def elements(rest: RestShape) -> Elements:
         loads.append(np.full(len(row), float(each)))
     row = np.concatenate(rows)
     data = {"moment": np.concatenate(moments), "load": np.concatenate(loads)}
-    return Elements(np.column_stack([lesser[row], greater[row]]), data, edges=number[row][:, None])
+    return Elements(np.column_stack([low[row], high[row]]), data, edges=number[row][:, None])
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Moment:

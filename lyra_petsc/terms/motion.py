@@ -1,4 +1,4 @@
-"""Rigid (and scaling) motions in time, and the window in which a handle or load acts."""
+"""Rigid motions with scaling in time, and the time window in which a handle or load acts."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import MAX_SPEED, Handle, Keyframe, Rotation, Scene
 
 HALF_TURN = 180.0
-"""Angle [degrees] up to which the interpolation of quaternions goes the way that angles say."""
+"""Angle [degrees] up to which interpolated quaternions rotate in the direction that the angle gives."""
 
 SAME_AXIS = 1e-12
-"""Squared sine of the angle between two axes below which they are one."""
+"""Squared sine of the angle between two axes below which they count as the same."""
 
 
-def _scaled(rotation: Rotation) -> Array:
-    """Its axis, with a largest component of 1: the square of another may not be a number."""
+def _scaled_axis(rotation: Rotation) -> Array:
+    """Axis of a rotation, scaled to a largest component of 1 so that its square does not overflow."""
     axis = np.asarray(rotation.axis, dtype=np.float64)
     return axis / np.abs(axis).max()
 
@@ -30,12 +30,12 @@ def _quaternion(keyframe: Keyframe) -> Array:
     if keyframe.rotate is None:
         return np.array([1.0, 0.0, 0.0, 0.0])
     half = 0.5 * math.radians(keyframe.rotate.degrees)
-    axis = _scaled(keyframe.rotate)
+    axis = _scaled_axis(keyframe.rotate)
     return np.concatenate([[math.cos(half)], math.sin(half) * axis / np.linalg.norm(axis)])
 
 
-def _way(first: Array, second: Array) -> tuple[Array, float]:
-    """Axis and angle [rad] of the shortest rotation that leads from one quaternion's to another's."""
+def _relative_rotation(first: Array, second: Array) -> tuple[Array, float]:
+    """Axis and angle [rad] of the rotation from the orientation of one quaternion to that of another."""
     a, b = second, first * np.array([1.0, -1.0, -1.0, -1.0])
     real = a[0] * b[0] - a[1:] @ b[1:]
     imaginary = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
@@ -58,20 +58,20 @@ def _rotation(q: Array) -> Array:
 
 
 def _axis(keyframe: Keyframe) -> Array | None:
-    """Unit vector of a keyframe's rotation; None where it does not turn."""
+    """Unit axis of a keyframe's rotation; None without a rotation."""
     if keyframe.rotate is None or keyframe.rotate.degrees == 0.0:
         return None
-    axis = _scaled(keyframe.rotate)
+    axis = _scaled_axis(keyframe.rotate)
     return axis / np.linalg.norm(axis)
 
 
-def _turns(keyframes: Sequence[Keyframe], key: str, file: object) -> list[float | None]:
-    """By how many degrees the sheet turns between keyframes; None where their axes differ.
+def _turn_angles(keyframes: Sequence[Keyframe], key: str, file: object) -> list[float | None]:
+    """Rotation angles [degrees] between successive keyframes; None where their axes differ.
 
     Raises
     ------
     InputError
-        If axes differ and an angle exceeds 180°: there is no way that such angles say.
+        If axes differ and an angle exceeds 180°, since the path between them is then undefined.
     """
     turns: list[float | None] = []
     for i, (first, second) in enumerate(pairwise(keyframes)):
@@ -99,15 +99,16 @@ class Motion:
     Translation, scale and the quaternion of the rotation are interpolated component by component, either
     linearly or by the cubic Hermite polynomial with central-difference tangents that vanish at both ends (as
     the original Lyra does; a keyframe's ``velocity`` replaces the tangent of the translation). Before the
-    first and after the last keyframe the transform stands still. Between keyframes with the same axis the
-    sheet turns by the difference of the angles, of which quaternions know only 180°: where one is larger,
-    the angles of the whole motion are interpolated instead. Between different axes it goes the shortest way.
+    first and after the last keyframe the transform is constant. Between keyframes with the same axis the
+    rotation angle changes by the difference of their angles. Since quaternions represent at most 180°, the
+    angles of the whole motion are interpolated instead if one difference is larger. Between different axes
+    the rotation takes the shortest path.
 
     Raises
     ------
     InputError
         If the axes of two keyframes differ and one of their angles exceeds 180°, scales differ in sign, or
-        it goes faster than `MAX_SPEED`.
+        the translation is faster than `MAX_SPEED`.
     """
 
     def __init__(
@@ -120,7 +121,7 @@ class Motion:
     ) -> None:
         self._times = np.array([k.time for k in keyframes], dtype=np.float64)
         n = len(keyframes)
-        turns = _turns(keyframes, key, file)
+        turns = _turn_angles(keyframes, key, file)
         rows: list[Array] = []
         side = 1.0  # a quaternion and its negative are the same rotation
         for i, k in enumerate(keyframes):
@@ -153,17 +154,17 @@ class Motion:
         for i, k in enumerate(keyframes):
             if k.velocity is not None:
                 self._tangents[i, :3] = k.velocity
-        self._windings: list[tuple[Array, float, float, float]] | None = None
+        self._rotations: list[tuple[Array, float, float, float]] | None = None
         if any(turn is not None and abs(turn) > HALF_TURN for turn in turns):
-            self._wind(keyframes, turns)
+            self._set_rotations(keyframes, turns)
 
-    def _wind(self, keyframes: Sequence[Keyframe], turns: list[float | None]) -> None:
-        """Of each interval the axis and the angle [rad] of its turn, and its rates [rad/s] at both ends."""
+    def _set_rotations(self, keyframes: Sequence[Keyframe], turns: list[float | None]) -> None:
+        """Set axis, angle [rad] and the rates [rad/s] at both ends of the rotation in each interval."""
         rates = [0.0] * len(keyframes)
         axes: list[Array] = []
         angles: list[float] = []
         for i, turn in enumerate(turns):
-            axis, angle = _way(self._values[i, 6:], self._values[i + 1, 6:])
+            axis, angle = _relative_rotation(self._values[i, 6:], self._values[i + 1, 6:])
             if turn is not None:
                 given = [each for each in map(_axis, keyframes[i : i + 2]) if each is not None]
                 axis, angle = given[0] if given else axis, math.radians(turn)
@@ -172,18 +173,18 @@ class Motion:
         if not self._linear:
             for i in range(1, len(turns)):
                 along = float(axes[i - 1] @ axes[i])
-                if along**2 > 1.0 - SAME_AXIS:  # else it comes to rest before it turns about another axis
+                if along**2 > 1.0 - SAME_AXIS:  # else the rotation stops before the axis changes
                     span = self._times[i + 1] - self._times[i - 1]
                     rates[i] = (angles[i - 1] * math.copysign(1.0, along) + angles[i]) / span
         signs = [1.0 if i == 0 or axes[i - 1] @ axes[i] > 0.0 else -1.0 for i in range(len(turns))]
-        self._windings = []
+        self._rotations = []
         for i, angle in enumerate(angles):
             end = rates[i + 1] * (signs[i + 1] if i + 1 < len(signs) else 1.0)
-            self._windings.append((axes[i], angle, rates[i], end))
+            self._rotations.append((axes[i], angle, rates[i], end))
 
     @property
-    def jumps(self) -> list[float]:
-        """Times [s] at which its velocity jumps."""
+    def velocity_jumps(self) -> list[float]:
+        """Times [s] at which the velocity is discontinuous."""
         n = len(self._times)
         if n == 1:
             return []
@@ -192,10 +193,10 @@ class Motion:
         slopes = np.diff(self._values, axis=0) / np.diff(self._times)[:, None]
         slopes = np.concatenate([np.zeros((1, 10)), slopes, np.zeros((1, 10))])
         differ = np.abs(np.diff(slopes, axis=0)) > 1e-9 * np.abs(slopes).max(initial=0.0)
-        wound = np.full(n, self._windings is not None)
+        wound = np.full(n, self._rotations is not None)
         return [float(time) for time in self._times[differ.any(axis=1) | wound]]
 
-    def _at(self, time: float) -> tuple[Array, Array]:
+    def _interpolate(self, time: float) -> tuple[Array, Array]:
         """Interpolated components and their time derivatives, each (10,)."""
         times, values = self._times, self._values
         if time <= times[0] or len(times) == 1:
@@ -220,49 +221,49 @@ class Motion:
 
     @property
     def times(self) -> list[float]:
-        """Of the keyframes [s]."""
+        """Times [s] of the keyframes."""
         return [float(time) for time in self._times]
 
     def transform(self, time: float) -> tuple[Array, Array]:
         """Matrix (3, 3) and translation (3,) [m] of T(t): x ↦ A x + d."""
-        value, _ = self._at(time)
-        return self._turned(time, value[6:]) * value[3:6], value[:3]
+        value, _ = self._interpolate(time)
+        return self._rotation_at(time, value[6:]) * value[3:6], value[:3]
 
-    def _turned(self, time: float, quaternion: Array) -> Array:
-        """Rotation (3, 3) at a time, of the interpolated quaternion or of the angle."""
+    def _rotation_at(self, time: float, quaternion: Array) -> Array:
+        """Rotation matrix (3, 3) at a time, from the interpolated quaternion or angle."""
         times = self._times
-        if self._windings is None or not times[0] < time < times[-1]:
+        if self._rotations is None or not times[0] < time < times[-1]:
             return _rotation(quaternion)
         i = int(np.searchsorted(times, time, side="right")) - 1
         h = times[i + 1] - times[i]
         s = (time - times[i]) / h
-        axis, angle, first, last = self._windings[i]
+        axis, angle, first, last = self._rotations[i]
         part = s * angle
         if not self._linear:
             part = s * s * (3 - 2 * s) * angle + h * s * (1 - s) ** 2 * first - h * s * s * (1 - s) * last
         turn = np.concatenate([[math.cos(0.5 * part)], math.sin(0.5 * part) * axis])
         return _rotation(turn) @ _rotation(self._values[i, 6:])
 
-    def carried(self, points: Array, start: float, time: float) -> Array:
-        """T(time) T(start)⁻¹ applied to ``points`` (n, 3) [m]."""
-        if len(self._times) == 1:  # most handles: nothing moves
+    def moved(self, points: Array, start: float, time: float) -> Array:
+        """Positions T(time) T(start)⁻¹ of ``points`` (n, 3) [m]."""
+        if len(self._times) == 1:  # most handles do not move
             return points.copy()
         a0, d0 = self.transform(start)
         a, d = self.transform(time)
         return (points - d0) @ (a @ np.linalg.inv(a0)).T + d
 
     def velocity(self, points: Array, start: float, time: float) -> Array:
-        """Time derivative [m/s] of ``carried`` (n, 3), by differences of 1e-6 of the shortest interval."""
+        """Time derivative (n, 3) [m/s] of ``moved``, by differences over 1e-6 of the shortest interval."""
         if len(self._times) == 1:
             return np.zeros_like(points)
         step = 1e-6 * float(np.diff(self._times).min())
-        before, after = self.carried(points, start, time - step), self.carried(points, start, time + step)
+        before, after = self.moved(points, start, time - step), self.moved(points, start, time + step)
         return (after - before) / (2 * step)
 
 
 @dataclass(frozen=True)
 class Window:
-    """The time span from ≤ t ≤ until in which something acts; ``fade`` [s] after it."""
+    """The time span start ≤ t ≤ until [s] in which a handle or load acts, and ``fade`` [s] after it."""
 
     start: float
     until: float
@@ -274,12 +275,12 @@ class Window:
         return cls(max(handle.start, 0.0), handle.until, handle.fade)
 
     def holds(self, t0: float, t1: float) -> bool:
-        """Whether the step from t0 to t1 lies within the window (steps land on its ends)."""
+        """Whether the step from t0 to t1 [s] lies within the window; steps end at its start and end."""
         slack = 1e-9 * max(t1 - t0, 0.0)
         return t0 >= self.start - slack and t1 <= self.until + slack
 
     def strength(self, t0: float, t1: float, at: float | None = None) -> float:
-        """1 within the window, (1 − (t − until)/fade)⁴ at t = ``at`` (t1) while it fades, else 0."""
+        """1 within the window, (1 − (t − until)/fade)⁴ at t = ``at`` (default t1) while fading, else 0."""
         if self.holds(t0, t1):
             return 1.0
         time = t1 if at is None else at
@@ -288,7 +289,7 @@ class Window:
         return 0.0
 
     def events(self) -> list[float]:
-        """Times on which a step must end."""
+        """Times [s] at which a step must end."""
         ends = [self.start, self.until]
         if self.fade > 0.0:
             ends.append(self.until + self.fade)
@@ -299,7 +300,7 @@ STILL = Motion([Keyframe(time=0.0)], "linear")
 
 
 def motion_of(scene: Scene, index: int) -> Motion:
-    """The motion of the scene's handle ``index``; without one the handle stands still."""
+    """The motion of the scene's handle ``index``; `STILL` for a handle without one."""
     handle = scene.handles[index]
     if handle.motion is None:
         return STILL

@@ -1,4 +1,4 @@
-"""Handles as exact constraints: which coordinates are prescribed in a step, and where to."""
+"""Handles as exact constraints: the coordinates that they prescribe in a step, and their values."""
 
 from __future__ import annotations
 
@@ -22,22 +22,28 @@ if TYPE_CHECKING:
 
 Selection = dict[int, NDArray[np.int64]]
 Reference = Callable[[float, NDArray[np.int64]], Array]
-"""Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time."""
+"""Takes a start time [s] and local rows (n,); returns their positions (n, 3) [m] at that time."""
 
 SAME_PLACE = 1e-9
-"""Distance over the sheet's size up to which two handles hold a vertex in one place."""
+"""Distance over the sheet's size up to which two target positions of a vertex count as equal."""
 
 BYTES_PER_HELD_VERTEX = 100
-"""Memory [B] of a vertex in a handle, while it is distributed and then held."""
+"""Memory [B] per vertex of a handle, during distribution and afterwards."""
 
 
 def is_exact(handle: Handle) -> bool:
-    """Whether a handle is a constraint (else it is a spring, see ``terms.spring``)."""
+    """Whether a handle is an exact constraint; otherwise it is a spring, see ``terms.spring``."""
     return handle.stiffness is None
 
 
-def select_held(scene: Scene, mesh: Mesh) -> Selection:
-    """Vertices of every exact handle of a scene, by its number, on the whole mesh (rank 0)."""
+def select_exact(scene: Scene, mesh: Mesh) -> Selection:
+    """Vertices of each exact handle of a scene, by its number, on the whole mesh (rank 0).
+
+    Raises
+    ------
+    InputError
+        If the handles hold more vertices than fit into memory.
+    """
     selection: Selection = {}
     memory, held = available_memory(), 0
     for number, handle in enumerate(scene.handles):
@@ -56,8 +62,8 @@ def select_held(scene: Scene, mesh: Mesh) -> Selection:
     return selection
 
 
-def disagreements(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
-    """A note for each two exact handles that at some time hold the same vertices in different places."""
+def conflicts(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
+    """A note for each pair of exact handles that prescribe different positions of the same vertices."""
     notes = []
     windows = {number: Window.of(scene.handles[number]) for number in held}
     slack = SAME_PLACE * float(np.ptp(mesh.positions, axis=0).max())
@@ -74,19 +80,19 @@ def disagreements(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
         knots = sorted({start, end, *(t for m in motions for t in m.times if start < t < end)})
         points = mesh.positions[vertices]
         for time in sorted({*knots, *(0.7 * a + 0.3 * b for a, b in pairwise(knots))}):
-            places = [motion.carried(points, start, time)[:, shared] for motion in motions]
-            apart = np.abs(places[1] - places[0]).max(axis=1) > slack
-            if apart.any():
+            one, other = (motion.moved(points, start, time)[:, shared] for motion in motions)
+            differ = np.abs(other - one).max(axis=1) > slack
+            if differ.any():
                 notes.append(
-                    f"handles[{first}] and handles[{second}] hold {int(apart.sum())} vertices (first: "
-                    f"{vertices[apart][0]}) in different places, as at t = {time:g} s; handles[{second}], "
+                    f"handles[{first}] and handles[{second}] hold {int(differ.sum())} vertices (first: "
+                    f"{vertices[differ][0]}) in different places, as at t = {time:g} s; handles[{second}], "
                     "the later in the scene, is followed"
                 )
                 break
     return notes
 
 
-class Held:
+class ExactHandles:
     """The exact handles of a scene on one rank.
 
     Where two handles prescribe the same coordinate at the same time, the later one in the scene counts.
@@ -97,7 +103,7 @@ class Held:
     owned : mapping of handle number → (n,) int
         Owned vertices of each exact handle, local numbering.
     edges : ClampedEdges or None
-        Whose unknowns are prescribed, too.
+        Edges whose unknowns are also prescribed.
 
     Attributes
     ----------
@@ -109,7 +115,7 @@ class Held:
         self._axes = {
             number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
         }
-        self._places = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
+        self._indices = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
         self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
         self._windows = {number: Window.of(scene.handles[number]) for number in owned}
         self._windows |= edges.windows if edges is not None else {}
@@ -118,63 +124,64 @@ class Held:
         return bool(self._windows)
 
     def active(self, t0: float, t1: float) -> tuple[int, ...]:
-        """Numbers of the handles that hold through the step from t0 to t1 [s]."""
+        """Numbers of the handles that act throughout the step from t0 to t1 [s]."""
         return tuple(number for number, window in self._windows.items() if window.holds(t0, t1))
 
     def mask(self, t0: float, t1: float, n_owned: int) -> NDArray[np.bool_]:
         """Prescribed unknowns (n_owned, 3) of the step from t0 to t1 [s]."""
         mask = np.zeros((n_owned, 3), dtype=bool)
         for number in self.active(t0, t1):
-            if number in self._places:
-                mask[self._places[number]] = True
+            if number in self._indices:
+                mask[self._indices[number]] = True
             if self.edges is not None:
-                mask.ravel()[self.edges.places(number)] = True
+                mask.ravel()[self.edges.indices(number)] = True
         return mask
 
     def shares(self, t0: float, t1: float, reaction: Array) -> Iterator[tuple[int, Array, Array]]:
-        """What each handle of the step bears of the forces (n_owned, 3) [N] on prescribed unknowns.
+        """Share of each active handle in the reaction (n_owned, 3) [N] on prescribed unknowns.
 
-        Those on its vertices (n, 3) and on the edges that it clamps (m,); what two hold the later one bears.
+        Yields the handle's number, the forces on its vertices (n, 3) and on the edge unknowns that it
+        prescribes (m,). Of two handles that prescribe the same unknown the later one gets the whole force.
         """
-        left = reaction.copy()
+        remaining = reaction.copy()
         for number in reversed(self.active(t0, t1)):
             forces = np.zeros((len(self.vertices(number)), 3))
-            if number in self._places:
-                forces[:, self._axes[number]] = left[self._places[number]]
-                left[self._places[number]] = 0.0
-            edges = self.edges.places(number) if self.edges is not None else np.empty(0, dtype=np.int64)
-            turning = left.ravel()[edges]
-            left.ravel()[edges] = 0.0
-            yield number, forces, turning
+            if number in self._indices:
+                forces[:, self._axes[number]] = remaining[self._indices[number]]
+                remaining[self._indices[number]] = 0.0
+            edges = self.edges.indices(number) if self.edges is not None else np.empty(0, dtype=np.int64)
+            edge_forces = remaining.ravel()[edges]
+            remaining.ravel()[edges] = 0.0
+            yield number, forces, edge_forces
 
     def targets(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
-        """Write the positions [m] prescribed at time ``at`` of the step t0..t1 over ``out`` (n_owned, 3).
+        """Write the unknowns [m] prescribed at time ``at`` of the step t0 to t1 into ``out`` (n_owned, 3).
 
-        The latter are the present ones, and say how often directors have turned.
+        ``out`` contains the present ones, which determine the number of full turns of directors.
         """
         for number in self.active(t0, t1):
             if self.edges is not None:
                 self.edges.targets(number, at, reference, out.ravel())
-            if number not in self._places:
+            if number not in self._indices:
                 continue
             start = self._windows[number].start
-            goal = self._motions[number].carried(reference(start, self._vertices[number]), start, at)
-            out[self._places[number]] = goal[:, self._axes[number]]
+            goal = self._motions[number].moved(reference(start, self._vertices[number]), start, at)
+            out[self._indices[number]] = goal[:, self._axes[number]]
 
     def velocities(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
-        """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
+        """Write the prescribed velocities ẋ*(at) [m/s] of the step t0 to t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
             if self.edges is not None:
                 self.edges.rates(number, at, reference, out.ravel())
-            if number not in self._places:
+            if number not in self._indices:
                 continue
             start = self._windows[number].start
             rate = self._motions[number].velocity(reference(start, self._vertices[number]), start, at)
-            out[self._places[number]] = rate[:, self._axes[number]]
+            out[self._indices[number]] = rate[:, self._axes[number]]
 
     @property
     def reference_rows(self) -> NDArray[np.int64]:
-        """Local rows (n,) whose reference positions are asked for."""
+        """Local rows (n,) whose reference positions are needed."""
         edges = [self.edges.reference_rows] if self.edges is not None else []
         return np.concatenate([np.empty(0, dtype=np.int64), *self._vertices.values(), *edges])
 
@@ -185,7 +192,7 @@ class Held:
 
     @property
     def with_slopes(self) -> list[int]:
-        """Numbers of those that hold directors of edges, too."""
+        """Numbers of the exact handles that also prescribe directors of edges."""
         windows = {} if self.edges is None else self.edges.windows
         return [number for number in self._vertices if number in windows]
 

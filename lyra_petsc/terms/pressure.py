@@ -1,6 +1,6 @@
 """Pressure: force p a n / 3 on each vertex of a triangle, along its current normal.
 
-Current area a and normal n are those at the start of the step, as for wind, so that the system stays
+The current area a and normal n are those at the start of the step, as for wind, so that the Jacobian is
 symmetric.
 """
 
@@ -35,9 +35,18 @@ def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
 
 
 class Pressure(Load):
-    """Parameters: elements with stencil (E, 3) and data ``load`` (E,), the number of the scene's load."""
+    """The pressures of all loads.
 
-    follows = True
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 3); data ``load`` (E,) the number of the scene's load.
+    pressures : (n_loads,) [Pa]
+    windows : list of Window
+        Of all loads of the scene.
+    """
+
+    is_follower = True
 
     def __init__(self, elements: Elements, pressures: Array, windows: list[Window]) -> None:
         super().__init__(elements)

@@ -1,8 +1,8 @@
-"""Every term: when a scene needs it, and what it is to the rest of the program.
+"""The registry of terms: when a scene needs a term, and which role the term has in the program.
 
-A term is one module and one entry in ``REGISTRY``. The module offers ``elements(rest)`` (rank 0: its stencil
-and constants on the whole mesh, or None) and ``make(elements, scene, mass)`` (each rank: the term on its own
-part). A module is imported, hence its kernels compiled, only when a scene needs the term.
+A term is one module and one entry in ``REGISTRY``. The module has the functions ``elements(rest)`` (rank 0:
+stencil and constants on the whole mesh, or None) and ``make(elements, scene, mass)`` (each rank: the term on
+the rank's part). A module is imported, hence its kernels compiled, only when a scene needs the term.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Need = Callable[[Scene, Sequence[ShellMaterial]], bool]
 
 
 class Role(Enum):
-    """What a term is in the equations of motion."""
+    """Role of a term in the equations of motion."""
 
     ELASTIC = "elastic energy of the sheet"
     CONSTRAINT = "elastic energy by which handles pull: its work comes from outside"
@@ -38,40 +38,40 @@ class Role(Enum):
 
 @dataclass(frozen=True)
 class Registration:
-    """A term, and what the rest of the program needs to know of it.
+    """A term and the properties by which the rest of the program treats it.
 
     Attributes
     ----------
     name : str
-        Also that of its module in ``lyra_petsc.terms``, unless ``home`` names another.
+        Name of the term, and of its module in ``lyra_petsc.terms`` unless ``module_name`` is given.
     needed : callable
-        Whether a scene with these materials needs it.
+        Returns whether a scene with these materials needs the term.
     role : Role
     energy : str
-        Column of history.csv that its energy [J] is added to; a new one comes after the present columns.
-        Empty where it is not stored in the sheet (constraints) or there is none.
+        Column of history.csv to which the term's energy [J] is added; a new column comes after the present
+        ones. Empty for terms without an energy stored in the sheet (constraints, loads).
     columns : mapping of str to str
-        Further columns of history.csv, and how the ranks' parts of ``Term.history`` become one number:
+        Additional columns of history.csv, with the reduction of the ranks' values of ``Term.history``:
         ``sum``, ``min`` or ``max``.
     damped : bool
-        Stiffness-proportional damping acts through it.
+        Whether stiffness-proportional damping acts through the term.
     bends : bool
-        It resists bending: without such a term sheets wrinkle as finely as their mesh.
+        Whether the term resists bending; without such a term sheets wrinkle as finely as their mesh.
     moving : bool
-        Its energy depends on where moving handles stand, which thereby do work on the sheet.
+        Whether the energy depends on the positions of moving handles, which thereby do work on the sheet.
     neighbours : bool
-        Its stencils change as points come near to each other.
+        Whether stencils change as points come near each other.
     limits_step : bool
-        It limits how far a Newton iteration may go.
+        Whether the term limits the length of Newton's steps.
     state, edge_state : tuple of str
-        Names of the arrays that a checkpoint must hold for it, of vertices and of edges with an unknown.
+        Names of the arrays on vertices, and on edges with an unknown, that a checkpoint holds for the term.
     element_vertices : int
-        Vertices of each of its elements, where a checkpoint must hold something of them.
+        Number of vertices of each element of a term whose elements have a state in checkpoints, else 0.
     coarse : str
-        The term that stands for it on coarse levels of multigrid, which have no unknowns of edges. Its module
-        offers ``coarse_elements(rest)``, of that term.
-    home : str
-        Full name of its module, where that is elsewhere.
+        Name of the term that replaces this one on coarse levels of multigrid, which have no edge unknowns.
+        This term's module then has ``coarse_elements(rest)``, the elements of that term.
+    module_name : str
+        Full name of the term's module, if it is not in ``lyra_petsc.terms``.
     """
 
     name: str
@@ -88,28 +88,28 @@ class Registration:
     edge_state: tuple[str, ...] = ()
     element_vertices: int = 0
     coarse: str = ""
-    home: str = ""
+    module_name: str = ""
 
     def module(self) -> ModuleType:
-        """The term's module, imported now."""
-        return import_module(self.home or f"lyra_petsc.terms.{self.name}")
+        """Import and return the term's module."""
+        return import_module(self.module_name or f"lyra_petsc.terms.{self.name}")
 
 
 def _bends_by(model: str) -> Need:
     return lambda scene, shells: any(shell.bends_with(model) for shell in shells)
 
 
-def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+def _has_clamped_hinges(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(s.bends_with("hinge") for s in shells) and any(handle.clamp for handle in scene.handles)
 
 
-def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    own = [obstacle.friction for obstacle in (scene.obstacles or {}).values()]
-    all_of_them = [] if scene.contact is None else [scene.contact.friction, *own]
-    return any(max(coefficients(each)) > 0.0 for each in all_of_them if each is not None)
+def _has_contact_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+    given = [obstacle.friction for obstacle in (scene.obstacles or {}).values()]
+    given = [] if scene.contact is None else [scene.contact.friction, *given]
+    return any(max(coefficients(each)) > 0.0 for each in given if each is not None)
 
 
-def _slides(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+def _has_bending_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(max(shell.friction_moment) > 0.0 for shell in shells)
 
 
@@ -128,7 +128,7 @@ REGISTRY: list[Registration] = [
     ),
     Registration(
         "midedge_friction",
-        _slides,
+        _has_bending_friction,
         Role.ELASTIC,
         "bending_energy",
         element_vertices=3,
@@ -152,14 +152,16 @@ REGISTRY: list[Registration] = [
     ),
     Registration(
         "friction",
-        _rubs,
+        _has_contact_friction,
         Role.CONSTRAINT,
         columns={"friction_work": "sum"},
         neighbours=True,
         state=("friction_work", "friction_owed"),
         element_vertices=4,
     ),
-    Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
+    Registration(
+        "clamp", _has_clamped_hinges, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True
+    ),
     Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
@@ -188,18 +190,20 @@ REGISTRY: list[Registration] = [
 ]
 
 
-def active(scene: Scene, shells: Sequence[ShellMaterial]) -> list[Registration]:
-    """The terms a scene needs, in the order of the registry."""
+def needed_terms(scene: Scene, shells: Sequence[ShellMaterial]) -> list[Registration]:
+    """The terms that a scene with these materials needs, in the order of the registry."""
     return [entry for entry in REGISTRY if entry.needed(scene, shells)]
 
 
-def registered(name: str) -> Registration:
-    """The entry of a term."""
+def registration_of(name: str) -> Registration:
+    """The registration of the term of this name."""
     return next(entry for entry in REGISTRY if entry.name == name)
 
 
-def made(entry: Registration, elements: Elements | None, scene: Scene, mass: NDArray[np.float64]) -> Term:
-    """A term on one rank, of its elements there and the mass (n_vertices,) [kg] of the vertices."""
+def make_term(
+    entry: Registration, elements: Elements | None, scene: Scene, mass: NDArray[np.float64]
+) -> Term:
+    """The term on one rank, from its elements there and the mass (n_vertices,) [kg] of the vertices."""
     term: Term = entry.module().make(elements, scene, mass)
     term.registration = entry
     return term

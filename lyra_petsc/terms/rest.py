@@ -1,4 +1,4 @@
-"""The rest shape with its materials, whole, on rank 0 during set-up: what terms build elements from."""
+"""The rest shape with its materials, on rank 0 during set-up, from which terms build their elements."""
 
 from __future__ import annotations
 
@@ -21,22 +21,24 @@ class RestShape:
 
     Attributes
     ----------
-    scene, mesh
+    scene : Scene
+    mesh : Mesh
     shells : list of ShellMaterial
         One per material block of the scene.
     shell_of : (F,) int64
-        Which of them each triangle has.
+        Index of each triangle's material in ``shells``.
     inverse : (F, 2, 2) float64
         Inverse rest matrices in material axes [1/m].
     area : (F,) float64
         Rest areas [m²].
     notes : list of str
-        What the materials' library has to tell.
+        Notes on the materials and the mesh for the user.
 
     Raises
     ------
     InputError
-        A material group that is not in the mesh, a triangle without a material.
+        If the mesh lacks the group of a material, a triangle has no material, or neighbours have different
+        bending models.
     """
 
     def __init__(self, scene: Scene, mesh: Mesh) -> None:
@@ -67,7 +69,7 @@ class RestShape:
         self.inverse, self.area = rest_matrices(mesh, self.per_triangle("warp_degrees"))
 
     def _check_models(self) -> None:
-        """Refuse neighbours that bend by different models."""
+        """Refuse neighbouring triangles with different bending models."""
         if len({shell.model for shell in self.shells if shell.bends_with(shell.model)}) < 2:
             return
         models = np.where(self.bends_with("midedge"), 1, 0) - np.where(self.bends_with("hinge"), 1, 0)
@@ -89,12 +91,12 @@ class RestShape:
         return values[self.shell_of]
 
     def bends_with(self, model: str) -> NDArray[np.bool_]:
-        """Which triangles resist bending by this model, (F,)."""
+        """Whether each triangle resists bending by this model, (F,)."""
         return np.array([shell.bends_with(model) for shell in self.shells])[self.shell_of]
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:
-        """Lumped mass [kg] of each vertex, (V,): a third of each of its triangles."""
+        """Lumped mass [kg] of each vertex, (V,): one third of the mass of each of its triangles."""
         shares = np.repeat(self.area * self.per_triangle("density") / 3.0, 3)
         corners = self.mesh.triangles.ravel()
         lumped = np.bincount(corners, weights=shares, minlength=self.mesh.n_vertices)
@@ -102,30 +104,30 @@ class RestShape:
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """Vertices (N, 2) of all edges, the smaller first: what `Elements.edges` refers to."""
+        """Vertices (N, 2) of all edges, the smaller first; `Elements.edges` are indices into this array."""
         return unique_edges(self.mesh.triangles)
 
     @cached_property
     def hinges(self) -> Hinges:
-        """The edges of two triangles; found only if a term asks."""
+        """The edges with two triangles, computed when a term first needs them."""
         self._check_junctions()
         return hinges(self.mesh.triangles)
 
     def _check_junctions(self) -> None:
-        """Refuse hinges where more than two triangles meet, of which no two make an angle."""
+        """Refuse edges of more than two triangles, for which a hinge's angle is undefined."""
         bends, found = self.bends_with("hinge"), junctions(self.mesh.triangles)
         wrong = [triangles for triangles in found if bends[triangles].any()]
         if wrong:
-            words = [self._edge_words(triangles) for triangles in wrong[:5]]
+            edges = [self._edge_text(triangles) for triangles in wrong[:5]]
             more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
             raise InputError(
-                f"edges of more than two triangles: {'; '.join(words)}{more} (counted from 0); hinges cannot "
+                f"edges of more than two triangles: {'; '.join(edges)}{more} (counted from 0); hinges cannot "
                 "bend there: give the material bending_model: midedge",
                 file=self.scene.source,
                 key="mesh",
             )
 
-    def _edge_words(self, triangles: NDArray[np.int64]) -> str:
+    def _edge_text(self, triangles: NDArray[np.int64]) -> str:
         corners = [set(corners) for corners in self.mesh.triangles[triangles].tolist()]
         low, high = sorted(set.intersection(*corners))
         return f"vertices {low}-{high} in triangles {', '.join(map(str, triangles))}"

@@ -78,7 +78,7 @@ class ShearFriction(Elastic):
 
     # -- state -------------------------------------------------------------------------------------
 
-    def begin(self, x: Array) -> None:
+    def initialise(self, x: Array) -> None:
         self.accept(x)
 
     def accept(self, x: Array, frozen: Any = None) -> None:

@@ -2,8 +2,8 @@
 
     energy = ½ k s(t) |x − x*(t)|²     over the held axes; s fades after release
 
-(the original Lyra's handles: k = 1000 N/m, implicit, undamped). A handle that is an exact constraint
-and fades becomes such a spring while it fades.
+(as in the original Lyra: k = 1000 N/m, implicit, undamped). An exact handle that fades is replaced by such a
+spring while it fades.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Pulling, UpcomingStep
+from lyra_petsc.terms.term import HandleTerm, UpcomingStep
 
 ORIGINAL_STIFFNESS = 1000.0
-"""[N/m], of the original program; what a fading exact handle takes."""
+"""Stiffness [N/m] of the original Lyra, which exact handles have while they fade."""
 
 
 class Springs(NamedTuple):
@@ -31,23 +31,24 @@ class Springs(NamedTuple):
     Attributes
     ----------
     target : (E, 3)
-        Where they pull to [m].
+        Target positions [m].
     stiffness : (E, 3)
-        Per axis [N/m]; 0 where they do not act.
+        Stiffness per axis [N/m]; 0 where a spring does not act.
     """
 
     target: Array
     stiffness: Array
 
 
-class Spring(Pulling):
+class Spring(HandleTerm):
     """Springs of all soft or fading handles.
 
     Parameters
     ----------
     elements : Elements
         Stencil (E, 1); data ``handle`` (E,) number of the handle, ``stiffness`` (E, 3) [N/m] per axis.
-    handles : mapping of handle number → (Motion, Window, only while fading)
+    handles : mapping of handle number → (Motion, Window, bool)
+        The last tells whether the springs act only while the handle fades.
     """
 
     def __init__(self, elements: Elements, handles: dict[int, tuple[Motion, Window, bool]]) -> None:
@@ -64,27 +65,29 @@ class Spring(Pulling):
         for number, (motion, window, fading_only) in self._handles.items():
             mine = self._handle == number
             holds = window.holds(step.start, step.end)
-            strength = 0.0 if fading_only and holds else window.strength(step.start, step.end, step.at)
+            strength = (
+                0.0 if fading_only and holds else window.strength(step.start, step.end, step.target_time)
+            )
             if strength > 0.0:
                 stiffness[mine] = strength * self.elements.data["stiffness"][mine]
                 start = step.reference(window.start, self.stencil[mine, 0].astype(np.int64))
-                target[mine] = motion.carried(start, window.start, step.at)
+                target[mine] = motion.moved(start, window.start, step.target_time)
         return Springs(target, stiffness)
 
-    def _pull(self, x: Array, frozen: Springs) -> Array:
+    def _elongation(self, x: Array, frozen: Springs) -> Array:
         return x[self.stencil[:, 0]] - frozen.target
 
     def energies(self, x: Array, frozen: Springs) -> Array:
-        return 0.5 * (frozen.stiffness * self._pull(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
+        return 0.5 * (frozen.stiffness * self._elongation(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
 
     def handle_forces(self, x: Array, frozen: Springs, count: int) -> Array:
         forces = np.zeros((count, 3))
         n = self.n_owned
-        np.add.at(forces, self._handle[:n], -(frozen.stiffness * self._pull(x, frozen))[:n])
+        np.add.at(forces, self._handle[:n], -(frozen.stiffness * self._elongation(x, frozen))[:n])
         return forces
 
     def add_gradient(self, x: Array, frozen: Springs, out: Array) -> None:
-        np.add.at(out, self.stencil[:, 0], frozen.stiffness * self._pull(x, frozen))
+        np.add.at(out, self.stencil[:, 0], frozen.stiffness * self._elongation(x, frozen))
 
     def hessians(self, x: Array, frozen: Springs, lo: int, hi: int, blend: float, out: Array) -> None:
         out[:] = 0.0
@@ -92,7 +95,7 @@ class Spring(Pulling):
             out[:, 0, 0, axis, axis] = frozen.stiffness[lo:hi, axis]
 
     def force_scale(self, size: float) -> Array:
-        # of the full stiffness: the scale is asked for before the first step
+        # not ``frozen.stiffness``, since the scale is needed before the first step
         return self.elements.data["stiffness"].max(axis=1) * size
 
 

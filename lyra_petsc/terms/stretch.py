@@ -1,7 +1,7 @@
 """Principal stretches of the triangles: the singular values of their deformation gradients.
 
 With C = FᵀF, m = tr C / 2 and r the distance of its eigenvalues from m, the larger eigenvalue is m + r
-and the smaller det C/(m + r), which loses no digits where a triangle is nearly collapsed.
+and the smaller det C/(m + r), a form without cancellation for nearly collapsed triangles.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SOFTENS_BELOW = 1.0 / math.sqrt(3.0)
 
 @kernel()
 def principal(x, s, n, inverse, out):  # type: ignore[no-untyped-def]
-    """Smallest and largest principal stretch of triangles 0..n into out (n, 2)."""
+    """Write the smallest and largest principal stretch of triangles 0..n into out (n, 2)."""
     for e in range(n):
         a, b, c = s[e, 0], s[e, 1], s[e, 2]
         i00, i01, i10, i11 = inverse[e, 0, 0], inverse[e, 0, 1], inverse[e, 1, 0], inverse[e, 1, 1]
@@ -33,7 +33,7 @@ def principal(x, s, n, inverse, out):  # type: ignore[no-untyped-def]
             uv += u * v
         half = 0.5 * (uu - vv)
         largest = 0.5 * (uu + vv) + np.sqrt(half * half + uv * uv)
-        # the area's ratio from a cross product: det C itself is a difference of products
+        # √det C as a ratio of areas from a cross product, since det C is a difference of products
         px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
         qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
         nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx

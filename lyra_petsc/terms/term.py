@@ -1,12 +1,12 @@
-"""What every term offers: pure functions on arrays. It knows neither PETSc, MPI nor files.
+"""The interface of terms: pure functions on arrays, independent of PETSc, MPI and files.
 
 Arrays over the block rows of a rank (owned first, then ghosts) have shape (n_local, 3): vertex positions,
 and the unknowns of edges, three to a row (`lyra_petsc.mesh.points.Layout`). Gradients are added to all rows
-of a stencil; what lands on ghosts is never read, since each rank has every element that touches a row it
-owns.
+of a stencil. Values added to ghost rows are never read, since each rank has every element that touches a row
+it owns.
 
-What stays as it is during a step (targets of handles, frozen normals) a term returns from ``freeze`` and is
-given back with every call, so that no result depends on the order of calls.
+``freeze`` returns the data of a term that are constant during a step (targets of handles, frozen normals).
+They are passed to every other method as ``frozen``, so that no result depends on the order of calls.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ if TYPE_CHECKING:
 Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 CHUNK_VALUES = 32_768
-"""Scalars of element Hessians computed before they are added to the matrix: they stay in cache."""
+"""Scalars of element Hessians computed before they are added to the matrix, few enough to stay in cache."""
 
-LARGEST_TURN = 1.0
-"""Angle [rad] by which a Newton iteration may turn a director against its triangles."""
+LARGEST_ROTATION = 1.0
+"""Largest angle [rad] by which a Newton iteration may rotate a director relative to its triangles."""
 
 
-class Across(NamedTuple):
-    """Pairs of rows (E, 2) of which only the coupling of one with the other is stored."""
+class OffDiagonal(NamedTuple):
+    """Pairs of rows (E, 2) for which only the off-diagonal block of the two rows is assembled."""
 
     stencil: NDArray[np.int32]
 
 
-class WithEdges(NamedTuple):
-    """Elements that couple rows of ``vertices`` (E, n) and ``edges`` (E, m), places of their unknowns.
+class MixedStencil(NamedTuple):
+    """Elements that couple ``vertices`` (E, n), local rows, with edge unknowns.
 
-    What couples the vertices with each other has offsets of its own.
+    ``edges`` (E, m) are the unknowns' indices in flattened arrays over local rows. The blocks that couple
+    vertices with vertices have offsets of their own.
     """
 
     vertices: NDArray[np.int32]
@@ -58,31 +59,31 @@ class WithEdges(NamedTuple):
         return np.ascontiguousarray(np.concatenate([self.vertices, rows], axis=1))
 
 
-Coupling = NDArray[np.int32] | Across | WithEdges
+Coupling = NDArray[np.int32] | OffDiagonal | MixedStencil
 Couplings = Mapping[str, Coupling]
-"""Rows (E, n) that the element Hessians couple, by the names of their offsets in a pattern."""
+"""Rows (E, n) that the element Hessians couple, by the name of their offsets in a `BlockPattern`."""
 
 
 @dataclass(frozen=True)
 class UpcomingStep:
-    """What a term may know of a step before it is computed.
+    """Data of a step that are known before it is computed.
 
     Attributes
     ----------
     start, end : float
-        [s]
-    at : float
-        Time [s] at which moving targets shall stand: that of the integrator's stage.
+        Time [s] of its start and end.
+    target_time : float
+        Time [s] at which moving targets are evaluated: that of the integrator's stage.
     x : (n_local, 3)
-        Positions [m] whose geometry stays as it is during the step.
+        Positions [m] from which a term computes geometry that is constant during the step.
     reference : callable
-        Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time: where handles that
-        begin then start from.
+        Takes a start time [s] and local rows (n,); returns their positions (n, 3) [m] at that time, from
+        which the motion of handles that start then is applied.
     """
 
     start: float
     end: float
-    at: float
+    target_time: float
     x: Array
     reference: Callable[[float, Ints], Array]
 
@@ -116,25 +117,25 @@ class Pair(NamedTuple):
 
 
 class Term(ABC):
-    """A sum over elements; what it is to the rest of the program stands in its registration.
+    """A sum over elements. Its registration describes its role in the rest of the program.
 
     Attributes
     ----------
     stencil : (E, n) int32
         Vertices of each element, local rows.
     edges : (E, m) int32 or None
-        Places of the edge unknowns of each element in the flat form of arrays over local rows.
+        Indices of the edge unknowns of each element in flattened arrays over local rows.
     n_elements, n_owned : int
-        E, and how many of them this rank counts (energies); those come first.
+        Number E of elements, and the number of those that this rank counts in energies; these come first.
     """
 
     registration: Registration
 
     def __init__(self, elements: Elements) -> None:
-        self.take(elements)
+        self.set_elements(elements)
 
-    def take(self, elements: Elements) -> None:
-        """Work on these elements from here on."""
+    def set_elements(self, elements: Elements) -> None:
+        """Replace the elements of this rank."""
         self.elements = elements.compress("damping")
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
         self.edges = None if elements.edges is None else np.ascontiguousarray(elements.edges, dtype=np.int32)
@@ -143,26 +144,26 @@ class Term(ABC):
 
     @property
     def name(self) -> str:
-        """As in the registry."""
+        """Name of the term in the registry."""
         return self.registration.name
 
     @property
     def couplings(self) -> Couplings:
-        """What the Hessians couple."""
+        """Rows and edge unknowns that the element Hessians couple."""
         if self.edges is None:
             return {self.name: self.stencil}
-        return {f"{self.name} vertices": self.stencil, self.name: WithEdges(self.stencil, self.edges)}
+        return {f"{self.name} vertices": self.stencil, self.name: MixedStencil(self.stencil, self.edges)}
 
     @property
     def reference_rows(self) -> Ints:
-        """Local rows (n,) whose positions at the start of handles ``freeze`` asks for."""
+        """Local rows (n,) for which ``freeze`` calls `UpcomingStep.reference`."""
         return np.empty(0, dtype=np.int64)
 
     def freeze(self, step: UpcomingStep) -> Any:
-        """What stays as it is during the step; every call in the step gets it as ``frozen``."""
+        """Data that are constant during the step; passed to all methods in the step as ``frozen``."""
         return None
 
-    def _scatter(
+    def _add_hessians(
         self,
         fill: Callable[[int, int, Array], None],
         weight: Array,
@@ -170,8 +171,9 @@ class Term(ABC):
         values: Array,
         rows: Ints | slice = slice(None),
     ) -> None:
-        """Add weight × Hessians of elements ``rows``, each with its own, to block rows; ``fill`` computes the
-        lo-th to hi-th.
+        """Add the Hessians of elements ``rows``, times ``weight`` of each, to block rows (n_blocks, 3, 3).
+
+        ``fill(lo, hi, out)`` computes those of the lo-th to hi-th of them.
         """
         at, stencil = offsets[self.name][rows], self.stencil[rows]
         n = stencil.shape[1]
@@ -274,11 +276,11 @@ class Elastic(Term):
 
     @property
     def moving(self) -> bool:
-        """Whether its energy depends on where something stands that moves, and does work on the sheet."""
+        """Whether the energy depends on moving targets or obstacles, which thereby do work on the sheet."""
         return self.registration.moving
 
     def connect(self, terms: Iterable[Term]) -> None:
-        """Know the scene's terms, which it may act through; before anything else is asked."""
+        """Look up the other terms of the scene that this one needs; called before all other methods."""
 
     @abstractmethod
     def energies(self, x: Array, frozen: Any) -> Array:
@@ -289,11 +291,11 @@ class Elastic(Term):
         """Add the gradient [N] to ``out`` (n_local, 3)."""
 
     def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
-        """Hessians [N/m] of elements lo..hi into ``out``; what a term has that does not add them itself.
+        """Write the Hessians [N/m] of elements lo..hi into ``out``; unused if ``add_hessian`` is overridden.
 
-        ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one, and what lies between
-        their mixture. ``out`` is (hi − lo, n, n, 3, 3), where elements couple edges (hi − lo, 3 n + m, 3 n +
-        m): the coordinates of the vertices, then the unknowns of the edges.
+        ``blend`` 0 gives the exact Hessian, 1 the regularised, positive-semidefinite one, values between them
+        the linear combination. ``out`` has shape (hi − lo, n, n, 3, 3); with edge unknowns
+        (hi − lo, 3 n + m, 3 n + m), the coordinates of the vertices before the unknowns of the edges.
         """
         raise NotImplementedError
 
@@ -309,40 +311,41 @@ class Elastic(Term):
     ) -> None:
         """Add weight (E,) × element Hessians [N/m] to block rows (n_blocks, 3, 3).
 
-        ``offsets`` are a pattern's, by the names of ``couplings``. ``predicted`` are
-        positions y and z (n_local, 3): an exact Hessian may take the stress of the strain at z, linearised at
-        y.
+        ``offsets`` are those of a `BlockPattern`, by the names of ``couplings``. With ``predicted`` positions
+        y and z (n_local, 3) an exact Hessian may use the stress of the strain at z linearised at y.
         """
-        self._scatter(
+        self._add_hessians(
             lambda lo, hi, out: self.hessians(x, frozen, lo, hi, blend, out), weight, offsets, values
         )
 
     @abstractmethod
     def force_scale(self, size: float) -> Array:
-        """Force [N] whose relative round-off each element's force carries, (E,).
+        """Force [N] to which the round-off error of each element's force is relative, (E,).
 
-        ``size`` [m] is the largest coordinate, to which it is proportional.
+        It is proportional to ``size`` [m], the largest coordinate.
         """
 
     def stiffness(self, x: Array, frozen: Any) -> Array:
         """Force over displacement [N/m] of each element at positions x (n_local, 3), (E,)."""
         return self.force_scale(1.0)
 
-    def sizes(self, size: float) -> float | Array:
-        """Coordinates [m] that each element's energy is of differences of, where the sheet's are ``size``."""
+    def coordinate_scale(self, size: float) -> float | Array:
+        """Magnitude [m] of the coordinates whose differences each element's energy depends on, where the
+        largest coordinate of the sheet is ``size`` [m].
+        """
         return size
 
     slips: bool = False
     """Whether it is friction of contacts, whose force changes too abruptly for one linear solve per step."""
 
     partner: Elastic | None = None
-    """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
+    """The term whose ``frozen`` data this one is given as well, as it depends on them (friction)."""
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
     def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``,
-        and whole numbers (E, m) of each, which ``take`` gets as data ``what``.
+        and whole numbers (E, m) of each, which `set_elements` gets as data ``what``.
 
         ``numbers`` (N,) are the points' global numbers, ``triangles`` (F, 3 + m) near triangles of
         ``surface`` with their marks. A term with an ``approach_limit`` also returns elements whose points
@@ -429,15 +432,16 @@ class Elastic(Term):
         return None
 
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
-        """Of a term that moves and does not push, for this rank's elements: where its targets stand [m], and
-        the energy's gradient by them [N], (n, 3) each.
+        """Target positions [m] of this rank's owned elements, and the energy's gradient by them [N], (n, 3)
+        each; of a ``moving`` term whose work follows from its energy.
         """
         raise NotImplementedError
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
-        """Work [J] that what moves does on this rank's elements on its way from one time [s] to another.
+        """Work [J] of moving obstacles on this rank's elements between the times ``start`` and ``end`` [s].
 
-        By the forces at positions x (n_local, 3) where it stands at time ``at``; of a term that ``pushes``.
+        The forces are those at positions x (n_local, 3) with obstacles at time ``at``; of a term that
+        ``pushes``.
         """
         raise NotImplementedError
 
@@ -470,17 +474,17 @@ class Elastic(Term):
         """
         return dx
 
-    def begin(self, x: Array) -> None:
-        """The run begins at positions x (n_local, 3); for terms that have a state."""
+    def initialise(self, x: Array) -> None:
+        """Initialise the state of the term at positions x (n_local, 3), at the start of a run."""
 
     # -- state and history -------------------------------------------------------------------------
 
     def accept(self, x: Array, frozen: Any) -> None:
-        """The step to positions x (n_local, 3) is accepted; for terms that have a state."""
+        """Update the state of the term after an accepted step to positions x (n_local, 3)."""
 
     def work_of_targets(self, ends: tuple[Array, Array], frozen: tuple[Any, Any]) -> float:
-        """Work [J] of its targets' motion in a step between these positions (n_local, 3), by the mean over
-        both ends; ``frozen`` with targets at its start and at its end.
+        """Work [J] of the targets' motion in a step: the change of energy at fixed positions, averaged over
+        the positions ``ends`` (n_local, 3) at its start and end. ``frozen`` has the targets at both times.
         """
         first, last = frozen
         return 0.5 * sum(float((self.energies(x, last) - self.energies(x, first)).sum()) for x in ends)
@@ -504,35 +508,35 @@ class Elastic(Term):
         """Go back to what `contact_state` returned."""
 
     def heat(self, x: Array, frozen: Any) -> float:
-        """What of the energy [J] of its owned elements is none when the step to x is accepted, but heat."""
+        """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
         return 0.0
 
     def element_values(self) -> Array:
-        """What a checkpoint must hold of elements that do not change, (E, m)."""
+        """State (E, m) of elements with a fixed stencil, for checkpoints."""
         raise NotImplementedError
 
     def restore_values(self, values: Array) -> None:
-        """Go on with these (E, m)."""
+        """Restore the state (E, m) that ``element_values`` returned."""
         raise NotImplementedError
 
     def state(self) -> dict[str, Array]:
-        """What a checkpoint must hold, by the registration's names: (n_vertices, 3) of owned vertices."""
+        """State of the owned vertices, (n_vertices, 3), for checkpoints, by the names in the registration."""
         return {}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Go on with a state."""
+        """Restore the state that ``state`` returned."""
 
     @property
     def edge_indices(self) -> Ints:
-        """Places (n,) of the edges that ``edge_state`` is of, in the flat form of arrays over local rows."""
+        """Indices (n,) of the unknowns of this term's edges in flattened arrays over local rows."""
         return np.empty(0, dtype=np.int64)
 
     def edge_state(self) -> dict[str, Array]:
-        """What a checkpoint must hold, by the registration's names: a number for each edge, (n,)."""
+        """State of the edges, one number each (n,), for checkpoints, by the names in the registration."""
         return {}
 
     def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
-        """Go on with a state of edges at positions x (n_local, 3)."""
+        """Restore the state of the edges at positions x (n_local, 3)."""
 
     def initialise_pairs(self, x: Array, frozen: Any) -> None:
         """Store the pairs in contact at positions x (n_local, 3), where a run begins or is resumed."""
@@ -559,54 +563,59 @@ class Elastic(Term):
         raise NotImplementedError
 
     def element_state(self) -> tuple[Ints, Array]:
-        """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,
-        by their global numbers, and (E, m) numbers.
+        """State of changing elements that this rank counts, for checkpoints: the global numbers of their
+        vertices (E, n) and their values (E, m).
         """
         raise NotImplementedError
 
     def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
-        """Go on with what `element_state` gave, of elements that touch owned vertices ``own``."""
+        """Restore what ``element_state`` returned, for elements that touch the owned vertices ``own``."""
 
-    def largest_turn(self, way: Array) -> float:
-        """Largest angle [rad] by which directors of owned edges turn on a way (n_owned, 3)."""
+    def largest_rotation(self, increment: Array) -> float:
+        """Largest angle [rad] by which an increment (n_owned, 3) [m] rotates directors of owned edges."""
         return 0.0
 
-    def forget(self) -> None:
-        """Keep nothing that can be computed again from positions."""
+    def clear_cache(self) -> None:
+        """Free everything that can be computed again from positions."""
 
     @property
     def edge_stiffness(self) -> Array:
-        """Of their unknowns at rest, (n,) [N/m]."""
+        """Stiffness [N/m] of the edges' unknowns in the rest shape, (n,)."""
         return np.empty(0)
 
-    def nearer(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:
-        """What ``frozen`` is to be from positions x on, where edges not ``held`` (n_local, 3) turned far from
-        it; or None. Energy and unknowns stay as they are.
+    def updated_frames(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:
+        """New frozen frames for positions x, where edges have turned far from theirs; None if none has.
+
+        Edges with prescribed unknowns, ``held`` (n_local, 3), keep theirs. Energy and unknowns stay the same.
         """
         return None
 
     def frames_at_end(self, x: Array, frozen: Any) -> Any:
-        """What ``frozen`` is to be from the end x of a step on, which ``accept`` then leaves as it is."""
+        """Frozen frames for positions x at the end of a step; ``accept`` then takes them unchanged."""
         return frozen
 
-    def followed(self, x: Array, way: Array, frozen: Any, along: Array | None = None) -> tuple[Ints, Array]:
-        """Places of edges whose unknowns go far on the way (n_local, 3) [m] from x, and better ways, (n,).
+    def edge_increments(
+        self, x: Array, increment: Array, frozen: Any, displacement: Array | None = None
+    ) -> tuple[Ints, Array]:
+        """Corrected increments (n,) [m] of edge unknowns, and the indices (n,) of the latter.
 
-        The same to first order. Of all edges, where vertices go ``along`` (n_local, 3) [m] instead.
+        They keep directors in line with their triangles where an increment (n_local, 3) [m] from positions x
+        rotates edges far, and equal its own to first order. Returned for edges that rotate by more than
+        `LARGEST_ROTATION`; for all if the vertices move by ``displacement`` (n_local, 3) [m] instead.
         """
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
-        """This rank's part of each further column of history.csv that the registration names."""
+        """This rank's part of each additional column of history.csv that the registration names."""
         return {}
 
 
-class Pulling(Elastic):
-    """An elastic term by which handles pull."""
+class HandleTerm(Elastic):
+    """An elastic energy by which handles pull the sheet."""
 
     @abstractmethod
     def handle_forces(self, x: Array, frozen: Any, count: int) -> Array:
-        """Force [N] of each of a scene's handles on this rank's elements, (count, 3)."""
+        """Force [N] of each of the scene's ``count`` handles on this rank's elements, (count, 3)."""
 
 
 class Viscous(Term):
@@ -626,18 +635,18 @@ class Viscous(Term):
 
 
 class Load(Term):
-    """A force that does not change within a step."""
+    """A force that is constant during a step."""
 
-    follows: ClassVar[bool] = False
-    """Whether it depends on the positions at the start of the step."""
+    is_follower: ClassVar[bool] = False
+    """Whether the force depends on the positions at the start of the step."""
 
     def connect(self, terms: Iterable[Term]) -> None:
-        """Know the scene's terms, which it may act through; before anything else is asked."""
+        """Look up the other terms of the scene that this one needs; called before all other methods."""
 
     @abstractmethod
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        """Add the force [N] of the step from t0 to t1 [s] that starts at positions x to ``out``."""
+        """Add the force [N] during the step from t0 to t1 [s], which starts at positions x, to ``out``."""
 
     def potential(self, x: Array) -> float:
-        """Potential energy [J] of this rank's elements where the load has one, else 0."""
+        """Potential energy [J] of this rank's elements; 0 for a load without a potential."""
         return 0.0

@@ -1,13 +1,13 @@
 """Wind on each triangle, with the geometry frozen at the start of the step.
 
-With v_rel = wind − mean velocity of the vertices, v_n its part along the unit normal n, v_t the rest,
-and the rest area A::
+With v_rel = wind − mean velocity of the vertices, its component v_n along the unit normal n, its tangential
+part v_t, and the rest area A::
 
-    force = ρ A |v_n| v_n n + drag A v_t        a third to each vertex
+    force = ρ A |v_n| v_n n + drag A v_t        one third on each vertex
     potential = ρ A |v_n|³ / 3 + drag A |v_t|² / 2
 
-(as the original Lyra: rest area, no ½, so ρ acts as ½ c_d ρ_air). The potential is convex, hence the
-implicit force is stable at any wind and step.
+(as in the original Lyra: rest area and no ½, so that ρ stands for ½ c_d ρ_air). The potential is convex,
+hence the implicit force is stable for any wind and step length.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 
 @kernel()
 def normals(x, s, out):  # type: ignore[no-untyped-def]
-    """Unit normals of the triangles into out (E, 3); zero for a collapsed one."""
+    """Write unit normals of triangles into out (E, 3); 0 for collapsed ones."""
     for e in range(s.shape[0]):
         a, b, c = s[e, 0], s[e, 1], s[e, 2]
         px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
@@ -52,7 +52,7 @@ def _relative(v, s, e, n, wind):  # type: ignore[no-untyped-def]
 
 @kernel()
 def potentials(v, s, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
-    """Potential [W] of the first len(out) triangles."""
+    """Write the potential [W] of the first len(out) triangles."""
     for e in range(out.shape[0]):
         rx, ry, rz, vn = _relative(v, s, e, n, wind)
         tangential = rx * rx + ry * ry + rz * rz - vn * vn
@@ -79,8 +79,8 @@ def add_gradient(v, s, area, n, wind, density, drag, out):  # type: ignore[no-un
 
 
 @kernel(inline="always")
-def _slopes(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-def]
-    """Factors of n nᵀ and of the identity in every block of the Hessian of triangle e."""
+def _hessian_factors(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-def]
+    """Factors of n nᵀ and of the identity in each block of the Hessian of triangle e."""
     _, _, _, vn = _relative(v, s, e, n, wind)
     w = area[e] / 9.0
     return w * (2.0 * density * abs(vn) - drag), w * drag
@@ -88,10 +88,10 @@ def _slopes(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-d
 
 @kernel()
 def add_hessian(v, s, area, n, wind, density, drag, offsets, values):  # type: ignore[no-untyped-def]
-    """Add Hessian blocks [N s/m] to the block rows, where ``offsets`` say."""
+    """Add the Hessian blocks [N s/m] to block rows at ``offsets`` (E, 6)."""
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values, 6)
-        along, across = _slopes(v, s, e, area, n, wind, density, drag)
+        along, across = _hessian_factors(v, s, e, area, n, wind, density, drag)
         right = n[e, 0], n[e, 1], n[e, 2]
         left = along * right[0], along * right[1], along * right[2]
         for pair in range(6):

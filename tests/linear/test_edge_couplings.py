@@ -11,7 +11,7 @@ from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
 from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, memory_sizes
 from lyra_petsc.linear.gauss_seidel import store
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.terms.term import WithEdges
+from lyra_petsc.terms.term import MixedStencil
 
 N_VERTICES, N_OWNED, N_LOCAL = 20, 32, 38
 """Rows 20 to 31 and 35 to 37 hold three edges each, all others a vertex."""
@@ -28,7 +28,7 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     vertices = np.array([RNG.choice(vertex_rows, 3, replace=False) for _ in range(40)], dtype=np.int32)
     edges = np.array([RNG.choice(places, 3, replace=False) for _ in range(40)], dtype=np.int64)
     pair = RNG.choice(vertex_rows, (8, 2)).astype(np.int32)
-    coupling = WithEdges(vertices, edges)
+    coupling = MixedStencil(vertices, edges)
     pattern = BlockPattern({"corners": vertices, "mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
     half = RNG.normal(size=(40, 12, 12))
     blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
@@ -249,7 +249,7 @@ def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
 
 def test_rows_of_ghosts_alone() -> None:
     """A rank all of whose elements belong to others' rows but for one vertex."""
-    coupling = WithEdges(np.array([[0, 2, 3]], np.int32), np.array([[12, 13, 14]], np.int64))
+    coupling = MixedStencil(np.array([[0, 2, 3]], np.int32), np.array([[12, 13, 14]], np.int64))
     pattern = BlockPattern({"mixed": coupling}, 1, 5)
     values = RNG.normal(size=(pattern.n_stored, 3, 3))
     x, out = RNG.normal(size=(5, 3)), np.empty((1, 3))

@@ -14,7 +14,7 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.linear import pattern as room
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.terms.term import Across, WithEdges
+from lyra_petsc.terms.term import MixedStencil, OffDiagonal
 
 N_OWNED, N_LOCAL = 9, 14
 
@@ -97,7 +97,7 @@ def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
 def test_rows_times_columns_pass_32_bits() -> None:
     n = 70_000  # n² > 2³²
     stencil = np.array([[n - 1, n - 2], [0, n - 1]], dtype=np.int32)
-    pattern = BlockPattern({"pair": Across(stencil)}, n, n)
+    pattern = BlockPattern({"pair": OffDiagonal(stencil)}, n, n)
     assert pattern.n_blocks == n + 2
     assert pattern.n_couplings == n + 4
     assert pattern.columns[: pattern.indptr[1]].tolist() == [0, n - 1]
@@ -116,7 +116,7 @@ def test_the_same_elements_have_one_table_of_offsets() -> None:
 
 def test_pairs_are_coupled_whole_or_across_only() -> None:
     stencil = np.array([[1, 2], [3, 0]], dtype=np.int32)
-    pattern = BlockPattern({"pair": stencil, "across": Across(stencil)}, 4, 4)
+    pattern = BlockPattern({"pair": stencil, "across": OffDiagonal(stencil)}, 4, 4)
     assert pattern.offsets["pair"].shape == (2, 3)
     assert pattern.offsets["across"].shape == (2,)
     np.testing.assert_array_equal(pattern.offsets["pair"][:, 1], pattern.offsets["across"])
@@ -128,7 +128,7 @@ def test_pairs_are_coupled_whole_or_across_only() -> None:
     for (a, b), block in zip(stencil, blocks, strict=True):
         expected[np.ix_([a, b], [a, b])] += block
     np.testing.assert_allclose(expanded(pattern, values, 4), expected.transpose(0, 2, 1, 3))
-    assert BlockPattern({"across": Across(stencil)}, 4, 4).columns.tolist() == pattern.columns.tolist()
+    assert BlockPattern({"across": OffDiagonal(stencil)}, 4, 4).columns.tolist() == pattern.columns.tolist()
 
 
 @pytest.mark.parametrize("largest", [room.LARGEST_INT32, 80])
@@ -164,7 +164,7 @@ def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
     rng = np.random.default_rng(8)
     vertices = np.array([[0, 1, 2], [5, 3, 1], [4, 2, 0]], dtype=np.int32)
     edges = np.array([[18, 19], [23, 20], [21, 19]], dtype=np.int64)  # two of one row, and of different ones
-    pattern = BlockPattern({"corners": vertices, "mixed": WithEdges(vertices, edges)}, n_owned, 8)
+    pattern = BlockPattern({"corners": vertices, "mixed": MixedStencil(vertices, edges)}, n_owned, 8)
     blocks = rng.random((3, 11, 11))
     blocks += blocks.transpose(0, 2, 1)
     weight, values = rng.random(3), np.zeros((pattern.n_stored, 3, 3))

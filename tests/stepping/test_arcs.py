@@ -33,7 +33,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
     for term in system.active.with_edges:
         places = term.edge_indices
         own = places < way.size
-        way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.tangent @ AXIS))[own]
+        way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.direction @ AXIS))[own]
     return system.stationary_velocity(), way / system.stage.c
 
 

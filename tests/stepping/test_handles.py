@@ -35,7 +35,7 @@ def test_linear_translation_is_a_straight_line() -> None:
     points = np.array([[0.1, 0.2, 0.3]])
     for t, share in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.25), (2.5, 0.75), (3.0, 1.0), (9.0, 1.0)):
         np.testing.assert_allclose(
-            motion.carried(points, 0.0, t) - points, [[2 * share, 0, -4 * share]], atol=1e-15
+            motion.moved(points, 0.0, t) - points, [[2 * share, 0, -4 * share]], atol=1e-15
         )
     np.testing.assert_allclose(motion.velocity(points, 0.0, 2.0), [[1, 0, -2]], rtol=1e-8)
     np.testing.assert_allclose(motion.velocity(points, 0.0, 4.0), 0.0)
@@ -50,7 +50,7 @@ def test_hermite_starts_and_ends_at_rest_and_passes_with_the_central_difference(
     slope = 4.0 / 3.0
     for t in np.linspace(0.05, 0.95, 7):
         expected = 3 * t**2 - 2 * t**3 + slope * (t**3 - t**2)
-        assert motion.carried(origin, 0.0, t)[0, 0] == pytest.approx(expected, rel=1e-13)
+        assert motion.moved(origin, 0.0, t)[0, 0] == pytest.approx(expected, rel=1e-13)
     assert motion.velocity(origin, 0.0, 0.0)[0, 0] == pytest.approx(0.0, abs=1e-4)
     assert motion.velocity(origin, 0.0, 1.0)[0, 0] == pytest.approx(slope, rel=1e-5)
     assert motion.velocity(origin, 0.0, 3.0)[0, 0] == pytest.approx(0.0, abs=1e-4)
@@ -64,7 +64,7 @@ def test_a_keyframe_velocity_replaces_the_tangent() -> None:
         "hermite",
     )
     for t in (0.3, 1.0, 1.7):
-        assert motion.carried(np.zeros((1, 3)), 0.0, t)[0, 0] == pytest.approx(t, rel=1e-13)
+        assert motion.moved(np.zeros((1, 3)), 0.0, t)[0, 0] == pytest.approx(t, rel=1e-13)
 
 
 @pytest.mark.parametrize("degrees", [45.0, -120.0, 200.0, 300.0])
@@ -74,8 +74,8 @@ def test_half_way_through_a_turn_is_half_the_angle(degrees: float, kind: str) ->
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
     for t, part in ((1.0, 0.5), (2.0, 1.0), (0.0, 0.0)):
         expected = points @ rotation([1, 1, 0], np.radians(part * degrees)).T
-        np.testing.assert_allclose(motion.carried(points, 0.0, t), expected, atol=1e-13)
-    middle = motion.carried(points, 0.0, 0.7)
+        np.testing.assert_allclose(motion.moved(points, 0.0, t), expected, atol=1e-13)
+    middle = motion.moved(points, 0.0, 0.7)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), np.linalg.norm(points, axis=1), rtol=1e-13)
 
 
@@ -96,8 +96,8 @@ def test_a_motion_is_relative_to_the_handles_start() -> None:
     motion = Motion(
         keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear"
     )
-    np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 2.0), [[1, 0, 0]])
-    np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
+    np.testing.assert_allclose(motion.moved(np.zeros((1, 3)), 1.0, 2.0), [[1, 0, 0]])
+    np.testing.assert_allclose(motion.moved(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
 
 
 @pytest.mark.parametrize("kind", ["linear", "hermite"])
@@ -111,9 +111,9 @@ def test_angles_mean_what_they_say(degrees: list[float], kind: str) -> None:
     motion = Motion(keyframes(*rows), kind)
     times = np.linspace(0, len(degrees) - 1, 400 * (len(degrees) - 1) + 1)
     points = np.array([[1.0, 0.0, 0.0]])
-    angles = np.degrees(np.unwrap([np.arctan2(*motion.carried(points, 0.0, t)[0, 1::-1]) for t in times]))
+    angles = np.degrees(np.unwrap([np.arctan2(*motion.moved(points, 0.0, t)[0, 1::-1]) for t in times]))
     np.testing.assert_allclose(angles[::400], np.array(degrees) - degrees[0], atol=1e-9)
-    middle = motion.carried(points, 0.0, 0.5)
+    middle = motion.moved(points, 0.0, 0.5)
     if kind == "linear" or len(degrees) == 2:
         half = np.radians(0.5 * (degrees[1] - degrees[0]))
         np.testing.assert_allclose(middle, [[np.cos(half), np.sin(half), 0.0]], atol=1e-12)
@@ -160,7 +160,7 @@ def test_two_halves_make_a_full_turn() -> None:
         keyframes({"time": 0}, {"time": 1, "rotate": turn(180)}, {"time": 2, "rotate": turn(360)}), "hermite"
     )
     points = np.array([[1.0, 0.0, 0.0]])
-    angles = np.unwrap([np.arctan2(*motion.carried(points, 0.0, t)[0, 1::-1]) for t in np.linspace(0, 2, 41)])
+    angles = np.unwrap([np.arctan2(*motion.moved(points, 0.0, t)[0, 1::-1]) for t in np.linspace(0, 2, 41)])
     assert np.all(np.diff(angles) > 0.0)
     assert angles[-1] - angles[0] == pytest.approx(2 * np.pi)
 
@@ -209,7 +209,7 @@ def test_held_vertices_are_where_the_motion_says_at_every_step(
         motion, start = motion_of(simulation.scene, 0), simulation.x[nodes]
         for step in range(1, 19):
             simulation.step(DT)
-            expected = motion.carried(start, 0.0, simulation.time)
+            expected = motion.moved(start, 0.0, simulation.time)
             np.testing.assert_allclose(simulation.x[nodes], expected, rtol=0.0, atol=1e-15)
             written = simulation.gather(simulation.system.output_velocity())[nodes]
             np.testing.assert_allclose(written, motion.velocity(start, 0.0, simulation.time), atol=1e-12)
@@ -248,7 +248,7 @@ def test_a_late_moving_handle_goes_the_rest_of_its_way(comm: MPI.Comm) -> None:
         for _ in range(5):
             simulation.step(DT)
             np.testing.assert_allclose(
-                simulation.x[[0, 4]], motion.carried(caught, 0.1, simulation.time), rtol=0.0, atol=1e-15
+                simulation.x[[0, 4]], motion.moved(caught, 0.1, simulation.time), rtol=0.0, atol=1e-15
             )
 
 
@@ -260,7 +260,7 @@ def test_the_later_handle_in_the_scene_counts(comm: MPI.Comm, order: tuple[int, 
         start = simulation.x
         motion = motion_of(simulation.scene, order.index(1))
         end = simulation.run(DT, 6)
-        moved = motion.carried(start[[1, 2]], 0.0, 0.3)
+        moved = motion.moved(start[[1, 2]], 0.0, 0.3)
         np.testing.assert_allclose(end[0], start[0])
         np.testing.assert_allclose(end[2], moved[1], atol=1e-15)
         np.testing.assert_allclose(end[1], moved[0] if order == (0, 1) else start[1], atol=1e-15)
@@ -295,7 +295,7 @@ def test_a_soft_handle_pulls_towards_the_moving_target() -> None:
         start = simulation.x[:2]
         for _ in range(10):
             simulation.step(DT)
-            target = motion_of(simulation.scene, 0).carried(start, 0.0, simulation.time)
+            target = motion_of(simulation.scene, 0).moved(start, 0.0, simulation.time)
             np.testing.assert_allclose(simulation.x[:2], target, atol=2e-5)
 
 

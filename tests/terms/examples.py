@@ -1,4 +1,4 @@
-"""A scene fragment for every registered term: what the contract test walks.
+"""A scene fragment for every registered term, for the tests of the contract.
 
 A new term needs an entry here; without one the contract test fails.
 """

@@ -1,4 +1,4 @@
-"""What every registered term must fulfil: each derivative against differences of the one before."""
+"""Requirements on every registered term, such as derivatives that agree with finite differences."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import Frames
 from lyra_petsc.terms.registry import REGISTRY, Role
-from lyra_petsc.terms.term import Elastic, Load, Pulling, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Elastic, HandleTerm, Load, Term, UpcomingStep, Viscous
 
 pytestmark = pytest.mark.quick
 
 
-#: anchored in space: neither invariant under rigid motion nor free of resultants
+#: terms with targets in space: not invariant under rigid motions, and their forces do not sum to zero
 ANCHORED = {"clamp", "spring"}
 
-#: those whose stencils change have none at rest: test_contact_pairs.py, test_friction_pairs.py
+#: all but terms with changing stencils, which have no elements at rest (test_contact_pairs.py and others)
 FIXED = [entry for entry in REGISTRY if not entry.neighbours]
 
-#: step of differences [m]: friction has a kink where it begins to slide, in shear after 0.1°
+#: step of finite differences [m], small where the force of friction has a kink: in shear after 0.1°
 STEPS = {"shear_friction": 3e-6}
 
-KINDS = {Role.ELASTIC: Elastic, Role.CONSTRAINT: Pulling, Role.VISCOUS: Viscous, Role.LOAD: Load}
+KINDS = {Role.ELASTIC: Elastic, Role.CONSTRAINT: HandleTerm, Role.VISCOUS: Viscous, Role.LOAD: Load}
 
 
-def registered(kind: type[Term]) -> list[str]:
+def names_of(kind: type[Term]) -> list[str]:
     """Names of the registered terms of a kind."""
     return [entry.name for entry in FIXED if issubclass(KINDS[entry.role], kind)]
 
 
 every_term = pytest.mark.parametrize("name", [entry.name for entry in FIXED])
-every_elastic = pytest.mark.parametrize("name", registered(Elastic))
-every_viscous = pytest.mark.parametrize("name", registered(Viscous))
-every_load = pytest.mark.parametrize("name", registered(Load))
+every_elastic = pytest.mark.parametrize("name", names_of(Elastic))
+every_viscous = pytest.mark.parametrize("name", names_of(Viscous))
+every_load = pytest.mark.parametrize("name", names_of(Load))
 
 
 @pytest.fixture
@@ -67,35 +67,35 @@ def term(simulation: Simulation, name: str) -> Term:
     return simulation.problem.terms[name]
 
 
-def moved(simulation: Simulation, x: Array, turn: Array, way: list[float]) -> Array:
-    """A shape after a rigid motion; unknowns of edges stay."""
+def moved(simulation: Simulation, x: Array, turn: Array, translation: list[float]) -> Array:
+    """The shape x after a rigid motion; unknowns of edges do not change."""
     y, n = x.copy(), simulation.problem.points.n_vertices
-    y[:n] = x[:n] @ turn.T + way
+    y[:n] = x[:n] @ turn.T + translation
     return y
 
 
 def disturbed(simulation: Simulation, size: float, squeeze: float = 1.0) -> Array:
-    """A shape far from rest, turned in space."""
+    """A randomly disturbed, rotated shape far from rest."""
     n = simulation.problem.points.n_vertices
     x = simulation.system.x * np.where(np.arange(len(simulation.system.x)) < n, squeeze, 1.0)[:, None]
     disturbance = np.random.default_rng(3).uniform(-size, size, x.shape)
     y = moved(simulation, x + disturbance, rotation([1.0, 2.0, 0.5], 0.9), [0.3, -0.2, 0.1])
     for term in simulation.problem.terms.values():
-        if isinstance(term, MidEdge):  # its directors have turned with the triangles
-            places = term.of_edges.places
-            y.ravel()[places] = directors_along_normals(term, y) + 0.5 * disturbance.ravel()[places]
+        if isinstance(term, MidEdge):  # let directors rotate with the triangles
+            indices = term.of_edges.indices
+            y.ravel()[indices] = directors_along_normals(term, y) + 0.5 * disturbance.ravel()[indices]
     return y
 
 
 def turned(frozen: Any, turn: Array) -> Any:
-    """What a term froze, turned with the shape."""
+    """The frozen data of a term, rotated with the shape."""
     return Frames(*(each @ turn.T for each in frozen)) if isinstance(frozen, Frames) else frozen
 
 
 def test_every_registered_term_has_an_example_and_a_kind() -> None:
     names = {entry.name for entry in FIXED}
     assert set(FRAGMENTS) == names
-    assert {*registered(Elastic), *registered(Viscous), *registered(Load)} == names
+    assert {*names_of(Elastic), *names_of(Viscous), *names_of(Load)} == names
 
 
 @every_term
@@ -118,7 +118,7 @@ def elastic(term: Term) -> Elastic:
 
 @pytest.fixture
 def frozen(term: Term, simulation: Simulation) -> Any:
-    """What the term freezes for a step; of the wind the geometry of a disturbed shape."""
+    """The frozen data of the term, for wind those of a disturbed shape."""
     assert isinstance(term, (Elastic, Viscous))
     x = disturbed(simulation, 0.1) if isinstance(term, Viscous) else simulation.system.x
     return frozen_by(term, simulation.system, x)
@@ -171,7 +171,7 @@ def test_regularised_hessian_is_positive_semidefinite(
 
 
 def test_exact_hessian_of_a_compressed_sheet_is_indefinite(tmp_path: Path) -> None:
-    # what the regularisation is there for: without it the test above would say nothing
+    # otherwise the test above would hold without the regularisation
     with example("membrane", tmp_path) as simulation:
         term = simulation.problem.membrane
         matrices = element_hessians(term, 0.4 * simulation.system.x, None, 0.0)
@@ -215,7 +215,7 @@ def test_no_force_and_no_energy_at_rest(elastic: Elastic, frozen: Any, simulatio
     assert np.all(elastic.energies(x, frozen) <= 1e-28 * stiffness)
 
 
-@pytest.mark.parametrize("name", [name for name in registered(Elastic) if name not in ANCHORED])
+@pytest.mark.parametrize("name", [name for name in names_of(Elastic) if name not in ANCHORED])
 def test_energy_is_invariant_and_forces_balance(
     elastic: Elastic, frozen: Any, simulation: Simulation
 ) -> None:
@@ -237,11 +237,11 @@ def test_energy_is_invariant_and_forces_balance(
 @every_elastic
 def test_force_scale_bounds_the_round_off_of_the_force(term: Term, simulation: Simulation) -> None:
     assert isinstance(term, Elastic)
-    # 10 ε of this scale is where a step may stop: the force at rest must stay below it
+    # Newton's method may stop at 10 ε of this scale: the force at rest must be below it
     far = 100.0
     x = moved(simulation, simulation.system.x, np.eye(3), [far, far, far])
     before = term.force_scale(far + 1.0)
-    # springs and clamps set out from where they stand
+    # springs and clamps start at the present positions
     frozen = term.freeze(UpcomingStep(0.0, 0.01, 0.01, x, lambda start, rows: x[rows]))
     np.testing.assert_array_equal(term.force_scale(far + 1.0), before)
     assert np.all(before > 0.0)

@@ -17,7 +17,7 @@ from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.clamp import Clamp
 from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
 from lyra_petsc.terms.motion import STILL, Window
-from lyra_petsc.terms.registry import registered
+from lyra_petsc.terms.registry import registration_of
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 EDGE = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
@@ -50,10 +50,10 @@ def bending(part_of_limit: float = 1.0) -> Bending:
         "rest_angle": np.array([-0.4]),
         "limit": part_of_limit * fading_limit(REST_AREAS)[None],
         "rest_height": np.array([1.0]),
-        "places": np.array([[2.0, 2.0]]),
+        "opposite_corners": np.array([[2.0, 2.0]]),
     }
     term = Bending(Elements(np.array([[0, 1, 2, 3]]), data))
-    term.registration = registered("bending")
+    term.registration = registration_of("bending")
     return term
 
 
@@ -66,7 +66,7 @@ def clamp() -> Clamp:
         "handle": np.array([0.0]),
     }
     term = Clamp(Elements(np.array([[0, 1, 2]]), data), {0: (STILL, Window(0.0, np.inf))})
-    term.registration = registered("clamp")
+    term.registration = registration_of("clamp")
     return term
 
 

@@ -20,8 +20,8 @@ SCENE = {
 def test_many_handles_on_many_vertices_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene.model_validate(SCENE)
     mesh = build_mesh(scene.mesh)
-    assert sum(len(vertices) for vertices in held.select_held(scene, mesh).values()) == 250
+    assert sum(len(vertices) for vertices in held.select_exact(scene, mesh).values()) == 250
     monkeypatch.setattr(held, "available_memory", lambda: 12_000)
     with pytest.raises(InputError, match="hold 125 vertices in all") as caught:
-        held.select_held(scene, mesh)
+        held.select_exact(scene, mesh)
     assert caught.value.key == "handles[4]"

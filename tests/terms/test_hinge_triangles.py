@@ -12,7 +12,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.hinge_triangles import triangles_of
-from lyra_petsc.terms.registry import registered
+from lyra_petsc.terms.registry import registration_of
 
 
 def strip(n: int, *, twisted: bool) -> Ints:
@@ -40,14 +40,14 @@ def turned(triangles: Ints) -> Ints:
 
 
 def hinges_of(triangles: Ints) -> tuple[Ints, Ints]:
-    """Hinges (E, 4) and the places (E, 2) of their opposite vertices."""
+    """Hinges (E, 4) and the corners (E, 2) of their opposite vertices."""
     vertices, faces = hinges(triangles)
-    places = [np.argmax(triangles[faces[:, i]] == vertices[:, 2 + i, None], axis=1) for i in (0, 1)]
-    return vertices, np.stack(places, axis=1)
+    opposite = [np.argmax(triangles[faces[:, i]] == vertices[:, 2 + i, None], axis=1) for i in (0, 1)]
+    return vertices, np.stack(opposite, axis=1)
 
 
-def given(rows: list[list[int]], places: list[list[int]]) -> tuple[Ints, Ints]:
-    return np.array(rows, dtype=np.int64).reshape(-1, 4), np.array(places, dtype=np.int64).reshape(-1, 2)
+def given(rows: list[list[int]], opposite: list[list[int]]) -> tuple[Ints, Ints]:
+    return np.array(rows, dtype=np.int64).reshape(-1, 4), np.array(opposite, dtype=np.int64).reshape(-1, 2)
 
 
 SHEETS = {
@@ -68,7 +68,7 @@ def shape(n: int) -> Array:
 
 
 def bending(name: str, limit: float = 0.0) -> Bending:
-    stencil, places = SHEETS[name]
+    stencil, opposite = SHEETS[name]
     n = len(stencil)
     rng = np.random.default_rng(3)
     data = {
@@ -76,7 +76,7 @@ def bending(name: str, limit: float = 0.0) -> Bending:
         "rest_angle": rng.uniform(-0.5, 0.5, n),
         "limit": np.full((n, 2), limit),
         "rest_height": np.ones(n),
-        "places": places.astype(np.float64),
+        "opposite_corners": opposite.astype(np.float64),
         "damping": np.zeros(n),
     }
     return made(Elements(stencil.astype(np.int32), data))
@@ -84,32 +84,35 @@ def bending(name: str, limit: float = 0.0) -> Bending:
 
 def made(elements: Elements) -> Bending:
     term = Bending(elements)
-    term.registration = registered("bending")
+    term.registration = registration_of("bending")
     return term
 
 
 def alone(name: str, limit: float = 0.0) -> list[Bending]:
     """A term for each hinge of ``bending``."""
-    (stencil, places), data = SHEETS[name], bending(name, limit).elements.data
+    (stencil, opposite), data = SHEETS[name], bending(name, limit).elements.data
     found = []
     for row, points in enumerate(stencil):
         own = {key: values[row : row + 1] for key, values in data.items()}
-        own |= {"limit": np.full((1, 2), limit), "places": places[row : row + 1].astype(np.float64)}
+        own |= {
+            "limit": np.full((1, 2), limit),
+            "opposite_corners": opposite[row : row + 1].astype(np.float64),
+        }
         found.append(made(Elements(points[None].astype(np.int32), own)))
     return found
 
 
 @every_sheet
 def test_sides_and_hinges_name_each_other(name: str) -> None:
-    stencil, places = SHEETS[name]
-    corners, sides, found = triangles_of(stencil.astype(np.int32), places)
+    stencil, opposite = SHEETS[name]
+    corners, sides, found = triangles_of(stencil.astype(np.int32), opposite)
     n = len(stencil)
     assert sides.shape == (n + 1, 2)
     assert found.shape == corners.shape
     for hinge, (a, b, c, d) in enumerate(stencil):
         for second, points in enumerate(((a, b, c), (a, b, d))):
             triangle, corner = divmod(sides[hinge, second], 4)
-            assert corner == places[hinge, second]
+            assert corner == opposite[hinge, second]
             around = corners[triangle, [(corner + 1) % 3, (corner + 2) % 3, corner]].tolist()
             assert around == [points[second], points[1 - second], points[2]]
             assert found[triangle, corner] == 2 * hinge + second
@@ -117,8 +120,8 @@ def test_sides_and_hinges_name_each_other(name: str) -> None:
 
 
 def count(name: str) -> int:
-    stencil, places = SHEETS[name]
-    return len(triangles_of(stencil.astype(np.int32), places).corners)
+    stencil, opposite = SHEETS[name]
+    return len(triangles_of(stencil.astype(np.int32), opposite).corners)
 
 
 def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> None:
@@ -132,8 +135,8 @@ def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> Non
 def test_triangles_are_those_of_the_mesh_whatever_their_points_are_called(seed: int, most: int) -> None:
     names = np.random.default_rng(seed).choice(most, 14, replace=False)
     mesh = strip(7, twisted=False)
-    stencil, places = hinges_of(mesh)
-    corners, _, _ = triangles_of(names[stencil].astype(np.int32), places)
+    stencil, opposite = hinges_of(mesh)
+    corners, _, _ = triangles_of(names[stencil].astype(np.int32), opposite)
     # the same corners in the same order, and in the order in which ranks have their elements
     assert sorted(corners.tolist()) == sorted(names[mesh].tolist())
     assert np.sort(corners, axis=1).tolist() == sorted(np.sort(corners, axis=1).tolist())

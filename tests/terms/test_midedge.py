@@ -72,18 +72,18 @@ def cylinder(pattern: str, n: int) -> float:
         rows = slice(0, simulation.problem.points.n_vertices)
         flat, edges = x[rows].copy(), term.of_edges
         x[rows] = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], 1.0 - np.cos(flat[:, 0])])
-        term.begin(x)
+        term.initialise(x)
         tangent, across = term.frames
         middle = flat[edges.ends].mean(axis=1)[:, 0]
         normal = np.column_stack([-np.sin(middle), np.zeros(len(middle)), np.cos(middle)])
         sine = np.sum(np.cross(tangent, across) * normal, axis=1)
-        x.ravel()[edges.places] = edges.length * np.arctan2(sine, np.sum(across * normal, axis=1))
+        x.ravel()[edges.indices] = edges.length * np.arctan2(sine, np.sum(across * normal, axis=1))
         return float(term.energies(x, term.frames).sum()) / 0.5
 
 
 @pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
 def test_energy_of_a_cylinder(pattern: str) -> None:
-    """A strip's ½ D11 κ² + terms of the mesh, of second order."""
+    """½ D11 κ² per area, with a discretisation error of second order."""
     errors = [abs(cylinder(pattern, n) - 1.0) for n in (4, 8, 16)]
     assert errors[0] < 0.03
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
@@ -91,7 +91,7 @@ def test_energy_of_a_cylinder(pattern: str) -> None:
 
 
 def test_moments_and_forces_balance_under_rotation(tmp_path: Path) -> None:
-    """Σ x × f + Σ m t = 0 where the frames are those of the shape: the energy is that of the shape alone."""
+    """Σ x × f + Σ m t = 0 with frames of the edges' present directions."""
     content = {
         "mesh": curved_sheet(tmp_path / "sheet.obj"),
         "material": BENDING | {"bending_model": "midedge"},
@@ -101,13 +101,13 @@ def test_moments_and_forces_balance_under_rotation(tmp_path: Path) -> None:
         random = np.random.default_rng(2)
         x = simulation.system.x.copy()
         x[:n] = (x[:n] + random.uniform(-0.1, 0.1, (n, 3))) @ rotation([1.0, 2.0, 0.5], 0.9).T
-        x.ravel()[term.of_edges.places] = directors_along_normals(term, x)
+        x.ravel()[term.of_edges.indices] = directors_along_normals(term, x)
         before = term.energies(x, term.frames)
         term.accept(x, term.frames)
         np.testing.assert_allclose(term.energies(x, term.frames), before, rtol=1e-12)
         pull = gradient(term, x, term.frames)
-        moments = pull.ravel()[term.of_edges.places] * term.of_edges.length
-        torque = np.cross(x[:n], pull[:n]).sum(axis=0) + moments @ term.frames.tangent
+        moments = pull.ravel()[term.of_edges.indices] * term.of_edges.length
+        torque = np.cross(x[:n], pull[:n]).sum(axis=0) + moments @ term.frames.direction
         assert np.abs(torque).max() < 1e-13 * np.abs(pull).max()
 
 
@@ -122,14 +122,14 @@ def test_frames_survive_a_checkpoint(tmp_path: Path) -> None:
         x[:n] = x[:n] @ rotation([1.0, 2.0, 0.5], 0.9).T
         term.accept(x, term.frames)
         frames, state = term.frames, term.edge_state()
-        term.frames = type(frames)(np.zeros_like(frames.tangent), np.zeros_like(frames.across))
+        term.frames = type(frames)(np.zeros_like(frames.direction), np.zeros_like(frames.reference))
         term.restore_edges(state, x)
-        np.testing.assert_allclose(term.frames.across, frames.across, rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(term.frames.reference, frames.reference, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("degrees", [40, 50, 85, 95, 140, 175])
 def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
-    """Gradient and Hessian where directors lie far from the normals."""
+    """Gradient and Hessian at large angles between directors and normals."""
     content = {
         "mesh": curved_sheet(tmp_path / "sheet.obj"),
         "material": BENDING | {"bending_model": "midedge"},
@@ -150,11 +150,11 @@ def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
 
 
 def test_energy_is_continuous_all_the_way_round() -> None:
-    """Grows to 180° on either side, of flat sheets to the same."""
+    """It grows up to 180° on either side, to the same value for flat sheets."""
     with Simulation({"mesh": grid(1.0, 1.0, 1, 1), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, x = midedge_of(simulation), simulation.system.x.copy()
         way = np.zeros_like(x)
-        way.ravel()[term.of_edges.places] = term.of_edges.length * [1.0, 0.1, 0.2, -0.1, 0.3]
+        way.ravel()[term.of_edges.indices] = term.of_edges.length * [1.0, 0.1, 0.2, -0.1, 0.3]
 
         def energy(turn: float) -> float:
             return float(term.energies(x + turn * way, term.frames).sum())
@@ -166,7 +166,7 @@ def test_energy_is_continuous_all_the_way_round() -> None:
 
 
 def test_triangles_that_are_computed_together_do_not_mix() -> None:
-    """Whatever of a batch folds beyond 45° or fades, and where the last batch ends."""
+    """With any triangles of a batch folded beyond 45° or fading, and for any size of the last batch."""
     with Simulation(SHEET, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         rows = simulation.system.discretisation.rows
@@ -174,29 +174,34 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         x = simulation.system.x.copy()
         x[:n] += random.normal(0.0, 0.05, (n, 3))
         x[term.stencil[7, 2]] = x[term.stencil[7, :2]].mean(axis=0) + 1e-4
-        x.ravel()[term.of_edges.places] = directors_along_normals(term, x)
+        x.ravel()[term.of_edges.indices] = directors_along_normals(term, x)
         frames, director = term.frames, term._directors(x, term.frames)
-        tangent = term.bent(x, frames)
+        tangent = term.angle_tangents(x, frames)
         length, weight = term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
         assert 0.1 < np.mean(np.abs(tangent[:, :3]) > 1.0) < 0.9
         assert term.n_elements % BATCH
 
         def computed(size: int) -> list[Array]:
-            """Energies, gradient and Hessian of so many triangles at a time."""
+            """Energies, gradient and Hessian, computed for so many triangles at a time."""
             energies, pull, values = np.empty(term.n_elements), np.zeros_like(x), rows.zeros()
             for first in range(0, term.n_elements, size):
                 part = slice(first, first + size)
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
                 bent = np.empty((len(triangles), 4))
-                tangents(x, triangles, edges, director, midedge.UPRIGHT, bent)
-                constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
+                tangents(x, triangles, edges, director, midedge.NO_REST_ROTATION, bent)
+                constants = (
+                    data["stiffness"][part],
+                    midedge.NO_REST_TANGENTS,
+                    data["limit"][part],
+                    midedge.NO_FRICTION,
+                )
                 midedge_energy.energies(bent, *constants, energies[part])
-                given = edges, at, sign, frames.tangent, bent, *constants, length
+                given = edges, at, sign, frames.direction, bent, *constants, length
                 midedge_energy.add_gradient(x, triangles, *given, pull)
                 corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
-                numbers = frames.tangent, bent, *constants, length, weight[part], corners, mixed, values
+                numbers = frames.direction, bent, *constants, length, weight[part], corners, mixed, values
                 midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, *numbers)
             return [energies, pull, values]
 
@@ -205,36 +210,36 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
 
 
 def test_frames_follow_edges_that_turn_far() -> None:
-    """Beyond 90° the frames of free edges are those of the present shape, at the same unknowns and energy."""
+    """Frames of free edges that turn by more than 90° are reset, with the same unknowns and energy."""
     with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         x = simulation.system.x.copy()
-        x.ravel()[term.of_edges.places] = 0.1 * np.random.default_rng(1).standard_normal(
+        x.ravel()[term.of_edges.indices] = 0.1 * np.random.default_rng(1).standard_normal(
             len(term.edge_indices)
         )
         x[:n] = x[:n] @ rotation([0.0, 1.0, 0.0], 2.0).T
         none = np.zeros(x.shape, dtype=bool)
         before, frames = term.energies(x, term.frames), term.frames
-        nearer = term.nearer(x, frames, none)
+        nearer = term.updated_frames(x, frames, none)
         assert nearer is not None
-        assert term.nearer(x, nearer, none) is None
-        assert term.nearer(x, frames, ~none) is None
-        turned = np.flatnonzero((nearer.tangent != frames.tangent).any(axis=1))
-        assert 0 < len(turned) < len(frames.tangent)
+        assert term.updated_frames(x, nearer, none) is None
+        assert term.updated_frames(x, frames, ~none) is None
+        turned = np.flatnonzero((nearer.direction != frames.direction).any(axis=1))
+        assert 0 < len(turned) < len(frames.direction)
         np.testing.assert_allclose(term.energies(x, nearer), before, rtol=1e-9)
 
 
 def test_directors_follow_triangles_that_turn_far() -> None:
-    """The way along the tangent of a rotation by 1.5 rad turns triangles by atan 1.5, and so directors."""
+    """An increment tangential to a rotation by 1.5 rad turns triangles by atan 1.5; directors must follow."""
     with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         x, axis = simulation.system.x.copy(), np.array([0.6, 0.8, 0.0])
         way = np.zeros_like(x)
         way[:n] = np.cross(1.5 * axis, x[:n])
-        places, length = term.of_edges.places, term.of_edges.length
-        way.ravel()[places] = 1.5 * length * (term.frames.tangent @ axis)
-        assert len(term.followed(x, 0.5 * way, term.frames)[0]) == 0
-        followed, values = term.followed(x, way, term.frames)
+        places, length = term.of_edges.indices, term.of_edges.length
+        way.ravel()[places] = 1.5 * length * (term.frames.direction @ axis)
+        assert len(term.edge_increments(x, 0.5 * way, term.frames)[0]) == 0
+        followed, values = term.edge_increments(x, way, term.frames)
         far = np.isin(places, followed)
         np.testing.assert_array_equal(far, np.abs(way.ravel()[places]) > length)
         assert 0 < far.sum() < len(far)
@@ -259,10 +264,10 @@ def test_directors_follow_to_first_order(tmp_path: Path, monkeypatch: pytest.Mon
         way, size, apart = random.uniform(-1.0, 1.0, x.shape), 1.0, []
         for _ in range(3):
             size *= 0.01
-            monkeypatch.setattr(midedge, "LARGEST_TURN", 0.0)  # all are asked, none is cut
+            monkeypatch.setattr(midedge, "LARGEST_ROTATION", 0.0)  # so that all edges are corrected
             clip = np.clip
             monkeypatch.setattr(np, "clip", lambda values, low, high: values)
-            places, values = term.followed(x, size * way, term.frames)
+            places, values = term.edge_increments(x, size * way, term.frames)
             monkeypatch.setattr(np, "clip", clip)
             apart.append(np.abs(values - size * way.ravel()[places]).max())
         assert np.log(np.array(apart[:-1]) / apart[1:]).min() > 1.5 * np.log(100.0)
@@ -270,7 +275,7 @@ def test_directors_follow_to_first_order(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parallel
 def test_one_linear_solve_a_step_unfolds_a_crumpled_sheet(comm: MPI.Comm) -> None:
-    """Where it carries directors beyond a right angle, which made energy without bounds."""
+    """The solve rotates directors beyond a right angle, where the energy was once unbounded."""
     scene: dict[str, Any] = {
         "mesh": grid(1.0, 1.0, 20, 20, "alternating"),
         "material": CLOTH | {"bending": 1e-4, "bending_model": "midedge", "damping": 0.005},
@@ -357,7 +362,7 @@ def test_runs_do_not_depend_on_ranks(comm: MPI.Comm, scheme: str) -> None:
 
 @pytest.mark.parametrize("scheme", ["midpoint", "bdf2", "alpha2"])
 def test_order_with_a_turning_clamp(scheme: str) -> None:
-    """Against half the step."""
+    """Order of convergence, from runs with half the step."""
     smoothly = {
         "handles": [SHEET["handles"][0] | {"motion": "turn"}],
         "motions": {"turn": [{"time": 0.0}, {"time": 0.1, "rotate": {"axis": [0, 1, 0], "degrees": 60}}]},
@@ -374,7 +379,7 @@ def test_order_with_a_turning_clamp(scheme: str) -> None:
 
 @pytest.mark.parametrize("scheme", ["midpoint", "bdf2", "alpha2"])
 def test_order_with_damping(scheme: str) -> None:
-    """Against half the step; it acts on directors, which have no mass."""
+    """Order of convergence, from runs with half the step; damping acts on directors, which have no mass."""
     ends = [
         outcome(MPI.COMM_SELF, {"time": {"end": 0.04, "step": step, "integrator": scheme}})
         for step in (0.004, 0.002, 0.001)
@@ -384,12 +389,12 @@ def test_order_with_damping(scheme: str) -> None:
 
 
 def test_a_clamp_turns_the_sheet_with_it() -> None:
-    """Without weight and slowly turned about its own edge, a sheet follows as a rigid body does."""
+    """A weightless sheet that is slowly rotated about its clamped edge moves as a rigid body."""
     degrees = 400.0
     keyframes = [{"time": 0.0}, {"time": 200.0, "rotate": {"axis": [0, 1, 0], "degrees": degrees}}]
     scene = TURN | {
         "mesh": grid(0.4, 0.1, 4, 1),
-        "material": SHEET["material"] | {"damping": 0.0},  # of rates that are chords, 10° at a time
+        "material": SHEET["material"] | {"damping": 0.0},  # in steps of 10° rates are those of chords
         "gravity": [0, 0, 0],
         "motions": {"turn": keyframes},
         "time": {"end": 200.0, "step": 5.0},
@@ -407,7 +412,7 @@ SLIDING = {"box": RIGHT, "axes": ["z"], "clamp": True}
 
 @pytest.mark.parallel(2)
 def test_a_clamped_edge_slides_in_the_plane_of_the_sheet(comm: MPI.Comm) -> None:
-    """Pulled aside until it has turned far in its plane; under its weight its slope stays 0."""
+    """Pulled sideways until it has turned far in its plane; under the weight its slope stays 0."""
     sideways = {
         "handles": [SHEET["handles"][0], SLIDING],
         "material": STIFF | {"membrane": {"c11": 10.0, "c22": 10.0, "c12": 3.0, "c33": 3.0}},
@@ -468,7 +473,7 @@ COLUMN = ((0.0, 0.0), CORNER)
 def test_walls_that_meet_bend_as_beams(
     beams: list[Any], axis: int, compliance: float, tmp_path: Path
 ) -> None:
-    """A clamped column, to whose top beams of the same strip are fixed, with a force at the end of one."""
+    """A clamped column with beams of the same strip at its top, loaded at the end of one beam."""
     errors = []
     for n in (8, 16):
         vertices, faces = walls([COLUMN, *beams], n, n // 4, 0.25)
@@ -504,7 +509,7 @@ def test_a_curved_sheet_at_rest_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("pattern", ["diagonal", "criss-cross"])
 def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
-    """A free strip of rest curvature κ11 is at rest as a cylinder towards its normal."""
+    """A free strip of rest curvature κ11 comes to rest as a cylinder on the side of its normal."""
     material = STIFF | {"bending": PLATE | {"d12": 0.0}, "rest_curvature": [0.5, 0.0, 0.0]}
     content = {
         "mesh": grid(1.0, 0.25, 16, 4, pattern),
@@ -521,7 +526,7 @@ def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
 
 @pytest.mark.parametrize(("twist", "rolled"), [(0.8, True), (0.15, False)])
 def test_a_tape_spring_is_bistable(twist: float, rolled: bool, tmp_path: Path) -> None:
-    """Bent by κ across at rest it may also be rolled up by d12 κ / d11 along, if it resists twist enough.
+    """With rest curvature κ across it is also stable rolled up by d12 κ / d11 along, if stiff in twist.
 
     At the start its chords are as much shorter as to fold it, were they let go little by little. S. D. Guest,
     S. Pellegrino, Proceedings of the Royal Society A 462 (2006) 839-854.
@@ -567,10 +572,10 @@ def test_a_tape_spring_is_bistable(twist: float, rolled: bool, tmp_path: Path) -
 
 
 def fan(path: Path, *degrees: float, flat: bool = False) -> dict[str, Any]:
-    """Triangles in such directions about the edge of vertices 0 and 1; ``flat``: at rest side by side."""
+    """Triangles at these angles about the edge of vertices 0 and 1; with ``flat`` the rest shape is flat."""
     angles = np.radians(degrees)
     corners = [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), *((np.cos(a), 0.5, np.sin(a)) for a in angles)]
-    # those of half a turn run along the edge as the others do
+    # orient those at 180° along the edge like the others
     faces = [(0, 2 + k, 1) if k % 2 == 0 else (0, 1, 2 + k) for k in range(len(angles))]
     mesh = obj_file(path, corners, faces)
     if flat:
@@ -581,7 +586,7 @@ def fan(path: Path, *degrees: float, flat: bool = False) -> dict[str, Any]:
 
 
 def test_a_start_folded_by_180_degrees_is_refused(tmp_path: Path) -> None:
-    """Where the rest shape is flat nothing says to which side."""
+    """With a flat rest shape the side of the fold is undefined."""
     material = STIFF | {"bending_model": "midedge"}
     with Simulation(
         {"mesh": fan(tmp_path / "a.obj", 0, 0.2, flat=True), "material": material}, MPI.COMM_SELF
@@ -596,7 +601,7 @@ def test_a_start_folded_by_180_degrees_is_refused(tmp_path: Path) -> None:
     "degrees", [(0, 0), (0, 10), (0, 120, 240), (0, 90, 180, 270), (0, 180, 90)], ids=str
 )
 def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) -> None:
-    """Triangles resist being turned against the others as much as in a flat pair, however they meet."""
+    """Triangles resist rotation relative to the others as in a flat pair, at any angles between them."""
     stiffness = []
     for number, each in enumerate((degrees, (0, 180))):
         content = {"mesh": fan(tmp_path / f"{number}.obj", *each), "material": STIFF | {"bending": PLATE}}
@@ -605,7 +610,7 @@ def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) ->
             assert np.abs(gradient(term, x, term.frames)).max() < 1e-12
             if number == 0 and degrees != (0, 10):
                 assert np.abs(term.curvatures(x, term.frames)).max() < 1e-12
-            x.ravel()[term.edge_indices] = term.anew(x)
+            x.ravel()[term.edge_indices] = term.reset_frames(x)
             assert term.energies(x, term.frames).max() < 1e-24
             tip = np.flatnonzero(np.isclose(x, [1.0, 0.5, 0.0]).all(axis=1))[0]
             stiffness.append(hessian(term, x, term.frames)[tip, 2, tip, 2])
@@ -613,7 +618,7 @@ def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) ->
 
 
 def test_curvature_that_no_edge_can_turn_is_refused() -> None:
-    """Of cells of 0.1 m a triangle has the tangent κ / 20 m, which is 1 + 3π/2 at 180°."""
+    """Triangles of cells of 0.1 m have the tangent T = κ / 20 m, which is 1 + 3π/2 at 180°."""
     sheet = {"mesh": {"grid": {"width": 0.5, "height": 0.2, "nx": 5, "ny": 2}}}
     material = STIFF | {"bending_model": "midedge"}
     with Simulation(sheet | {"material": material | {"rest_curvature": [114.0, 0.0, 0.0]}}, MPI.COMM_SELF):
@@ -626,8 +631,9 @@ def test_curvature_that_no_edge_can_turn_is_refused() -> None:
 
 @pytest.mark.parametrize(("n", "alternating"), [(8, False), (24, False), (24, True)])
 def test_a_coarse_shell_is_noted(tmp_path: Path, n: int, alternating: bool) -> None:
-    """A quarter of a cylinder of radius 1 and thickness 0.01, √(t R) = 0.1; alternately four and eight of its
-    triangles meet."""
+    """A quarter cylinder of radius 1 and thickness 0.01, √(t R) = 0.1; ``alternating``: with vertices of four
+    and of eight triangles.
+    """
     flat, faces = rectangle(n, n, 0.5 * np.pi, 1.0, alternating=alternating)
     bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
@@ -653,7 +659,7 @@ BALL = {"young": 1e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0}
 
 
 def test_vertices_of_four_triangles_in_a_curved_shell_are_noted(tmp_path: Path) -> None:
-    """Under pressure they lack what is said; neither are free corners nor those of finer meshes."""
+    """With the right error; free corners are not noted, nor are vertices of finer meshes."""
     pressure = 10.0
     ball = {"mesh": octant(tmp_path / "ball.obj", 16), "material": BALL, "handles": symmetric("xyz", 1.0)}
     load = {"loads": [{"pressure": pressure}], "time": {"analysis": "static", "step": 1.0}}
@@ -679,7 +685,7 @@ def test_creases_are_not_noted(tmp_path: Path) -> None:
 
 
 def coarse(content: dict[str, Any]) -> list[str]:
-    """What is noted of triangles that are too large."""
+    """Notes on triangles that are too large."""
     return noted(content, "large for the curvature")
 
 
@@ -695,7 +701,7 @@ THIN = {"young": 1e6, "poisson": 0.3, "thickness": 0.01, "density": 1.0}
 
 @pytest.mark.parametrize("thickness", [0.01, 0.1])
 def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
-    """Ten times as wide as thick they twist 0.63/10 too little; clamped and symmetric edges are not free."""
+    """At 10 times their thickness they twist 0.63/10 too little; clamped, symmetric edges are not free."""
     content = {
         "mesh": grid(8.0, 1.0, 16, 2),
         "material": THIN | {"thickness": thickness},
@@ -703,7 +709,7 @@ def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
     }
     found = noted(content, "transverse shear")
     assert len(found) == (1 if thickness == 0.1 else 0)
-    assert all("resist twist by 6% too much" in note for note in found)
+    assert all("torsional stiffness is about 6% too large" in note for note in found)
     everywhere = [{"group": "sheet", "clamp": True}]
     assert not noted(content | {"handles": everywhere}, "transverse shear")
 
@@ -765,7 +771,7 @@ def test_a_polygon_for_a_disc_has_no_corners(tmp_path: Path) -> None:
 
 
 def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
-    """An angle of 45° is no curvature where the walls beside it are flat, nor is that of a third wall."""
+    """A fold of 45° between flat walls is no curvature, nor is that of a third wall."""
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.001, "density": 1.0}
     half = np.sqrt(0.5)
     tube = [(0, 0), (1, 0), (1 + half, half), (1 + half, 1 + half), (1, 1 + 2 * half)]
@@ -858,7 +864,7 @@ def test_a_symmetry_plane_is_one(tmp_path: Path) -> None:
 
 
 def rolled(comm: MPI.Comm, n: int, pattern: str, **more: Any) -> tuple[Array, Array]:
-    """A strip of length 12 and stiffness 100 N·m whose end moment makes a circle of it: B2 of Sze et al."""
+    """A strip of length 12 and stiffness 100 N·m, rolled into a circle by its end moment: B2 of Sze et al."""
     scene = {
         "mesh": grid(12.0, 1.0, n, 2, pattern),
         "material": {"young": 1.2e6, "poisson": 0.0, "thickness": 0.1, "density": 1.0},
@@ -880,7 +886,7 @@ def rolled(comm: MPI.Comm, n: int, pattern: str, **more: Any) -> tuple[Array, Ar
     ids=["slit plate", "open cylinder"],
 )
 def test_fifteen_load_steps_in_eighty_iterations(shell: Callable[[Bench], dict[str, Any]], most: int) -> None:
-    """Published shells, which their loads turn by a right angle and far more."""
+    """Published benchmarks of shells that rotate by 90° and far more."""
     with Bench(MPI.COMM_SELF, direct=False) as bench:
         scene = shell(bench) | {
             "gravity": [0, 0, 0],
@@ -899,7 +905,7 @@ ROLLED_UP = 0.5 * 100.0 * (2.0 * np.pi / 12.0) ** 2 * 12.0
 
 @pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
 def test_an_end_moment_rolls_a_strip_into_a_circle(pattern: str) -> None:
-    """In one load step; κ = M / D, and the load's work is the energy where it grows with the turn."""
+    """In one load step: κ = M / D, and the load's work is the energy, as it grows with the rotation."""
     errors = []
     for n in (24, 48):
         x, energies = rolled(MPI.COMM_SELF, n, pattern)
@@ -923,7 +929,7 @@ def test_moments_do_not_depend_on_ranks(comm: MPI.Comm) -> None:
 
 
 def test_a_moment_works_through_the_turn_of_directors() -> None:
-    """Far from the shape of the frames, where these turn, too: against differences of directors."""
+    """Against differences of directors, far from the frames' directions, where the frames rotate, too."""
     scene = {"mesh": grid(1.0, 1.0, 2, 3), "material": STIFF, "loads": [{"group": "top", "moment": 0.7}]}
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         bending, load = midedge_of(simulation), simulation.problem.terms["moment"]
@@ -946,7 +952,7 @@ def test_a_moment_works_through_the_turn_of_directors() -> None:
         rest = simulation.problem.surface.x
         top = (rest[tail, 1] > 0.99) & (rest[head, 1] > 0.99)
         assert top.sum() == 2
-        # counter-clockwise is against x here, and positive moments turn against that
+        # the counter-clockwise direction is −x here, and positive moments act about its reverse
         along = np.sign(rest[head, 0] - rest[tail, 0])[top]
         expected = 0.7 * np.sum(bending.of_edges.length[top] * along * turn[top])
         assert np.sum(force * way) == pytest.approx(expected, rel=1e-7)
@@ -1001,7 +1007,7 @@ def test_before_the_first_step_a_clamp_has_no_moment(comm: MPI.Comm, shared_tmp:
 
 @pytest.mark.parallel
 def test_what_two_handles_hold_one_of_them_bears(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """A clamp in a plane of symmetry, whose corner both hold: the clamp bears the weight, the plane nothing
+    """A clamp and a symmetry plane that hold the same corner: the clamp bears the weight, the plane nothing
     within itself.
     """
     handles = [{"group": "bottom", "symmetry": "y"}, {"group": "left", "clamp": True}]
@@ -1014,7 +1020,7 @@ def test_what_two_handles_hold_one_of_them_bears(comm: MPI.Comm, shared_tmp: Pat
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["clamp", "symmetry"])
 def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tmp: Path) -> None:
-    """A force at the corner and a moment at the end: what the clamp or the plane of symmetry carries."""
+    """Reaction of a clamp or a symmetry plane to a force at the corner and a moment at the end."""
     hold: dict[str, Any] = {"clamp": True} if kind == "clamp" else {"symmetry": "x"}
     loads: list[dict[str, Any]] = [{"group": "right", "moment": 0.04}]
     handles = [{"group": "left", **hold}]
@@ -1035,7 +1041,7 @@ def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tm
 
 @pytest.mark.parallel
 def test_the_moment_of_a_clamp_that_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """Angular momentum: of a stiff sheet that turns about its edge with constant acceleration."""
+    """Rate of the angular momentum of a stiff sheet that is rotated about its edge."""
     turn = [{"time": 0.0}, {"time": 2.0, "rotate": {"axis": [0, 1, 0], "degrees": 720}}]
     scene = CANTILEVER | {
         "handles": [{"group": "left", "clamp": True, "motion": "turn"}],
@@ -1068,7 +1074,7 @@ def jittered(n: int, m: int) -> tuple[Array, NDArray[np.int64]]:
 @pytest.mark.parametrize("pattern", ["diagonal", "alternating", "jittered"])
 @pytest.mark.parametrize("weight", [0.0, 10.0])
 def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path: Path) -> None:
-    """Under a tip load 4 B/L² (Bisshopp & Drucker 1945), or their weight 10 B/L³, with B as it stands."""
+    """Under a tip load 4 B/L² (Bisshopp & Drucker 1945), or their weight 10 B/L³, without a factor on B."""
     n, m = 50, 2
     mesh = grid(1.0, m / n, n, m, pattern)
     if pattern == "jittered":
@@ -1103,7 +1109,7 @@ SCHEMES = ["beuler", "semi-implicit", "alpha2"]
     + [("pressed", scheme) for scheme in ("beuler", "alpha2")],  # one linear solve a step is not enough
 )
 def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
-    """Edges that turn by 230° in a nominal step, a crumpled start, two edges brought together."""
+    """Finite results for edges turning by 230° in a step, a crumpled start, edges pressed together."""
     scene: dict[str, Any] = {
         "mesh": grid(0.4, 0.4, 6, 6, "alternating"),
         "material": CLOTH | {"bending": 2e-4, "bending_model": "midedge"},
@@ -1145,7 +1151,7 @@ PUSH = 1e-6
 
 
 def pushed(comm: MPI.Comm, path: Path, n: int) -> float:
-    """How far the upper edge of the standing plate gives way [m] to a force per width PUSH [N/m]."""
+    """Deflection [m] of the upper edge of the standing plate under a force per width PUSH [N/m]."""
     content = {
         "mesh": t_frame(path, n),
         "material": STIFF | {"bending": PLATE | {"d12": 0.0, "d33": 0.5}},
@@ -1164,11 +1170,11 @@ def pushed(comm: MPI.Comm, path: Path, n: int) -> float:
 
 @pytest.mark.parallel
 def test_a_plate_stands_on_another(tmp_path: Path, comm: MPI.Comm) -> None:
-    """F L³ / 3D of the plate that stands, and F L³ / 6D by what the joint turns on a span of 2 L."""
+    """F L³ / 3D from the standing plate, and F L³ / 6D from the rotation of the joint on a span of 2 L."""
     exact = PUSH * (1.0 / 3.0 + 1.0 / 6.0)
     coarse, fine = (pushed(comm, tmp_path / f"frame{n}.obj", n) for n in (8, 16))
     assert abs(fine - exact) < 0.55 * abs(coarse - exact)
-    np.testing.assert_allclose(2.0 * fine - coarse, exact, rtol=0.01)  # the first order's error taken off
+    np.testing.assert_allclose(2.0 * fine - coarse, exact, rtol=0.01)  # extrapolated from first order
 
 
 def test_hinges_are_refused_there(tmp_path: Path) -> None:

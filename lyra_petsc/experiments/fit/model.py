@@ -23,7 +23,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
-from lyra_petsc.terms.registry import active
+from lyra_petsc.terms.registry import needed_terms
 
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
 """Blocks of a scene whose numbers can be fitted."""
@@ -96,7 +96,7 @@ class Model:
         self.runs = 0
         # there are no tangents for terms with a state of their own or with changing stencils
         shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
-        entries = active(scene, shells)
+        entries = needed_terms(scene, shells)
         self._needs_differences = any(entry.neighbours or entry.element_vertices for entry in entries)
 
         def check_vertices() -> None:

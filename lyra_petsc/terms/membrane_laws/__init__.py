@@ -1,10 +1,11 @@
-"""Laws of the membrane by Green strain: one module and one line in ``LAWS`` each.
+"""Membrane laws as functions of Green strain: one module and one line in ``LAWS`` each.
 
-A law's module offers kernels of the Green strain (e0, e1, e2) = (E_uu, E_vv, 2 E_uv) with the parameters in
-row m of c (n_laws, n): ``energy`` W [J/m²], ``stress`` ∂W/∂e (3 numbers) and ``tangent`` ∂²W/∂e² (c11, c12,
-c22, c33, c13, c23) [N/m]; and on arrays ``parameters(shell)``, a row of c for a material (shorter ones are
-filled with zeros), and ``stiffest(c)``, the largest size of the tangent at rest (n_laws,). ``SOFTENS`` says
-whether it does under compression. Convex laws have a positive-semidefinite tangent.
+The module of a law has kernels of the Green strain (e0, e1, e2) = (E_uu, E_vv, 2 E_uv), with the parameters
+of a material in row m of c (n_materials, n): ``energy`` W [J/m²], ``stress`` ∂W/∂e (3 numbers) and
+``tangent`` ∂²W/∂e² (c11, c12, c22, c33, c13, c23) [N/m]. Further, ``parameters(shell)`` returns a material's
+row of c (shorter rows are filled with zeros), ``stiffest(c)`` the largest tangent at rest (n_materials,)
+[N/m], and ``SOFTENS`` tells whether the law softens under compression. Convex laws have a
+positive-semidefinite tangent.
 """
 
 from __future__ import annotations
@@ -21,5 +22,5 @@ LAWS = {
 
 
 def law_of(name: str) -> ModuleType:
-    """The module of a law, imported now."""
+    """Import and return the module of a law."""
     return import_module(LAWS[name])

@@ -1,10 +1,10 @@
-"""What keeps a law of strains from softening under compression: an energy of small principal stretches λ.
+"""A barrier against compression: an energy of small principal stretches λ that other laws add to theirs.
 
-    φ(λ) = b ln(λ₀/λ)³ below λ₀ = ¾, else 0
+    φ(λ) = b ln(λ₀/λ)³ below λ₀ = ¾, else 0,   summed over both principal stretches
 
-added for both. A quadratic energy of the Green strain softens below λ = 1/√3, as its force λ S vanishes with
-λ. φ is convex in E (a convex decreasing function of the eigenvalues of C = I + 2E), has nothing at rest, and
-λ₀ lies below what wovens are sheared to.
+Without it a quadratic energy of the Green strain softens below λ = 1/√3, since its force λ S vanishes with λ.
+φ is convex in E, being a convex decreasing function of the eigenvalues of C = I + 2E, and 0 at rest. λ₀ is
+smaller than the principal stretches that occur when wovens are sheared.
 """
 
 from __future__ import annotations
@@ -13,34 +13,34 @@ import math
 
 from lyra_petsc.kernels.element import kernel
 
-BEGINS = 0.75**2
+THRESHOLD = 0.75**2
 """λ₀²."""
 
-LEAST = 0.1**2
-"""λ² below which φ goes on as a parabola of λ²: strains that Newton's method expects may be of no shape."""
+SMALLEST_SQUARE = 0.1**2
+"""λ² below which φ is extended as a parabola in λ²: strains predicted in Newton's method may have λ² < 0."""
 
-PART = 0.25
-"""b over the largest stiffness at rest."""
+STIFFNESS_RATIO = 0.25
+"""Ratio of b to the largest stiffness at rest."""
 
-ROUND = 1e-6
-"""Difference of λ² below which both count as one."""
+COINCIDENT = 1e-6
+"""Difference of the two λ² below which they count as equal."""
 
 
 @kernel(inline="always")
 def _barrier(c):  # type: ignore[no-untyped-def]
-    """φ/b of c = λ², and its first two derivatives with respect to c."""
-    if c >= BEGINS:
+    """φ/b as a function of c = λ², and its first two derivatives."""
+    if c >= THRESHOLD:
         return 0.0, 0.0, 0.0
-    at = max(c, LEAST)
-    q = 0.5 * math.log(BEGINS / at)
+    at = max(c, SMALLEST_SQUARE)
+    q = 0.5 * math.log(THRESHOLD / at)
     second = 1.5 * q * (1.0 + q) / (at * at)
-    slope, more = -1.5 * q * q / at, c - at
-    return q * q * q + (slope + 0.5 * second * more) * more, slope + second * more, second
+    slope, beyond = -1.5 * q * q / at, c - at
+    return q * q * q + (slope + 0.5 * second * beyond) * beyond, slope + second * beyond, second
 
 
 @kernel(inline="always")
 def _stretches(e0, e1, e2):  # type: ignore[no-untyped-def]
-    """Mean and half difference of the λ²."""
+    """Mean and half the difference of the two λ²."""
     return 1.0 + e0 + e1, math.sqrt((e0 - e1) * (e0 - e1) + e2 * e2)
 
 
@@ -48,45 +48,45 @@ def _stretches(e0, e1, e2):  # type: ignore[no-untyped-def]
 def energy(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²] of the Green strain (E_uu, E_vv, 2 E_uv); b [N/m]."""
     mean, half = _stretches(e0, e1, e2)
-    if mean - half >= BEGINS:
+    if mean - half >= THRESHOLD:
         return 0.0
     return b * (_barrier(mean - half)[0] + _barrier(mean + half)[0])
 
 
 @kernel(inline="always")
 def _slopes(mean, half):  # type: ignore[no-untyped-def]
-    """Σ φ', (φ'₂ − φ'₁)/half, Σ φ'' and φ''₂ − φ''₁, over b."""
+    """φ'₁ + φ'₂, (φ'₂ − φ'₁)/half, φ''₁ + φ''₂ and φ''₂ − φ''₁, divided by b."""
     _, slope1, second1 = _barrier(mean - half)
     _, slope2, second2 = _barrier(mean + half)
-    apart = (slope2 - slope1) / half if half > ROUND else second1 + second2
-    return slope1 + slope2, apart, second1 + second2, second2 - second1
+    ratio = (slope2 - slope1) / half if half > COINCIDENT else second1 + second2
+    return slope1 + slope2, ratio, second1 + second2, second2 - second1
 
 
 @kernel(inline="always")
 def stress(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     mean, half = _stretches(e0, e1, e2)
-    if mean - half >= BEGINS:
+    if mean - half >= THRESHOLD:
         return 0.0, 0.0, 0.0
-    both, apart, _, _ = _slopes(mean, half)
+    both, ratio, _, _ = _slopes(mean, half)
     d = e0 - e1
-    return b * (both + apart * d), b * (both - apart * d), b * apart * e2
+    return b * (both + ratio * d), b * (both - ratio * d), b * ratio * e2
 
 
 @kernel(inline="always")
 def tangent(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     mean, half = _stretches(e0, e1, e2)
-    if mean - half >= BEGINS:
+    if mean - half >= THRESHOLD:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    _, apart, both, differ = _slopes(mean, half)
-    d, s = ((e0 - e1) / half, e2 / half) if half > ROUND else (0.0, 0.0)
-    left = both - apart
+    _, ratio, both, differ = _slopes(mean, half)
+    d, s = ((e0 - e1) / half, e2 / half) if half > COINCIDENT else (0.0, 0.0)
+    rest = both - ratio
     return (
-        b * (both + 2.0 * differ * d + left * d * d + apart),
-        b * (both - left * d * d - apart),
-        b * (both - 2.0 * differ * d + left * d * d + apart),
-        b * (apart + left * s * s),
-        b * (differ + left * d) * s,
-        b * (differ - left * d) * s,
+        b * (both + 2.0 * differ * d + rest * d * d + ratio),
+        b * (both - rest * d * d - ratio),
+        b * (both - 2.0 * differ * d + rest * d * d + ratio),
+        b * (ratio + rest * s * s),
+        b * (differ + rest * d) * s,
+        b * (differ - rest * d) * s,
     )

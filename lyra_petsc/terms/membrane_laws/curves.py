@@ -1,10 +1,9 @@
-"""Cloth by one's own curves: forces per width along warp and weft, and in shear, each by its own strain.
+"""Cloth by curves of the user: forces per width along warp and weft, and in shear, each by its own strain.
 
-    W = ∫ P₁ dλ₁ + ∫ P₂ dλ₂ + ∫ P₃ dγ + what keeps it from collapsing (``compression``)
+    W = ∫ P₁ dλ₁ + ∫ P₂ dλ₂ + ∫ P₃ dγ + barrier against compression (``compression``)
 
-with the stretches λ = √(1 + 2E) of warp and weft, forces P per width at rest [N/m], and γ = 2 E_uv. Nothing
-couples them. Beyond its last point a curve goes on straight, and so do P₁ and P₂ under compression; P₃ is
-odd.
+with the stretches λ = √(1 + 2E) of warp and weft, forces P per rest width [N/m], and γ = 2 E_uv, without
+coupling. A curve is extended linearly beyond its last point, P₁ and P₂ also under compression. P₃ is odd.
 """
 
 from __future__ import annotations
@@ -22,21 +21,21 @@ from lyra_petsc.terms.membrane_laws import compression
 
 SOFTENS = False
 
-LEAST = 0.1**2
-"""λ² below which P/λ goes on straight: strains that Newton's method expects may be of no shape."""
+SMALLEST_SQUARE = 0.1**2
+"""λ² below which P/λ is extended linearly in E: strains predicted in Newton's method may have λ² < 0."""
 
 
 @kernel()
-def _curve(x, c, m, which):  # type: ignore[no-untyped-def]
-    """Integral, force and slope of a curve at x."""
+def _evaluate_curve(x, c, m, which):  # type: ignore[no-untyped-def]
+    """Integral, value and slope at x of curve ``which`` (0 warp, 1 weft, 2 shear) of material m."""
     first, last = Index(c[m, 1 + which]), Index(c[m, 2 + which]) - Index(4)
     if x <= 0.0:
         slope = c[m, first + 2]
         return 0.5 * slope * x * x, slope * x, slope
     if x >= c[m, last]:
-        more, slope = x - c[m, last], c[m, last + 2]
+        beyond, slope = x - c[m, last], c[m, last + 2]
         force = c[m, last + 1]
-        return c[m, last + 3] + (force + 0.5 * slope * more) * more, force + slope * more, slope
+        return c[m, last + 3] + (force + 0.5 * slope * beyond) * beyond, force + slope * beyond, slope
     low, high = first // 4, last // 4
     while high - low > 1:
         middle = (low + high) // 2
@@ -54,29 +53,29 @@ def _curve(x, c, m, which):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _along(e, c, m, which):  # type: ignore[no-untyped-def]
+def _axial(e, c, m, which):  # type: ignore[no-untyped-def]
     """Energy, P/λ and its derivative at the Green strain e along warp (0) or weft (1)."""
-    square = max(1.0 + 2.0 * e, LEAST)
+    square = max(1.0 + 2.0 * e, SMALLEST_SQUARE)
     stretch = math.sqrt(square)
-    # λ − 1 without cancellation
-    total, force, slope = _curve((square - 1.0) / (stretch + 1.0), c, m, which)
+    # (λ² − 1)/(λ + 1) is λ − 1 without cancellation
+    total, force, slope = _evaluate_curve((square - 1.0) / (stretch + 1.0), c, m, which)
     stress = force / stretch
     rise = (slope - stress) / square
-    more = e - 0.5 * (square - 1.0)
-    return total + (stress + 0.5 * rise * more) * more, stress + rise * more, rise
+    beyond = e - 0.5 * (square - 1.0)
+    return total + (stress + 0.5 * rise * beyond) * beyond, stress + rise * beyond, rise
 
 
 @kernel()
-def _across(e, c, m):  # type: ignore[no-untyped-def]
-    """Energy, stress and its derivative of shear."""
-    total, force, slope = _curve(abs(e), c, m, 2)
+def _shear(e, c, m):  # type: ignore[no-untyped-def]
+    """Energy, stress and its derivative at the shear e."""
+    total, force, slope = _evaluate_curve(abs(e), c, m, 2)
     return total, (force if e >= 0.0 else -force), slope
 
 
 @kernel(inline="always")
 def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²]."""
-    sheet = _along(e0, c, m, 0)[0] + _along(e1, c, m, 1)[0] + _across(e2, c, m)[0]
+    sheet = _axial(e0, c, m, 0)[0] + _axial(e1, c, m, 1)[0] + _shear(e2, c, m)[0]
     return sheet + compression.energy(e0, e1, e2, c[m, 0])
 
 
@@ -84,25 +83,25 @@ def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     s0, s1, s2 = compression.stress(e0, e1, e2, c[m, 0])
-    return s0 + _along(e0, c, m, 0)[1], s1 + _along(e1, c, m, 1)[1], s2 + _across(e2, c, m)[1]
+    return s0 + _axial(e0, c, m, 0)[1], s1 + _axial(e1, c, m, 1)[1], s2 + _shear(e2, c, m)[1]
 
 
 @kernel(inline="always")
 def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     c11, c12, c22, c33, c13, c23 = compression.tangent(e0, e1, e2, c[m, 0])
-    c11, c22, c33 = c11 + _along(e0, c, m, 0)[2], c22 + _along(e1, c, m, 1)[2], c33 + _across(e2, c, m)[2]
+    c11, c22, c33 = c11 + _axial(e0, c, m, 0)[2], c22 + _axial(e1, c, m, 1)[2], c33 + _shear(e2, c, m)[2]
     return c11, c12, c22, c33, c13, c23
 
 
 def parameters(shell: ShellMaterial) -> list[float]:
-    """b [N/m]; where the points of the three curves begin, and where they end; the points."""
+    """b [N/m], the start and end indices of the three curves' points in the row, and the points."""
     curves = [interpolation(points) * [1.0, *(shell.stretching,) * 3] for points in shell.curves]
     starts = 8 + np.cumsum([0, *(4 * len(curve) for curve in curves)])
-    b = compression.PART * max(shell.c11, shell.c22, shell.c33)
+    b = compression.STIFFNESS_RATIO * max(shell.c11, shell.c22, shell.c33)
     return [b, *starts.astype(float), 0.0, 0.0, 0.0, *np.concatenate(curves).ravel()]
 
 
 def stiffest(c: Array) -> Array:
-    """Largest stiffness [N/m] of each law (n_laws, n) at rest."""
-    return c[:, 0] / compression.PART
+    """Largest stiffness at rest [N/m], (n_materials,), for parameters c (n_materials, n)."""
+    return c[:, 0] / compression.STIFFNESS_RATIO

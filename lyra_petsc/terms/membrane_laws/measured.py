@@ -1,16 +1,15 @@
-"""Cloth that stiffens as it is stretched, fitted to the strained rows of measured tables.
+"""Cloth that stiffens under tension, fitted to measured tables of stiffness at rest and under strain.
 
-    W = ½ eᵀ C e + Σ_k a_k h(n_k · e) + what keeps it from collapsing (``compression``)
+    W = ½ eᵀ C e + Σ_k a_k h(n_k · e) + barrier against compression (``compression``)
 
-of e = (E_uu, E_vv, 2 E_uv), with the library's stiffness C at rest, the strains n_k · e of fibres at 0°,
-22.5°, 45°, 67.5° and 90° to the warp (on both sides) and of the area, and a_k ≥ 0. h has the second
-derivative min(s/s₁, 1) of stretched fibres, 0 of others, so that W is convex in E, with a continuous second
-derivative. s₁ is the strain of the strained rows, beyond which nothing was measured.
-``scripts/fit_membranes.py`` finds
-the a_k once: non-negative least squares of the stress that the tables give, see `fit_errors`.
+with e = (E_uu, E_vv, 2 E_uv), the library's stiffness C at rest, the strains n_k · e of fibres at 0°, 22.5°,
+45°, 67.5° and 90° to the warp (on both sides) and of the area, and a_k ≥ 0. The second derivative of h is
+min(s/s₁, 1) for stretched fibres, 0 for others, so that W is convex in E, with a continuous second
+derivative. s₁ is the strain of the strained rows, the largest one measured. ``scripts/fit_membranes.py``
+computed the a_k by non-negative least squares from the stresses of the tables, see `fit_errors`.
 
-Sources: the tables Wang, O'Brien & Ramamoorthi, ACM TOG 30(4):71 (2011), read as ARCSim does, which makes no
-energy of them; energies of fibres for wovens Clyde, Teran & Tamstorf, SCA 2017.
+Sources: tables of Wang, O'Brien & Ramamoorthi, ACM TOG 30(4):71 (2011), read as by ARCSim (whose stresses do
+not derive from an energy); energies of fibres for wovens Clyde, Teran & Tamstorf, SCA 2017.
 """
 
 from __future__ import annotations
@@ -32,13 +31,13 @@ SOFTENS = False
 MEASURED = 1.0 / 6.0
 """Largest strain of the tables."""
 
-FULL = 0.5 * ((1.0 + MEASURED) ** 2 - 1.0)
-"""s₁: Green strain from which on fibres are as stiff as they get."""
+FULL_STRAIN = 0.5 * ((1.0 + MEASURED) ** 2 - 1.0)
+"""s₁: Green strain above which the stiffness of fibres is constant."""
 
 _COS, _SIN = np.cos(np.pi / 8.0) ** 2, np.sin(np.pi / 8.0) ** 2
 _BOTH = np.sqrt(_COS * _SIN)
 
-FORMS: tuple[tuple[tuple[float, float, float], ...], ...] = (
+FIBRES: tuple[tuple[tuple[float, float, float], ...], ...] = (
     ((1.0, 0.0, 0.0),),
     ((_COS, _SIN, _BOTH), (_COS, _SIN, -_BOTH)),
     ((0.5, 0.5, 0.5), (0.5, 0.5, -0.5)),
@@ -46,19 +45,19 @@ FORMS: tuple[tuple[tuple[float, float, float], ...], ...] = (
     ((0.0, 1.0, 0.0),),
     ((0.5, 0.5, 0.0),),
 )
-"""n_k of each a_k."""
+"""The vectors n_k of each coefficient a_k: fibres, on both sides of the warp, and lastly the area."""
 
-_N = np.array([form for forms in FORMS for form in forms])
-_OF = np.repeat(np.arange(len(FORMS)), [len(forms) for forms in FORMS])
+_N = np.array([vector for vectors in FIBRES for vector in vectors])
+_COEFFICIENT = np.repeat(np.arange(len(FIBRES)), [len(vectors) for vectors in FIBRES])
 
 
 @kernel(inline="always")
 def _stiffening(s):  # type: ignore[no-untyped-def]
-    """h of s > 0, and its first two derivatives."""
-    if s < FULL:
-        part = s / FULL
+    """h at s > 0, and its first two derivatives."""
+    if s < FULL_STRAIN:
+        part = s / FULL_STRAIN
         return part * s * s / 6.0, 0.5 * part * s, part
-    return 0.5 * s * (s - FULL) + FULL * FULL / 6.0, s - 0.5 * FULL, 1.0
+    return 0.5 * s * (s - FULL_STRAIN) + FULL_STRAIN * FULL_STRAIN / 6.0, s - 0.5 * FULL_STRAIN, 1.0
 
 
 @kernel(inline="always")
@@ -69,7 +68,7 @@ def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     for k in range(len(_N)):
         s = _N[k, 0] * e0 + _N[k, 1] * e1 + _N[k, 2] * e2
         if s > 0.0:
-            total += c[m, 5 + _OF[k]] * _stiffening(s)[0]
+            total += c[m, 5 + _COEFFICIENT[k]] * _stiffening(s)[0]
     return total
 
 
@@ -85,8 +84,8 @@ def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     for k in range(len(_N)):
         s = _N[k, 0] * e0 + _N[k, 1] * e1 + _N[k, 2] * e2
         if s > 0.0:
-            pull = c[m, 5 + _OF[k]] * _stiffening(s)[1]
-            s0, s1, s2 = s0 + pull * _N[k, 0], s1 + pull * _N[k, 1], s2 + pull * _N[k, 2]
+            force = c[m, 5 + _COEFFICIENT[k]] * _stiffening(s)[1]
+            s0, s1, s2 = s0 + force * _N[k, 0], s1 + force * _N[k, 1], s2 + force * _N[k, 2]
     return s0, s1, s2
 
 
@@ -99,21 +98,21 @@ def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
         n0, n1, n2 = _N[k, 0], _N[k, 1], _N[k, 2]
         s = n0 * e0 + n1 * e1 + n2 * e2
         if s > 0.0:
-            more = c[m, 5 + _OF[k]] * _stiffening(s)[2]
-            c11, c12, c22 = c11 + more * n0 * n0, c12 + more * n0 * n1, c22 + more * n1 * n1
-            c33, c13, c23 = c33 + more * n2 * n2, c13 + more * n0 * n2, c23 + more * n1 * n2
+            stiffness = c[m, 5 + _COEFFICIENT[k]] * _stiffening(s)[2]
+            c11, c12, c22 = c11 + stiffness * n0 * n0, c12 + stiffness * n0 * n1, c22 + stiffness * n1 * n1
+            c33, c13, c23 = c33 + stiffness * n2 * n2, c13 + stiffness * n0 * n2, c23 + stiffness * n1 * n2
     return c11, c12, c22, c33, c13, c23
 
 
 @cache
 def tables() -> dict[str, Any]:
-    """Of each cloth ``strained`` rows (5, 4), the fitted ``stiffening`` a_k (6,) [N/m], and its errors."""
+    """For each cloth the ``strained`` rows (5, 4), the fitted ``stiffening`` a_k (6,) [N/m] and errors."""
     text = files(__package__).joinpath("wang2011.json").read_text(encoding="utf-8")
     return json.loads(text)["cloths"]
 
 
 def fit_errors() -> dict[str, tuple[float, float]]:
-    """Of each cloth the root mean square error of the stress over that of the tables, and by C alone."""
+    """Relative root mean square error of each cloth's stress against the tables, and that of C alone."""
     return {name: (row["error"], row["error_of_stvk"]) for name, row in tables().items()}
 
 
@@ -123,11 +122,11 @@ def parameters(shell: ShellMaterial) -> list[float]:
     largest = max(shell.c11, shell.c22, shell.c33)
     return [
         *(shell.c11, shell.c12, shell.c22, shell.c33),
-        compression.PART * largest,
+        compression.STIFFNESS_RATIO * largest,
         *(shell.stretching * a for a in stiffening),
     ]
 
 
 def stiffest(c: Array) -> Array:
-    """Largest stiffness [N/m] of each law (n_laws, 11) at rest."""
+    """Largest stiffness at rest [N/m], (n_materials,), for parameters c (n_materials, 11)."""
     return np.abs(c[:, :4]).max(axis=1)

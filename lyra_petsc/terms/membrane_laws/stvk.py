@@ -39,5 +39,5 @@ def parameters(shell: ShellMaterial) -> list[float]:
 
 
 def stiffest(c: Array) -> Array:
-    """Largest stiffness [N/m] of each law (n_laws, 4)."""
+    """Largest stiffness [N/m], (n_materials,), for parameters c (n_materials, 4)."""
     return np.abs(c).max(axis=1)
