@@ -62,7 +62,7 @@ def run(
     """
     if served is not None:
         on_root(comm, lambda: served.check("--live"))
-    phases = Phases(tell=say)
+    phases = Phases(report=say)
     stop = StopRequest(comm)
     if scene is None and resume and out is not None:
         scene = out / "scene.yaml"

@@ -14,7 +14,7 @@ import click
 
 from lyra_petsc.cli.options import results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
-from lyra_petsc.extras import require
+from lyra_petsc.extras import require_packages
 from lyra_petsc.output.agreement import raise_together
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
@@ -72,7 +72,7 @@ class Served:
         InputError
             For missing packages, or an address that cannot be used.
         """
-        require(what, PACKAGES, "view")
+        require_packages(what, PACKAGES, "view")
         from lyra_petsc.show.view.server import check_address
 
         check_address(self.host, self.port)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.extras import require
+from lyra_petsc.errors import InputError, suggest
+from lyra_petsc.extras import require_packages
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, check_name, read_stored
@@ -172,7 +172,7 @@ class StoredRun:
             If they do not hold it.
         """
         if name not in self.fields:
-            what = nearest(name, self.fields) if self.fields else "the states hold positions alone"
+            what = suggest(name, self.fields) if self.fields else "the states hold positions alone"
             raise InputError(
                 f"no field {name!r}, {what}; a scene's output.fields names them", file=self.folder
             )
@@ -205,7 +205,7 @@ class StoredRun:
         every : int
             Take every so manieth state.
         """
-        require("dataset", ("xarray",), "export")
+        require_packages("dataset", ("xarray",), "export")
         import xarray
 
         def variable(name: str, last: tuple[str, ...], arrays: StateArrays) -> tuple[Any, ...]:

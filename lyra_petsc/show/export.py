@@ -29,8 +29,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, OutputError, nearest
-from lyra_petsc.extras import require
+from lyra_petsc.errors import InputError, OutputError, suggest
+from lyra_petsc.extras import require_packages
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.hdf5 import properties
 from lyra_petsc.output.read_run import StoredRun
@@ -132,11 +132,11 @@ def export_run(
         If the files cannot be written; nothing is left of them.
     """
     if to not in FORMATS:
-        raise InputError(f"unknown format {to!r}, {nearest(to, FORMATS)}", key="--to")
+        raise InputError(f"unknown format {to!r}, {suggest(to, FORMATS)}", key="--to")
     if displacement and not FORMATS[to].fields:
         able = ", ".join(name for name, form in FORMATS.items() if form.fields)
         raise InputError(f"{to} holds positions alone; take --to {able}", key="--displacement")
-    require(f"export --to {to}", FORMATS[to].packages, "export")
+    require_packages(f"export --to {to}", FORMATS[to].packages, "export")
     found = StoredRun(run)
     folder = out if out is not None else found.folder / to
     check_folder(folder, force=force)

@@ -9,8 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lyra_petsc.errors import in_python
-from lyra_petsc.extras import require
+from lyra_petsc.errors import python_argument_names
+from lyra_petsc.extras import require_packages
 from lyra_petsc.output.read_run import StoredRun
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Run(StoredRun):
     """
 
     def __init__(self, folder: str | Path) -> None:
-        with in_python():
+        with python_argument_names():
             super().__init__(folder)
 
     def render(self, at: float | None = None, *, film: bool | str = False, **options: Any) -> Media:
@@ -103,10 +103,10 @@ class Run(StoredRun):
         TypeError
             For an option that there is none of.
         """
-        with in_python():
+        with python_argument_names():
             from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 
-            require("render", PACKAGES, "view")
+            require_packages("render", PACKAGES, "view")
             from mpi4py import MPI
 
             from lyra_petsc.show.render.draw import draw
@@ -133,8 +133,8 @@ class Run(StoredRun):
         InputError, OutputError
             If it cannot be made or written.
         """
-        with in_python():
-            require("report", ("matplotlib", "jinja2"))
+        with python_argument_names():
+            require_packages("report", ("matplotlib", "jinja2"))
             from lyra_petsc.show.report.run_page import write_page
 
             path = write_page(self.folder, None if out is None else Path(out))
@@ -188,6 +188,6 @@ def run(
     """
     from lyra_petsc.api.runs import run as simulate
 
-    with in_python():
+    with python_argument_names():
         how: dict[str, Any] = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
         return Run(simulate(scene, out, **how, on_step=on_step, comm=comm, progress=progress))

@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, in_python
+from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, refuse_idle, search
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
@@ -357,7 +357,7 @@ def gradient(
         If the simulation fails.
     """
     comm = MPI.COMM_WORLD if comm is None else comm
-    with in_python():
+    with python_argument_names():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
 
         def prepare() -> Any:
@@ -434,7 +434,7 @@ def fit(
         If a simulation fails.
     """
     comm = MPI.COMM_WORLD if comm is None else comm
-    with in_python():
+    with python_argument_names():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
         if out is None:
             if resume:

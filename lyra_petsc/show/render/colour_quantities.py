@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS, plane_components
 
@@ -160,7 +160,7 @@ def quantity(run: StoredRun, name: str) -> ColourQuantity:
     if name not in run.fields:
         known = [*DERIVED, *run.fields]
         raise InputError(
-            f"no field {name!r}, {nearest(name, known)}; a scene's output.fields names further ones",
+            f"no field {name!r}, {suggest(name, known)}; a scene's output.fields names further ones",
             file=run.folder,
             key="--field",
         )

@@ -23,7 +23,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lyra_petsc.extras import missing, remedy
+from lyra_petsc.extras import install_hint, missing_packages
 from lyra_petsc.output.agreement import replace_bytes, replace_text
 
 
@@ -264,7 +264,7 @@ PACKAGES = ("matplotlib", "jinja2")
 
 def lacking() -> list[str]:
     """The packages for pictures and ``report.html`` that are not installed."""
-    return missing(PACKAGES)
+    return missing_packages(PACKAGES)
 
 
 def close(
@@ -286,7 +286,7 @@ def close(
     packages = lacking()
     if packages:
         replace_text(folder / "report.md", report.markdown())
-        return f"no {pictures} and no report.html: {remedy(packages)}"
+        return f"no {pictures} and no report.html: {install_hint(packages)}"
     (folder / PLOTS).mkdir(exist_ok=True)
     report.write(folder)
     return ""

@@ -15,7 +15,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.extras import missing
+from lyra_petsc.extras import missing_packages
 from lyra_petsc.output import read_run
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
@@ -606,7 +606,7 @@ def write_page(folder: Path, out: Path | None) -> Path:
 
 def _rendered(run: StoredRun) -> list[Drawing]:
     """Pictures of a few states as ``render`` draws them; none where that cannot be."""
-    if missing(PACKAGES):
+    if missing_packages(PACKAGES):
         return []
     from mpi4py import MPI
 
