@@ -15,7 +15,7 @@ import click
 from lyra_petsc.cli.options import results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require_packages
-from lyra_petsc.output.agreement import raise_together
+from lyra_petsc.output.file_operations import raise_on_all_ranks
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
 """Packages of the extra ``view`` that the page needs."""
@@ -107,7 +107,7 @@ def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser
     request = comm.Ibarrier()
     while not request.Test():  # unlike MPI's barrier this keeps no processor busy
         time.sleep(0.2)
-    raise_together(comm, problem)
+    raise_on_all_ranks(comm, problem)
 
 
 def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:

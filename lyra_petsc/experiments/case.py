@@ -22,7 +22,7 @@ from pydantic import PlainValidator, TypeAdapter
 
 from lyra_petsc.api.mpirun import error_message, run_launched
 from lyra_petsc.errors import InputError, suggest
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

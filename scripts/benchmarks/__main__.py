@@ -23,7 +23,7 @@ from tables import document, growth
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.errors import InputError, OutputError, suggest
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 
 DEFAULT = {"vertices": [1024, 10201, 50176], "weak": 25_000, "output": 200_000}
 QUICK = {"vertices": [1024, 4900], "weak": 2_500, "output": 10_201}

@@ -26,7 +26,7 @@ from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, refuse_idle, search
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
 from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
-from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose, present
+from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder, existing_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
@@ -46,7 +46,7 @@ FIT = FolderKind(
     Path("fits"),
     "fit.lock",
     re.compile(r"(trials\.json|fit\.(csv|json)|report\.(html|md)|[\w-]+\.(png|svg))(\.part)?"),
-    partial(present, TRIALS_FILE),
+    partial(existing_files, TRIALS_FILE),
     "no evaluations to go on from",
     folders=("plots",),
 )
@@ -440,7 +440,7 @@ def fit(
             if resume:
                 raise InputError("needs the folder, out, that holds evaluations", key="resume")
             return fit_scene(comm, loaded)
-        choice = choose(comm, "scene", out, force=force, resume=resume, kind=FIT)
+        choice = choose_folder(comm, "scene", out, force=force, resume=resume, kind=FIT)
         with RunDirectory(comm, choice) as directory:
             directory.clean()
             return fit_scene(comm, loaded, folder=directory.path)

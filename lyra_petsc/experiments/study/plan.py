@@ -18,7 +18,7 @@ from lyra_petsc.experiments.case import Case, load_record
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.measures import mean_edge_length
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.document import seconds, short
