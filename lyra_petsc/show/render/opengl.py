@@ -52,7 +52,6 @@ def check_opengl() -> None:
         If it cannot; the message names the library to install.
     """
     import_pyvista()
-    import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
     window = vtkRenderWindow()
