@@ -80,6 +80,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.hookimpl(trylast=True)  # the terminal exists by then
 def pytest_configure(config: pytest.Config) -> None:
+    import petsc4py.PETSc  # noqa: F401
 
     from lyra_petsc.parallel import restore_signal_handlers
 

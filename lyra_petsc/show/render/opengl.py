@@ -52,6 +52,7 @@ def check_opengl() -> None:
         If it cannot; the message names the library to install.
     """
     import_pyvista()
+    import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the windows)
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
     window = vtkRenderWindow()

@@ -81,5 +81,5 @@ def test_a_run_that_is_late_is_said_to_be(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(StoredRun, "summary", {"outcome": "running"})
     run.__dict__.pop("summary", None)
     assert page._outcome().endswith(" running")
-    page._news -= 7.0
+    page._last_news -= 7.0
     assert page._outcome().endswith("running, the next state awaited for 7 s")
