@@ -1,7 +1,7 @@
-"""The few ways in which a run ends early, and the exit code of each.
+"""The exceptions that end a run early, and the exit code of each.
 
-Every module raises one of these and nothing prints or exits by itself; ``cli`` turns
-them into one line on rank 0 and the exit code.
+All modules raise these exceptions and none prints or exits by itself; ``cli`` turns an exception
+into one line on rank 0 and the exit code.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 LONGEST_WORD = 250
-"""Characters that messages quote of what has no spaces: more than paths and keys have."""
+"""Length from which messages shorten a word without spaces; paths and keys are shorter."""
 
 
-def with_short_words(text: str) -> str:
-    """``text`` with its longest words cut short."""
+def shorten_words(text: str) -> str:
+    """``text`` with words of at least `LONGEST_WORD` characters shortened."""
     return re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: word[0][:57] + "...", text)
 
 
 class LyraError(Exception):
-    """Base of everything a user may see as one line."""
+    """Base of all errors that a user sees as one line instead of a traceback."""
 
     exit_code = 1
     details: tuple[str, ...] = ()
-    """Further lines for the user, below the one that says it."""
+    """Further lines for the user, below the message."""
 
     def _render_traceback_(self) -> list[str]:
-        """What IPython and Jupyter show instead of the whole traceback."""
+        """The lines that IPython and Jupyter show instead of the traceback."""
         return [f"{type(self).__name__}: {self}", *(f"  {detail}" for detail in self.details)]
 
 
@@ -39,11 +39,11 @@ class InputError(LyraError):
     Parameters
     ----------
     message : str
-        What is wrong and what is allowed, in one line.
+        One line that says what is wrong and what is allowed.
     file : str, optional
-        The file in which the mistake stands.
+        The file with the mistake.
     key : str, optional
-        The key (dotted path, e.g. ``handles[1].group``) or option in question.
+        The wrong key (dotted path, e.g. ``handles[1].group``) or option.
     """
 
     exit_code = 2
@@ -56,10 +56,10 @@ class InputError(LyraError):
 
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.key) if part)
-        return with_short_words(f"{where}: {self.message}" if where else self.message)
+        return shorten_words(f"{where}: {self.message}" if where else self.message)
 
     def __reduce__(self) -> tuple[object, ...]:
-        # broadcast from rank 0 to all: pickle must keep the keywords
+        # rank 0 broadcasts errors to all ranks: pickle must keep the keyword arguments
         return (_rebuild_input_error, (self.message, self.file, self.key))
 
 
@@ -68,9 +68,9 @@ def _rebuild_input_error(message: str, file: str | None, key: str | None) -> Inp
 
 
 class SolverError(LyraError):
-    """The solver could not go on; the last good state is on disk (exit 3).
+    """The solver failed; the last accepted state is on disk (exit 3).
 
-    ``collective`` is true where all ranks raise it together, so that the state can still be written.
+    ``collective`` is true if all ranks raise the error together, so that they can still write the state.
     """
 
     exit_code = 3
@@ -82,57 +82,57 @@ class SolverError(LyraError):
 
 
 class OutputError(LyraError):
-    """A result could not be written (disk full, no permission); what was announced stands (exit 3)."""
+    """A result could not be written (disk full, no permission); announced states are kept (exit 3)."""
 
     exit_code = 3
 
 
 class Interrupted(LyraError):
-    """A signal asked the program to stop; a run has finished its step and written a checkpoint.
+    """A signal stopped the program; a run has first finished its step and written a checkpoint.
 
     Parameters
     ----------
-    told : str
-        After the signal's name: what has been done, and how to go on.
+    suffix : str
+        Text after the signal's name: the work that is done, and how to resume.
     signal_number : int
-    how : str
-        Before the name.
+    prefix : str
+        Text before the signal's name.
     """
 
-    def __init__(self, told: str, signal_number: int, how: str = "stopped by") -> None:
-        super().__init__(f"{how} {signal.Signals(signal_number).name}{told}")
+    def __init__(self, suffix: str, signal_number: int, prefix: str = "stopped by") -> None:
+        super().__init__(f"{prefix} {signal.Signals(signal_number).name}{suffix}")
         self.signal_number = signal_number
         self.exit_code = 130 if signal_number == signal.SIGINT else 143
-        self._given = told, signal_number, how
+        self._arguments = suffix, signal_number, prefix
 
     def __reduce__(self) -> tuple[object, ...]:
-        return Interrupted, self._given
+        return Interrupted, self._arguments
 
 
 _FLAGS = {"force", "resume", "sheet", "handles", "wind", "cells"}
-_COMMAND = re.compile(r"--([a-z]+)\b")
+_OPTION = re.compile(r"--([a-z]+)\b")
 
 
-def _words(text: str) -> str:
-    return _COMMAND.sub(lambda found: f"{found[1]}={'True' * (found[1] in _FLAGS)}", text)
+def _replace_options(text: str) -> str:
+    return _OPTION.sub(lambda option: f"{option[1]}={'True' * (option[1] in _FLAGS)}", text)
 
 
 @contextmanager
-def in_python() -> Iterator[None]:
-    """A context in which errors name Python's arguments (``force=True``), not options (``--force``)."""
+def python_argument_names() -> Iterator[None]:
+    """A context in which errors name Python arguments (``force=True``) instead of options (``--force``)."""
     try:
         yield
     except LyraError as error:
-        error.args = tuple(_words(part) if isinstance(part, str) else part for part in error.args)
-        error.details = tuple(map(_words, error.details))
+        error.args = tuple(_replace_options(arg) if isinstance(arg, str) else arg for arg in error.args)
+        error.details = tuple(map(_replace_options, error.details))
         if isinstance(error, InputError):
-            error.message = _words(error.message)
+            error.message = _replace_options(error.message)
             error.key = None if error.key is None else error.key.removeprefix("--")
         raise
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """``did you mean 'x'?`` for the nearest of ``known``, else the list of them all."""
+def suggest(word: str, known: Iterable[str]) -> str:
+    """``did you mean 'x'?`` with the name in ``known`` that is most similar to ``word``, else all names."""
     names = sorted(known)
     by_lower = {name.lower(): name for name in names}
     match = difflib.get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)

@@ -1,4 +1,4 @@
-"""The optional packages that reports, comparisons and pictures need."""
+"""Optional packages, which reports, comparisons and pictures need."""
 
 from __future__ import annotations
 
@@ -7,37 +7,37 @@ import importlib.util
 from lyra_petsc.errors import InputError
 
 PACKAGES = ("matplotlib", "jinja2", "scipy")
-"""What the extra ``study`` brings."""
+"""Packages of the extra ``study``."""
 
 
-def missing(packages: tuple[str, ...] = PACKAGES) -> list[str]:
-    """Those of ``packages`` that cannot be imported."""
+def missing_packages(packages: tuple[str, ...] = PACKAGES) -> list[str]:
+    """The names in ``packages`` that cannot be imported."""
     return [name for name in packages if importlib.util.find_spec(name) is None]
 
 
-def remedy(names: list[str], extra: str = "study") -> str:
-    """One line: what is missing, and how to get it."""
+def install_hint(names: list[str], extra: str = "study") -> str:
+    """One line that names missing packages and the command that installs them."""
     verb = "is" if len(names) == 1 else "are"
     return f"{' and '.join(names)} {verb} not installed; get the extra: pip install 'lyra-petsc[{extra}]'"
 
 
-def require(what: str, packages: tuple[str, ...] = PACKAGES, extra: str = "study") -> None:
-    """Check that the packages of an extra are installed, before anything runs.
+def require_packages(verb: str, packages: tuple[str, ...] = PACKAGES, extra: str = "study") -> None:
+    """Check that optional packages are installed, before any work begins.
 
     Parameters
     ----------
-    what : str
-        The verb that needs them.
+    verb : str
+        The command that needs the packages.
     packages : tuple of str
-        Their names in Python.
+        Import names of the packages.
     extra : str
-        Its name in pyproject.toml.
+        Name of the extra in pyproject.toml that installs the packages.
 
     Raises
     ------
     InputError
-        Naming what is missing and how to get it.
+        If packages are missing; the message says how to install them.
     """
-    names = missing(packages)
+    names = missing_packages(packages)
     if names:
-        raise InputError(remedy(names, extra), key=what)
+        raise InputError(install_hint(names, extra), key=verb)

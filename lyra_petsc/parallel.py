@@ -1,4 +1,4 @@
-"""Ranks and their process: decisions made on one rank and told to all; signals."""
+"""Operations on all ranks: work on rank 0 whose result or error is broadcast, machine layout, signals."""
 
 from __future__ import annotations
 
@@ -18,20 +18,23 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 GRACE = 5.0
-"""How long [s] a rank that failed waits for the others to fail alike."""
+"""Time [s] for which a rank that failed waits for the other ranks to fail as well."""
 
 
-def take_back_signals() -> None:
-    """Put back what PETSc's start replaces: a pipe or a terminal that goes away must not end the process."""
+def restore_signal_handlers() -> None:
+    """Restore Python's handlers of SIGPIPE and SIGHUP, which PETSc replaces when it is initialised.
+
+    With PETSc's handlers, a closed pipe or terminal would end the process.
+    """
     for number in (signal.SIGPIPE, signal.SIGHUP):
         with suppress(ValueError):  # not in the main thread
             signal.signal(number, signal.getsignal(number))
 
 
-def all_here(comm: MPI.Comm) -> bool:
-    """Whether all ranks call this within `GRACE` seconds, each after a failure of its own.
+def all_ranks_arrive(comm: MPI.Comm) -> bool:
+    """Whether all ranks call this function within `GRACE` seconds, each after an error of its own.
 
-    If not, nothing collective may follow on this communicator.
+    If it returns False, no collective operation may follow on this communicator.
     """
     if comm.size == 1:
         return True
@@ -44,7 +47,7 @@ def all_here(comm: MPI.Comm) -> bool:
 
 
 def on_one_machine(comm: MPI.Comm) -> bool:
-    """Whether all ranks share a machine; collective the first time, remembered with the communicator."""
+    """Whether all ranks share a machine. The first call is collective; the communicator keeps the result."""
     from mpi4py import MPI
 
     known = comm.Get_attr(_one_machine())
@@ -68,7 +71,7 @@ def on_root(comm: MPI.Comm, work: Callable[[], Result]) -> Result: ...
 @overload
 def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool) -> Result | None: ...
 def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -> Result | None:
-    """Run ``work`` on rank 0 only; every rank gets its result or raises its error.
+    """Run ``work`` on rank 0 only; every rank returns the result or raises the error of ``work``.
 
     Parameters
     ----------
@@ -77,13 +80,13 @@ def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -
     work : callable
         Called without arguments on rank 0.
     share : bool
-        With ``False`` the result stays on rank 0 (others get ``None``) and only the
-        outcome is sent: for results as large as a mesh.
+        With ``False``, for results as large as a mesh, only success or the error is broadcast; the
+        other ranks get ``None``.
 
     Raises
     ------
     LyraError
-        What ``work`` raised, on every rank alike, so that all leave together.
+        On every rank, the error that ``work`` raised on rank 0.
     """
     result: Result | None = None
     problem: LyraError | None = None
@@ -95,7 +98,7 @@ def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
                 raise
-            problem = InputError("file name too long", file=error.filename)  # as any name comes from outside
+            problem = InputError("file name too long", file=error.filename)  # all names are user input
     problem, shared = comm.bcast((problem, result if share else None), root=0)
     if problem is not None:
         raise problem

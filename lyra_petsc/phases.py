@@ -1,7 +1,7 @@
-"""Wall time of a run by phase, and our names in PETSc's own profile (``-log_view``).
+"""Wall time of a run by phase, and the stages and events of PETSc's profile (``-log_view``).
 
-Each phase is a stage of PETSc's profile, too. A stage or an event costs no more than a microsecond unless
-the user asks PETSc to log.
+Each phase is also a stage of PETSc's profile. A stage or an event costs at most a microsecond unless the user
+asks PETSc to log.
 """
 
 from __future__ import annotations
@@ -17,44 +17,43 @@ from petsc4py import PETSc
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# registered here, as PETSc adds up the stages of all ranks by number: the order must not depend on the way
-# a rank takes
+# PETSc sums the stages of all ranks by number, so all ranks must register the stages in the same order
 STAGES: dict[str, PETSc.Log.Stage] = {}
 
 
 def _register(name: str) -> None:
-    """Make a stage that the profile leaves out until it is pushed; PETSc would call it "Unknown"."""
+    """Create a stage that the profile omits until it is first pushed; PETSc would list it as "Unknown"."""
     STAGES[name] = PETSc.Log.Stage(name)
     STAGES[name].setVisible(False)
 
 
 for _name in ("mesh", "partition", "assembly", "solve", "balance", "output"):
     _register(_name)
-# PETSc registers this one itself, for a server of linear solvers that we never start
+# PETSc registers this stage itself, for a server of linear solvers that is never started here
 PETSc.Log.Stage("PCMPI").setVisible(False)
 
 RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
-"""Events, the latter once a Newton iteration; PETSc's table has room for names of 16 letters."""
+"""Events of assembly, the Jacobian once per Newton iteration. PETSc's table fits names of 16 letters."""
 
 JACOBIAN_AGAIN = "AssembleAgain"
-"""The Jacobian with more regularisation, where the linear solve met negative curvature."""
+"""Assembly of the Jacobian with more regularisation, after the linear solver found negative curvature."""
 
 FROZEN = "AssembleFrozen"
-"""Once an attempt at a step: damping, loads and geometry that stay as they are during it."""
+"""Assembly, once per attempted step, of damping, loads and geometry that are constant during the step."""
 
 GALERKIN = "MGGalerkin"
-"""Of the multigrid: coarser matrices."""
+"""Computation of the multigrid's coarse-level matrices."""
 
 SWEEP, TRANSFER = PETSc.Log.Event("MGSweep"), PETSc.Log.Event("MGTransfer")
-"""A level's Gauss-Seidel sweep, and transfers between levels; both too often to look them up by name."""
+"""Gauss-Seidel sweep of a level, and transfers between levels: too frequent to look the events up by name."""
 
 COMPILE = PETSc.Log.Event("CompileKernels")
-"""Once for each kernel that is compiled and not loaded from the disk, with those that it calls."""
+"""Compilation of a kernel and the kernels it calls; does not count kernels loaded from the cache on disk."""
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Let PETSc charge what happens in the block to the stage ``name``; ended also by an exception."""
+    """A context whose time PETSc charges to the stage ``name``; an exception ends the stage, too."""
     if name not in STAGES:
         _register(name)
     STAGES[name].setVisible(True)
@@ -66,7 +65,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def logged(name: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Decorate a function to be the event ``name``: each call counts once, also if it raises."""
+    """A decorator that logs each call as the event ``name``, also a call that raises."""
     event = PETSc.Log.Event(name)
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -80,32 +79,32 @@ def logged(name: str) -> Callable[[Callable[Arguments, Result]], Callable[Argume
     return decorate
 
 
-def _nobody(text: str) -> None:
+def _ignore(message: str) -> None:
     pass
 
 
 class Phases:
     """Charges every second since construction to exactly one phase.
 
-    ``with phases("assembly"):`` charges the block to ``assembly``; a phase entered inside
-    another takes its time out of the outer one, so that all phases add up to the total.
+    ``with phases("assembly"):`` charges the block to ``assembly``. The time of a nested phase is not
+    charged to the outer phase, so that all phases add up to the total.
 
     Parameters
     ----------
     clock : callable
-        Returns seconds; the wall clock unless a test brings its own.
-    tell : callable
-        Called with a line where a phase takes long before the first step; on rank 0.
+        Returns seconds; the wall clock except in tests.
+    report : callable
+        Called on rank 0 with one line of text when a phase before the first step takes long.
     """
 
     OTHER = "other"
 
     def __init__(
-        self, clock: Callable[[], float] = time.perf_counter, tell: Callable[[str], None] = _nobody
+        self, clock: Callable[[], float] = time.perf_counter, report: Callable[[str], None] = _ignore
     ) -> None:
-        self._clock, self.tell = clock, tell
+        self._clock, self.report = clock, report
         self._seconds: dict[str, float] = {}
-        self._open = [self.OTHER]
+        self._active = [self.OTHER]  # nested phases, the innermost last
         self._start = self._charged_until = clock()
 
     @contextmanager
@@ -118,23 +117,23 @@ class Phases:
             self.end()
 
     def begin(self, name: str) -> None:
-        """Charge what follows to a phase, until `end`."""
+        """Charge the time until `end` to the phase ``name``."""
         self._charge()
         self._seconds.setdefault(name, 0.0)
-        self._open.append(name)
+        self._active.append(name)
 
     def end(self) -> None:
-        """Charge again to the phase before."""
+        """End the innermost phase and charge to the enclosing phase again."""
         self._charge()
-        self._open.pop()
+        self._active.pop()
 
     def begin_compilation(self) -> None:
-        """Charge what follows to the compilation of a kernel, until `end_compilation`."""
+        """Charge the time until `end_compilation` to the compilation of a kernel."""
         self.begin("compilation")
         COMPILE.begin()
 
     def end_compilation(self) -> None:
-        """Charge again to the phase that needed the kernel."""
+        """Charge to the phase that needed the kernel again."""
         COMPILE.end()
         self.end()
 
@@ -144,7 +143,7 @@ class Phases:
         return self._clock() - self._start
 
     def seconds(self) -> dict[str, float]:
-        """Seconds of each phase in the order of first entry, then ``other``: time in none."""
+        """Seconds of each phase in the order of first entry, then ``other``: time outside of all phases."""
         self._charge()
         other = self._seconds.get(self.OTHER, 0.0)
         return {
@@ -154,6 +153,6 @@ class Phases:
 
     def _charge(self) -> None:
         now = self._clock()
-        current = self._open[-1]
+        current = self._active[-1]
         self._seconds[current] = self._seconds.get(current, 0.0) + now - self._charged_until
         self._charged_until = now

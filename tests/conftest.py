@@ -82,10 +82,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def pytest_configure(config: pytest.Config) -> None:
     import petsc4py.PETSc  # noqa: F401
 
-    from lyra_petsc.parallel import take_back_signals
+    from lyra_petsc.parallel import restore_signal_handlers
 
     # or a pipe that is closed, as by a film that cannot be written, ends pytest
-    take_back_signals()
+    restore_signal_handlers()
     if WORLD.size == 1:
         compile_once()
         return

@@ -251,7 +251,7 @@ def end_on_one_rank(comm: MPI.Comm, scene: Scene, folder: Path, steps: int) -> A
     for _ in range(steps):
         recorder.record(simulation.step())
     recorder.write_checkpoint()
-    recorder.settle()
+    recorder.flush()
     recorder.close()
     simulation.destroy()
     few, x = comm.Split(0 if comm.rank == 0 else 1), None
@@ -262,7 +262,7 @@ def end_on_one_rank(comm: MPI.Comm, scene: Scene, folder: Path, steps: int) -> A
         assert resumed.step_number == steps
         while not resumed.finished:
             again.record(resumed.step())
-        again.settle()
+        again.flush()
         again.close()
         x = shape(resumed)
         resumed.destroy()

@@ -7,7 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS, History
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import lyra_petsc
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 
 POLL = 0.05
 """Seconds between checks whether a process has ended."""

@@ -15,8 +15,8 @@ from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, S
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderChoice, RunDirectory
-from lyra_petsc.output.stored import import_ahead
-from lyra_petsc.output.summary import read_summary, versions, write_summary
+from lyra_petsc.output.stored import import_h5py_in_background
+from lyra_petsc.output.summary import library_versions, read_summary, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import STORED, with_stored_bending_model
@@ -66,7 +66,7 @@ def simulate(
         A signal requested it to stop; the last step is in the checkpoint.
     """
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
-        import_ahead()
+        import_h5py_in_background()
         if choice.resume:
             scene = on_root(comm, lambda: with_stored_bending_model(scene, directory.path / STORED)) or scene
         simulation = SteppedScene(comm, scene, phases)
@@ -107,7 +107,7 @@ class _RunLoop:
     ) -> None:
         self._simulation, self._recorder, self._folder = simulation, recorder, folder
         self._callbacks, self._comm = callbacks, simulation.comm
-        self._versions = versions()
+        self._versions = library_versions()
         self._waiting = Waiting(self._comm)
         self._notes_shown = simulation.earlier_notes
         self._first_step = simulation.step_number
@@ -144,11 +144,11 @@ class _RunLoop:
                     callbacks.note(note)
                 if number := stop():
                     recorder.write_checkpoint()
-                    recorder.settle()
+                    recorder.flush()
                     when = f" after step {simulation.step_number} (t = {simulation.time:g} s)"
                     raise Interrupted(f"{when}; the checkpoint is written, --resume goes on", number)
             with simulation.phases("output"):
-                recorder.settle()
+                recorder.flush()
             if simulation.note_of_repeats:
                 callbacks.note(simulation.note_of_repeats)
         except SolverError as error:
@@ -179,7 +179,7 @@ class _RunLoop:
         """Write the last accepted state and the failed step; returns lines that name their files."""
         try:
             self._recorder.write_state()
-            self._recorder.settle()
+            self._recorder.flush()
             self._summarise(outcome)
             if self._simulation.failure is None:
                 return ()

@@ -20,7 +20,7 @@ from lyra_petsc.api.run_loop import ProgressCallbacks, SignalCheck, simulate
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.api.simulations import refuse_mixed_options
 from lyra_petsc.errors import Interrupted, LyraError
-from lyra_petsc.output.run_folder import choose
+from lyra_petsc.output.run_folder import choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
@@ -48,7 +48,7 @@ def run(
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
         refuse_mixed_options(loaded)
         stem = loaded.source.stem if loaded.source else "scene"
-        choice = choose(comm, stem, out, force=force, resume=resume)
+        choice = choose_folder(comm, stem, out, force=force, resume=resume)
         with _defer_interrupt(comm) as stop, np.errstate(over="ignore", invalid="ignore"):
             folder = simulate(comm, loaded, choice, callbacks, stop)
     except (LyraError, KeyboardInterrupt) as error:

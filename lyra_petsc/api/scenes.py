@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from lyra_petsc.errors import InputError, in_python
+from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.scene.load import default_scene, load_scene, scene_of
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import shown
@@ -40,7 +40,7 @@ def load(
     InputError
         For invalid input, naming file and key.
     """
-    with in_python():
+    with python_argument_names():
         if isinstance(source, Mapping):
             scene = scene_of(source, changes)
         elif source is not None and not isinstance(source, Scene | str | os.PathLike):

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output.fields import FIELDS, check_field
-from lyra_petsc.parallel import on_root, take_back_signals
+from lyra_petsc.parallel import on_root, restore_signal_handlers
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene
 
-take_back_signals()  # PETSc's import has replaced the signal handlers
+restore_signal_handlers()  # PETSc's import has replaced the signal handlers
 
 
 _OPEN: weakref.WeakSet[Simulation] = weakref.WeakSet()
@@ -181,7 +181,7 @@ class Simulation:
             If there is no field of that name, or the scene lacks its term.
         """
         if name not in FIELDS:
-            raise InputError(f"unknown field {name!r}, {nearest(name, FIELDS)}", key="field")
+            raise InputError(f"unknown field {name!r}, {suggest(name, FIELDS)}", key="field")
         problem = self._running.problem
         check_field(FIELDS[name], problem)
         return np.array(FIELDS[name].compute(problem))

@@ -15,8 +15,8 @@ import click
 
 from lyra_petsc.cli.arguments import move_help, split, start_error, start_petsc
 from lyra_petsc.cli.verbs import verbs
-from lyra_petsc.errors import InputError, LyraError, SolverError, with_short_words
-from lyra_petsc.parallel import take_back_signals
+from lyra_petsc.errors import InputError, LyraError, SolverError, shorten_words
+from lyra_petsc.parallel import restore_signal_handlers
 
 PROGRAM = "lyra-petsc"
 
@@ -44,7 +44,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         failure = start_error(petsc)
         if not failure:
             failure = start_petsc([argv[0], *petsc])
-            take_back_signals()
+            restore_signal_handlers()
         import numpy as np
         from mpi4py import MPI
     except ImportError as error:
@@ -109,10 +109,10 @@ def _print_error(comm: Any, line: str, details: Sequence[str] = ()) -> None:
 
 def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()) -> int:
     """Print the message; returns the exit code if all ranks failed together, else ends the MPI job."""
-    from lyra_petsc.parallel import all_here
+    from lyra_petsc.parallel import all_ranks_arrive
 
     _print_error(comm, line, details)
-    if not all_here(comm):
+    if not all_ranks_arrive(comm):
         if comm.rank > 0:  # rank 0 may not have failed, and printed nothing
             with suppress(OSError):
                 print(f"lyra-petsc: rank {comm.rank}: {' '.join(line.split())}", file=sys.stderr, flush=True)
@@ -140,6 +140,6 @@ def _report_unexpected(comm: Any, error: BaseException) -> int:
 
 def _in_one_line(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption):
-        name = with_short_words(error.option_name)
+        name = shorten_words(error.option_name)
         return f"{name}: no such option; see --help (PETSc options have one dash)"
-    return with_short_words(error.format_message())
+    return shorten_words(error.format_message())

@@ -36,7 +36,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     """
     path = path or default_scene()
     scene = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulation = SteppedScene(comm, scene, Phases(tell=say))
+    simulation = SteppedScene(comm, scene, Phases(report=say))
     Recorder(simulation)
     problem = simulation.problem
     points, pattern = problem.points, problem.pattern

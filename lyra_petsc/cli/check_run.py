@@ -14,7 +14,7 @@ from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import Overlaps, find_overlaps
-from lyra_petsc.output.agreement import on_each
+from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root
 from lyra_petsc.show.obstacle_surfaces import run_obstacles
@@ -87,7 +87,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     """
     run = on_root(comm, lambda: StoredRun(folder))
     scene = on_root(comm, lambda: run.scene)
-    obstacles = on_each(comm, lambda: run_obstacles(run))
+    obstacles = on_every_rank(comm, lambda: run_obstacles(run))
     row = PAIRS + (INSIDE if scene.obstacles else "")
     time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
@@ -95,7 +95,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     _print(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_each(comm, partial(_count_in_state, run, obstacles, begin + comm.rank))
+        found = on_every_rank(comm, partial(_count_in_state, run, obstacles, begin + comm.rank))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
                 rows.append(one[0])

@@ -19,7 +19,7 @@ from lyra_petsc.experiments.fit.estimate import Trial
 from lyra_petsc.experiments.fit.fit_report import Fit, FitOutcome, outcome_of
 from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene, unknowns_of
 from lyra_petsc.experiments.results import Results
-from lyra_petsc.output.run_folder import RunDirectory, choose
+from lyra_petsc.output.run_folder import RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
@@ -76,7 +76,7 @@ def fit(
         return loaded.trusting_meshes() if trust_mesh else loaded
 
     loaded = on_root(comm, read)
-    choice = choose(comm, scene.stem, out, force=force, resume=resume, kind=FIT)
+    choice = choose_folder(comm, scene.stem, out, force=force, resume=resume, kind=FIT)
 
     def kept() -> str:
         if not FIT.resumable(choice.path):

@@ -47,7 +47,7 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
     from lyra_petsc.cli.progress import FrameProgress
     from lyra_petsc.cli.signals import StopRequest
     from lyra_petsc.errors import Interrupted
-    from lyra_petsc.extras import require
+    from lyra_petsc.extras import require_packages
     from lyra_petsc.parallel import on_root
     from lyra_petsc.show.render.opengl import share_cores
     from lyra_petsc.show.render.paraview_script import write_script
@@ -62,7 +62,7 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
         if not (options.at or options.film or options.sheet):
             return
     share_cores(comm)
-    on_root(comm, lambda: require("render", PACKAGES, "view"))
+    on_root(comm, lambda: require_packages("render", PACKAGES, "view"))
     from lyra_petsc.show.render.draw import draw
 
     plan = on_root(comm, lambda: make_plan(options))
@@ -126,11 +126,11 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="The page (RUN/report.html).")
 def report(comm: Any, run: Path, out: Path | None) -> None:
     """One HTML page about RUN: pictures, energy, steps, time, settings, notes, what to change."""
-    from lyra_petsc.extras import require
+    from lyra_petsc.extras import require_packages
     from lyra_petsc.parallel import on_root
     from lyra_petsc.show.report.run_page import write_page
 
-    require("report", ("matplotlib", "jinja2"))
+    require_packages("report", ("matplotlib", "jinja2"))
     path = on_root(comm, lambda: write_page(run, out))
     if comm.rank == 0:
         click.echo(f"report       {path}")

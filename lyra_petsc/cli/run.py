@@ -17,7 +17,7 @@ from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.kernels.compilation import COMPILATION, no_action
 from lyra_petsc.linear.petsc_options import unused
-from lyra_petsc.output.run_folder import choose
+from lyra_petsc.output.run_folder import choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene, load_scene
@@ -62,12 +62,12 @@ def run(
     """
     if served is not None:
         on_root(comm, lambda: served.check("--live"))
-    phases = Phases(tell=say)
+    phases = Phases(report=say)
     stop = StopRequest(comm)
     if scene is None and resume and out is not None:
         scene = out / "scene.yaml"
     path = scene or default_scene()
-    choice = choose(comm, path.stem, out, force=force, resume=resume)
+    choice = choose_folder(comm, path.stem, out, force=force, resume=resume)
     loaded = read_scene(comm, path, settings, trust_mesh=trust_mesh)
     simulate(comm, loaded, choice, TerminalProgress(comm, served, choice.first), stop.signal_number, phases)
 

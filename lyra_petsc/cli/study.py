@@ -18,7 +18,7 @@ from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
 from lyra_petsc.experiments.study.study_report import Study
 from lyra_petsc.experiments.study.study_runner import StudyRunner, choose_references
-from lyra_petsc.output.run_folder import RunDirectory, choose
+from lyra_petsc.output.run_folder import RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import default_scene
 
@@ -46,7 +46,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **give
     """
     scene = given["scene"] or default_scene()
     stem = out.name if resume and given["scene"] is None and out is not None else scene.stem
-    choice = choose(comm, stem, out, force=force, resume=resume, kind=STUDY)
+    choice = choose_folder(comm, stem, out, force=force, resume=resume, kind=STUDY)
     base = on_root(comm, lambda: read_request(choice.path)) if resume else Request(str(scene))
     given["scene"] = given["scene"] and str(scene)
     request = dataclasses.replace(base, **{k: value for k, value in given.items() if value not in (None, ())})

@@ -16,7 +16,7 @@ from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, add_help, example, out, prints, scene, settings, trust_mesh, verb
 from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, server_options, view
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 
 
 class _Verbs(click.Group):
@@ -32,7 +32,7 @@ class _Verbs(click.Group):
             hint = (
                 "give a verb first, as in: run " + name
                 if Path(name).suffix
-                else nearest(name, list(self.commands))
+                else suggest(name, list(self.commands))
             )
             raise InputError(f"unknown verb, {hint}", key=name)
         return super().resolve_command(ctx, args)
@@ -145,9 +145,9 @@ def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
 @click.option("--job", type=click.Path(path_type=Path), hidden=True)
 def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     """Error against run time: run, time and compare combinations of settings of SCENE."""
-    from lyra_petsc.extras import require
+    from lyra_petsc.extras import require_packages
 
-    require("study")
+    require_packages("study")
     if job is not None:
         from lyra_petsc.cli.experiments import stop_check
         from lyra_petsc.experiments.study.jobs import run_job

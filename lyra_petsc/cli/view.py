@@ -14,8 +14,8 @@ import click
 
 from lyra_petsc.cli.options import results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
-from lyra_petsc.extras import require
-from lyra_petsc.output.agreement import raise_together
+from lyra_petsc.extras import require_packages
+from lyra_petsc.output.file_operations import raise_on_all_ranks
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
 """Packages of the extra ``view`` that the page needs."""
@@ -72,7 +72,7 @@ class Served:
         InputError
             For missing packages, or an address that cannot be used.
         """
-        require(what, PACKAGES, "view")
+        require_packages(what, PACKAGES, "view")
         from lyra_petsc.show.view.server import check_address
 
         check_address(self.host, self.port)
@@ -107,7 +107,7 @@ def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser
     request = comm.Ibarrier()
     while not request.Test():  # unlike MPI's barrier this keeps no processor busy
         time.sleep(0.2)
-    raise_together(comm, problem)
+    raise_on_all_ranks(comm, problem)
 
 
 def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:

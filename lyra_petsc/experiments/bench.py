@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import LyraError, SolverError
-from lyra_petsc.parallel import all_here, on_root
+from lyra_petsc.parallel import all_ranks_arrive, on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import Scene
@@ -60,7 +60,7 @@ def failure_message(comm: MPI.Comm, error: LyraError) -> str:
     SolverError
         The error itself if it did not occur on every rank: the ranks could not continue together.
     """
-    if isinstance(error, SolverError) and not error.collective and not all_here(comm):
+    if isinstance(error, SolverError) and not error.collective and not all_ranks_arrive(comm):
         raise error
     return " ".join(str(error).split())
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic import PlainValidator, TypeAdapter
 
 from lyra_petsc.api.mpirun import error_message, run_launched
-from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.errors import InputError, suggest
+from lyra_petsc.output.file_operations import replace_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -159,7 +159,7 @@ class Registry(Generic[T]):
             For an unknown name; the message suggests the nearest known one.
         """
         if name not in self.modules:
-            raise InputError(f"unknown case, {nearest(name, self.modules)}", key=name)
+            raise InputError(f"unknown case, {suggest(name, self.modules)}", key=name)
         module = import_module(f"{self.package}.{self.modules[name]}")
         return cast(T, getattr(module, name.replace("-", "_")))
 

@@ -28,7 +28,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import needed_terms
@@ -411,7 +411,7 @@ def exact_motion(name: str, body: Body) -> ExactMotion:
     """
     key = f"--reference exact:{name}"
     if name not in SOLUTIONS:
-        raise InputError(f"no exact solution of that name, {nearest(name, SOLUTIONS)}", key=key)
+        raise InputError(f"no exact solution of that name, {suggest(name, SOLUTIONS)}", key=key)
     violations = SOLUTIONS[name].violations(body)
     if violations:
         raise InputError(

@@ -13,10 +13,10 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, count_passed
-from lyra_petsc.output.agreement import replace_text
-from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.output.file_operations import replace_text
+from lyra_petsc.output.summary import library_versions, write_summary
 from lyra_petsc.parallel import on_root
-from lyra_petsc.show.report.document import Report, close, lacking
+from lyra_petsc.show.report.document import Report, missing_report_packages, write_report
 
 O = TypeVar("O", bound=Outcome[Any])  # noqa: E741
 C = TypeVar("C", bound=Case)
@@ -112,7 +112,7 @@ class View(ABC, Generic[O]):
         return self.summary_content(outcomes) | {
             "passed": all(outcome.passed for outcome in run),
             "ranks": ranks,
-            "versions": versions(),
+            "versions": library_versions(),
             "cases": [
                 {"name": outcome.case.name, "title": outcome.case.title, **self.case_content(outcome)}
                 | {
@@ -130,7 +130,7 @@ class View(ABC, Generic[O]):
 
     def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         """Add command and versions and write the page, on one rank; returns a note on missing packages."""
-        return close(report, folder, versions(), command, pictures=self.pictures)
+        return write_report(report, folder, library_versions(), command, pictures=self.pictures)
 
 
 def _without_left_out(outcomes: Sequence[O]) -> list[O]:
@@ -242,7 +242,7 @@ class Results(Generic[O]):
         report = Report(self.view.title)
         ranks = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
         summary = f"{count_passed(self.outcomes)} on {ranks}."
-        self.view.fill(report, self.outcomes, summary, plots=not lacking())
+        self.view.fill(report, self.outcomes, summary, plots=not missing_report_packages())
         return self.view.close_page(report, self.folder, self._command)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.mesh.readers import first_few
@@ -79,7 +79,7 @@ def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -
     found = mesh.groups.get(name)
     if found is not None:
         return found
-    raise InputError(f"no group '{name}' in the mesh; {nearest(name, mesh.groups)}", key=key, file=file)
+    raise InputError(f"no group '{name}' in the mesh; {suggest(name, mesh.groups)}", key=key, file=file)
 
 
 def _check_numbers(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> Ints:

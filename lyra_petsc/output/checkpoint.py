@@ -1,4 +1,4 @@
-"""checkpoint.h5: all that a run needs to go on, on any number of ranks."""
+"""checkpoint.h5: everything that a run needs to resume, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import writing
+from lyra_petsc.output.file_operations import writing
 from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
-from lyra_petsc.output.stored import check_sums, open_stored, text_of
+from lyra_petsc.output.stored import check_sums, open_stored, text_attribute
 from lyra_petsc.parallel import on_root
 
 FORMAT = 2
 
 FIRST_FORMAT = 1
-"""That of older versions, where only the arrays have check sums."""
+"""Format of older versions, in which only the arrays have check sums."""
 
 Scalars = dict[str, Any]
 
@@ -41,15 +41,15 @@ class Checkpoint:
     arrays : dict of str to (n_owned, ...) array
         Vertex arrays by name, in this rank's numbering.
     scalars : dict
-        As given to ``write_checkpoint``.
+        As given to `checkpoint_file`.
     file : Path
-        The file read: the newest that is whole.
+        The file that was read: the newest undamaged checkpoint.
     note : str or None
-        Why it is not the newest one, for the user.
+        For the user: why this is not the newest checkpoint.
     edges : dict of str to (n_edges,) array
         Unknowns of edges by name, in this rank's numbering.
     elements : dict of str to (n, m) array
-        Rows of elements that change, by name; this rank has as good a share of them as any other.
+        Rows of changing elements by name, divided evenly among the ranks.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -69,24 +69,24 @@ def checkpoint_file(
     edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> NewFile:
-    """A new checkpoint to write to; the old one is kept as the previous.
+    """A new checkpoint, to be passed to `write_collective`; the old file is kept as the previous checkpoint.
 
     Parameters
     ----------
     folder : path
         The run's folder.
     order : FileOrder
-        Order of the vertices each rank owns; collective over its ranks.
+        File order of the vertices that each rank owns; collective over its ranks.
     arrays : mapping of str to (n_owned, ...) array of float64 or int64
-        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and what the integrator remembers.
+        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's memory.
     edge_order : FileOrder or None
-        Order of the edges each rank owns that carry an unknown; None: there are none.
+        File order of the edges with an unknown that each rank owns; None without such edges.
     edge_arrays : mapping of str to (n_edges,) array of float64
-        The same of the unknowns of edges.
+        Arrays of the unknowns of edges.
     elements : mapping of str to (n, m) array of float64
-        Rows of this rank's elements that change, in any order.
+        Rows of this rank's changing elements, in any order.
     scalars : mapping
-        What JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
+        Values that JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
         works, …; the same on every rank.
     """
     folder = Path(folder)
@@ -119,34 +119,34 @@ def _rotate(folder: Path) -> None:
 def read_checkpoint(
     folder: str | os.PathLike[str], order: FileOrder, edge_order: FileOrder | None = None
 ) -> Checkpoint:
-    """The newest whole checkpoint of a run, whatever number of ranks wrote it.
+    """The newest undamaged checkpoint of a run, which any number of ranks may have written.
 
     Parameters
     ----------
     folder : path
         The run's folder.
     order : FileOrder
-        Order of the vertices each rank owns now; collective over its ranks.
+        File order of the vertices that each rank owns now; collective over its ranks.
 
     Raises
     ------
     InputError
-        On every rank, if there is none, if all are damaged, or if it is of another mesh.
+        On every rank, if there is no checkpoint, all are damaged, or the mesh is a different one.
     """
     newest: InputError | None = None
     for file in on_root(order.comm, lambda: checkpoint_files(folder)):
         try:
-            scalars, sums, counts = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
+            scalars, sums, counts = on_root(order.comm, lambda f=file: _read_metadata(f, order))  # type: ignore[misc]
             arrays, edges = (
                 {
-                    name.split("/", 1)[1]: _rows(file, name, sums[name], by)
+                    name.split("/", 1)[1]: _read_rows(file, name, sums[name], by)
                     for name in sorted(sums)
                     if name.startswith(kind) and by is not None
                 }
                 for kind, by in (("vertices/", order), ("edges/", edge_order))
             )
             elements = {
-                name.split("/", 1)[1]: _rows(file, name, sums[name], _shares(order.comm, count))
+                name.split("/", 1)[1]: _read_rows(file, name, sums[name], _equal_slabs(order.comm, count))
                 for name, count in sorted(counts.items())
             }
         except InputError as error:
@@ -162,25 +162,25 @@ def read_checkpoint(
     )
 
 
-def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int], dict[str, int]]:
+def _read_metadata(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int], dict[str, int]]:
     with open_stored(file) as content:
         version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
         if version not in (FIRST_FORMAT, FORMAT):
             raise InputError(
                 f"checkpoint has format {version}, this version reads {FIRST_FORMAT} and {FORMAT}", file=file
             )
-        text = text_of(content, "scalars")
+        text = text_attribute(content, "scalars")
         scalars = json.loads(text)
         found = {
-            f"{kind}/{name}": (data.dtype.str, data.shape[1:], int(text_of(data, "sum")))
+            f"{kind}/{name}": (data.dtype.str, data.shape[1:], int(text_attribute(data, "sum")))
             for kind in ("vertices", "edges", "elements")
             for name, data in content.get(kind, {}).items()
         }
         counts = {f"elements/{name}": len(data) for name, data in content.get("elements", {}).items()}
-        told = text_of(content, "digest") if version != FIRST_FORMAT else None
-    if told is not None and told != _digest(version, n_vertices, text, found):
+        stored_digest = text_attribute(content, "digest") if version != FIRST_FORMAT else None
+    if stored_digest is not None and stored_digest != _digest(version, n_vertices, text, found):
         raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
-    if not _plausible(scalars) or any(np.dtype(kind).itemsize != 8 for kind, _, _ in found.values()):
+    if not _is_plausible(scalars) or any(np.dtype(kind).itemsize != 8 for kind, _, _ in found.values()):
         raise InputError("checkpoint is damaged: it holds what no run writes", file=file)
     if n_vertices != order.n_global:
         raise InputError(
@@ -191,14 +191,14 @@ def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int], dict[s
     return scalars, {name: total for name, (_, _, total) in found.items()}, counts
 
 
-def _shares(comm: MPI.Comm, count: int) -> FileOrder:
-    """An order in which each rank has the rows of its slab."""
+def _equal_slabs(comm: MPI.Comm, count: int) -> FileOrder:
+    """A file order in which each rank owns the rows of its slab."""
     starts = np.arange(comm.size + 1, dtype=np.int64) * count // comm.size
     return FileOrder(comm, np.arange(starts[comm.rank], starts[comm.rank + 1]), count)
 
 
-def _plausible(scalars: Any) -> bool:
-    """Whether scalars are a run's; those of older versions have no check sum."""
+def _is_plausible(scalars: Any) -> bool:
+    """Whether a run can have written these scalars; in the first format they have no check sum."""
     if not isinstance(scalars, dict):
         return False
     step, time = scalars.get("step"), scalars.get("time")
@@ -206,7 +206,7 @@ def _plausible(scalars: Any) -> bool:
 
 
 def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tuple[Any, ...]]) -> str:
-    """Check sum of all that a checkpoint holds: of the scalars' text, and of the arrays by their own sums."""
+    """SHA-256 of a checkpoint's content: the scalars' text, and type, shape and check sum of each array."""
     content = [
         version,
         n_vertices,
@@ -216,7 +216,7 @@ def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tu
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
-def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
+def _read_rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
     slab = read_slab(file, name, order)
     if int(check_sums([slab], order.comm)[0]) != expected:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Fields that a scene may ask for beside the positions; one function and one line each."""
+"""Fields that a scene can request besides the positions; each is one function and one line in ``FIELDS``."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def _velocity(problem: Problem) -> Array:
 
 
 def _displacement(problem: Problem) -> Array:
-    """From the positions at t = 0."""
+    """Displacement from the positions at t = 0."""
     assert problem.start is not None  # see `check_field`
     return problem.system.x[: problem.points.n_vertices] - problem.start
 
 
 def _green_strain(problem: Problem) -> Array:
-    """In material axes; see `tensors`."""
+    """Green strain in material axes; see `tensors`."""
     strain, _ = problem.membrane.strain_and_stress(problem.system.x)
     return six_components(strain[: problem.membrane.n_owned])
 
 
 def _stress(problem: Problem) -> Array:
-    """Second Piola-Kirchhoff, in material axes; see `tensors`."""
+    """Second Piola-Kirchhoff stress in material axes; see `tensors`."""
     _, stress = problem.membrane.strain_and_stress(problem.system.x)
     return six_components(stress[: problem.membrane.n_owned])
 
@@ -53,31 +53,37 @@ def _membrane_energy(problem: Problem) -> Array:
     return membrane.energies(problem.system.x) / membrane.elements.data["area"][: membrane.n_owned]
 
 
-def _per_area(problem: Problem, rows: Ints, shares: Array) -> Array:
-    """What shares (n,) of local rows (n,) make on the owned vertices, over the vertices' rest area."""
+def _density_on_vertices(problem: Problem, rows: Ints, values: Array) -> Array:
+    """Sum of ``values`` (n,) over the local vertices ``rows`` (n,), divided by the vertices' rest area.
+
+    Returns the density of each owned vertex, (n_owned,).
+    """
     n_local, n_owned = problem.points.n_local, problem.points.n_vertices
     membrane = problem.membrane
     thirds = np.repeat(membrane.elements.data["area"] / 3.0, 3)
     area = np.bincount(membrane.stencil.ravel(), thirds, n_local)
-    return np.bincount(rows, shares, n_local)[:n_owned] / area[:n_owned]
+    return np.bincount(rows, values, n_local)[:n_owned] / area[:n_owned]
 
 
-def _on_vertices(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangles) -> Array:
-    """Per rest area: halves of what hinges carry on their edges' ends, thirds of what triangles do."""
+def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangles) -> Array:
+    """Density on vertices of a quantity of bending elements, (n_owned,).
+
+    A hinge's value is divided between the two ends of its edge, a triangle's among its three corners.
+    """
     x, out = problem.system.x, np.zeros(problem.points.n_vertices)
     if "bending" in problem.terms:
         hinges = cast("Bending", problem.terms["bending"])
         halves = np.repeat(0.5 * of_hinges(hinges, x), 2)
-        out += _per_area(problem, hinges.stencil[:, :2].ravel(), halves)
+        out += _density_on_vertices(problem, hinges.stencil[:, :2].ravel(), halves)
     if "midedge" in problem.terms:
         midedge = cast("MidEdge", problem.terms["midedge"])
         thirds = np.repeat(of_triangles(midedge, x, problem.system.active.frozen[midedge]) / 3.0, 3)
-        out += _per_area(problem, midedge.stencil.ravel(), thirds)
+        out += _density_on_vertices(problem, midedge.stencil.ravel(), thirds)
     return out
 
 
 def _bending_energy(problem: Problem) -> Array:
-    return _on_vertices(
+    return _bending_density(
         problem,
         lambda hinges, x: hinges.all_energies(x, hinges.n_elements),
         lambda midedge, x, frames: midedge.all_energies(x, frames, midedge.n_elements),
@@ -85,10 +91,10 @@ def _bending_energy(problem: Problem) -> Array:
 
 
 def _curvature(problem: Problem) -> Array:
-    """Sum of the principal curvatures."""
-    return _on_vertices(
+    """Sum of the principal curvatures on vertices [1/m]."""
+    return _bending_density(
         problem,
-        # the angle of a collapsed triangle is undefined
+        # NaN curvatures: the angle of a collapsed triangle is undefined
         lambda hinges, x: -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x),
         lambda midedge, x, frames: (
             midedge.areas * np.nan_to_num(midedge.curvatures(x, frames)[:, :2].sum(axis=1))
@@ -99,7 +105,7 @@ def _curvature(problem: Problem) -> Array:
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
     found = midedge.curvatures(problem.system.x, problem.system.active.frozen[midedge])[: midedge.n_owned]
-    out = np.zeros((problem.membrane.n_owned, 3))  # of triangles that do not bend
+    out = np.zeros((problem.membrane.n_owned, 3))  # stays zero for triangles without bending stiffness
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)
     own = midedge.elements.data["triangle"][: midedge.n_owned]
@@ -108,12 +114,14 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 
 def _contact_pressure(problem: Problem) -> Array:
-    """From the normal forces on both sides together; collective."""
+    """Contact pressure from the sum of the normal forces on both sides; collective."""
     contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
     forces = np.zeros_like(system.x)
     forces[:, 0] = contact.normal_forces(system.x, system.active.frozen[contact])
     system.points.add_to_owners(forces)
-    return _per_area(problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0]))
+    return _density_on_vertices(
+        problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0])
+    )
 
 
 def _rank(problem: Problem) -> Array:
@@ -122,7 +130,18 @@ def _rank(problem: Problem) -> Array:
 
 @dataclass(frozen=True)
 class Field:
-    """A field, what its rows belong to, how one rank computes its own, and the terms that it needs one of."""
+    """A field that states can hold.
+
+    Attributes
+    ----------
+    name : str
+    on : str
+        ``vertex`` or ``triangle``: what the rows belong to.
+    compute : callable
+        Returns this rank's rows, (n_owned, ...).
+    terms : tuple of str
+        The field needs at least one of these terms in the scene.
+    """
 
     name: str
     on: Literal["vertex", "triangle"]
@@ -148,16 +167,16 @@ FIELDS = {
         Field("rank", "vertex", _rank),
     )
 }
-"""By their names; units stand in `scene.schema.FIELD_UNITS`, of densities per rest area."""
+"""Fields by name. Their units are in `scene.schema.FIELD_UNITS`; densities are per rest area."""
 
 
-def chosen(problem: Problem) -> list[Field]:
-    """The fields a scene asks for.
+def chosen_fields(problem: Problem) -> list[Field]:
+    """The fields that the scene requests.
 
     Raises
     ------
     InputError
-        For a field of a term that the scene does not have.
+        For a field whose term the scene does not have.
     """
     fields = [FIELDS[name] for name in problem.scene.output.fields]
     for field in fields:
@@ -166,11 +185,12 @@ def chosen(problem: Problem) -> list[Field]:
 
 
 def check_field(field: Field, problem: Problem) -> None:
-    """Refuse a field of a term that the scene does not have, or of a start that was not kept.
+    """Check that a field can be computed in this scene.
 
     Raises
     ------
     InputError
+        If the scene lacks the field's term, or ``displacement`` lacks the start positions.
     """
     if field.name == "displacement" and problem.start is None:
         raise InputError(

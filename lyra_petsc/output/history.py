@@ -1,4 +1,4 @@
-"""Tables with rows for each accepted step: history.csv, probes.csv, reactions.csv, obstacles.csv."""
+"""CSV tables with rows for each accepted step: history.csv, probes.csv, reactions.csv, obstacles.csv."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import replaced, writing
+from lyra_petsc.output.file_operations import atomic_write, writing
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -45,26 +45,31 @@ def vector_columns(names: Sequence[str]) -> tuple[str, ...]:
 
 
 class History:
-    """A CSV table on disk, written row by row by rank 0. Construction is collective.
+    """A CSV table on disk that rank 0 writes row by row. Construction is collective.
 
     Parameters
     ----------
     path : path
-        The file; one that exists is replaced, or with ``resume_after`` continued.
+        The file; an existing file is replaced or, with ``resume_after``, continued.
     columns : sequence of str
         The header; the first column is ``step``.
     comm : MPI.Comm
-        All ranks of the run; what opening it on rank 0 raises is raised on all.
+        All ranks of the run.
     resume_after : int, optional
-        Keep the rows up to and including this step, cut what follows (also a row that a kill
-        left half written) and go on behind them. A file that is missing is begun anew.
+        Keep the rows up to and including this step, remove later and incomplete rows, and append after
+        them. A missing file is created.
+
+    Attributes
+    ----------
+    kept_until : int
+        Step of the last row that was kept; −1 without one.
 
     Raises
     ------
     InputError
-        If the file to be continued has other columns.
+        On all ranks, if the file to be continued has other columns.
     OutputError
-        If the file cannot be written.
+        On all ranks, if the file cannot be written.
     """
 
     def __init__(
@@ -83,12 +88,12 @@ class History:
         self.kept_until = comm.bcast(self.kept_until, root=0)
 
     def append(self, *rows: Mapping[str, float | str]) -> None:
-        """Write the rows of a step; for rank 0, which may write several tables before the others hear of it.
+        """Write the rows of a step. Call on rank 0 within `on_root`, so that all ranks raise its errors.
 
         Parameters
         ----------
         rows : mapping
-            A number, or a name, for each column.
+            A number or a name for each column.
 
         Raises
         ------
@@ -96,12 +101,12 @@ class History:
             On rank 0.
         """
         with writing(self.path):
-            self._write([_text(values[name]) for name in self.columns] for values in rows)
+            self._write([_format(values[name]) for name in self.columns] for values in rows)
 
     def close(self) -> None:
         """Close the file; nothing can be appended afterwards.
 
-        Every row is on its way when ``append`` returns: what a failed one left behind is dropped.
+        ``append`` flushes every row, so only the rest of a failed row is lost.
         """
         if self._file is not None:
             with suppress(OSError):
@@ -110,25 +115,25 @@ class History:
 
     def _open(self, resume_after: int | None) -> None:
         with writing(self.path):
-            go_on = resume_after is not None and self.path.exists()
-            if resume_after is not None and go_on:
-                self._cut(resume_after)
-            self._file = self.path.open("ab" if go_on else "wb")
-            if not go_on:
+            continued = resume_after is not None and self.path.exists()
+            if resume_after is not None and continued:
+                self._truncate(resume_after)
+            self._file = self.path.open("ab" if continued else "wb")
+            if not continued:
                 self._write([self.columns])
 
     def _write(self, rows: Iterable[Sequence[str]]) -> None:
-        """Write all rows at once."""
+        """Write all rows in one call."""
         assert self._file is not None
         lines = StringIO()
         csv.writer(lines, lineterminator="\n").writerows(rows)
         self._file.write(lines.getvalue().encode())
         self._file.flush()
 
-    def _cut(self, last_step: int) -> None:
-        """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""
+    def _truncate(self, last_step: int) -> None:
+        """Replace the file atomically by its header and its complete rows up to ``last_step``."""
         check_columns(self.path, self.columns)
-        with open(self.path, "rb") as old, replaced(self.path) as new:
+        with open(self.path, "rb") as old, atomic_write(self.path) as new:
             new.write(old.readline())
             for line in old:
                 if not line.endswith(b"\n") or not _is_row_until(line, last_step):
@@ -138,12 +143,12 @@ class History:
 
 
 def check_columns(path: Path, columns: Sequence[str]) -> None:
-    """Refuse to continue a table that has other columns; for one rank.
+    """Check that a table to be continued has these columns. Call on one rank.
 
     Raises
     ------
     InputError
-        Both sets of columns. A file that is missing or cannot be read is left to `History`.
+        If the columns differ. A missing or unreadable file is not an error here; `History` reports it.
     """
     with suppress(OSError), open(path, encoding="utf-8", errors="replace", newline="") as table:
         header = next(csv.reader([table.readline()]), [])
@@ -162,8 +167,8 @@ def _is_row_until(line: bytes, last_step: int) -> bool:
         return False
 
 
-def _text(value: float | str) -> str:
-    """The shortest text that reads back as the same number; a name in one line."""
+def _format(value: float | str) -> str:
+    """The shortest text that reads back as the same number; a name on one line."""
     if isinstance(value, str):
         return " ".join(value.splitlines())
     return str(int(value)) if isinstance(value, int | np.integer) else repr(float(value))

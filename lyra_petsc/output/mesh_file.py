@@ -1,4 +1,4 @@
-"""mesh.h5: what all states of a run share."""
+"""mesh.h5: the mesh, groups and obstacle surfaces, which all states of a run share."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 
 ROUNDING = 1e-9
-"""Difference between coordinates over the size of the mesh that another machine's arithmetic may make."""
+"""Allowed rounding differences of coordinates between machines, relative to the size of the mesh."""
 
-PARTS = ("vertices", "edges", "triangles")
+GROUP_ARRAYS = ("vertices", "edges", "triangles")
 
 
 def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm) -> None:
-    """Write ``mesh.h5`` from the mesh as it exists on rank 0. Collective.
+    """Write ``mesh.h5`` from the mesh on rank 0. Collective.
 
     ``/mesh/triangles`` (F, 3) int64, ``/mesh/rest`` (V, 3) [m] and the material coordinates
     [m]: ``/mesh/uv`` (V, 2) where each vertex has one, else ``/mesh/corner_uv`` (F, 3, 2).
     The attribute ``vt`` of ``/mesh`` is 1 if they came with the mesh, as texture coordinates.
-    Beside them, for `check_same_mesh`: ``/start`` (V, 3), the start positions [m], and
-    ``/groups/<number>`` with an attribute ``name`` and its ``vertices`` (n,), ``edges`` (k, 2)
-    and ``triangles`` (m,) where it has any; ``/obstacles/<number>`` with an attribute ``name``,
-    ``points`` (n, 3) [m] at t = 0 and ``triangles`` (m, 3), of obstacles that are meshes.
+    For `check_same_mesh` also ``/start`` (V, 3), the start positions [m]; for each group
+    ``/groups/<number>`` with an attribute ``name`` and its non-empty arrays ``vertices`` (n,),
+    ``edges`` (k, 2) and ``triangles`` (m,); for each obstacle that is a mesh ``/obstacles/<number>``
+    with an attribute ``name``, ``points`` (n, 3) [m] at t = 0 and ``triangles`` (m, 3).
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
         names: dict[str, dict[str, int | float | str]] = {"mesh": {"vt": int(mesh.has_uv)}}
         for number, (name, group) in enumerate(mesh.groups.items()):
             names[f"groups/{number}"] = {"name": name}
-            parts = _parts(group)
+            parts = _group_arrays(group)
             datasets |= {f"groups/{number}/{part}": rows for part, rows in parts.items() if len(rows)}
         for number, (name, surface) in enumerate(mesh.obstacles.items()):
             names[f"obstacles/{number}"] = {"name": name}
@@ -69,7 +69,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
 
 
 def vertex_uv(mesh: Mesh) -> Array | None:
-    """(V, 2) material coordinates [m], or ``None`` where a vertex has more than one."""
+    """(V, 2) material coordinates [m], or ``None`` if a vertex has several."""
     uv = np.zeros((mesh.n_vertices, 2))
     uv[mesh.triangles] = mesh.triangle_uv
     return uv if np.array_equal(uv[mesh.triangles], mesh.triangle_uv) else None
@@ -78,7 +78,7 @@ def vertex_uv(mesh: Mesh) -> Array | None:
 def check_same_mesh(
     folder: str | os.PathLike[str], mesh: Mesh | None, groups: Iterable[str], comm: MPI.Comm
 ) -> None:
-    """Refuse to go on with another mesh than the one that the run was begun with. Collective.
+    """Check that the scene's mesh is the one that the run was begun with. Collective.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def check_same_mesh(
     Raises
     ------
     InputError
-        On every rank: what differs, or why ``mesh.h5`` cannot be read.
+        On every rank, if the meshes differ or ``mesh.h5`` cannot be read.
     """
     file = Path(folder) / MESH_FILE
 
@@ -130,47 +130,45 @@ def _arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
     }
 
 
-def _parts(group: Group) -> dict[str, Ints]:
-    return {part: getattr(group, part) for part in PARTS}
+def _group_arrays(group: Group) -> dict[str, Ints]:
+    return {part: getattr(group, part) for part in GROUP_ARRAYS}
 
 
 def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
-    """How a mesh differs from the one in the file, in words; empty if it does not."""
+    """A text that names the first difference between a mesh and the stored one; empty if they agree."""
     counts = len(stored.rest), len(stored.triangles)
     if counts != (mesh.n_vertices, mesh.n_triangles):
-        ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
-        return f"it has {ours_too}, not {counts[0]} and {counts[1]}"
+        now = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
+        return f"it has {now}, not {counts[0]} and {counts[1]}"
     rows = np.flatnonzero((stored.triangles != mesh.triangles).any(axis=1))
     if len(rows):
         return f"triangle {rows[0]} has other vertices ({len(rows)} such triangles)"
-    slack = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
-    for theirs, ours, words in (
-        (stored.rest, mesh.rest, "at rest"),
-        (stored.start, mesh.positions, "at the start"),
-    ):
-        if theirs is not None and (place := _apart(theirs, ours, slack)):
-            return f"vertex {place[0]} stands {place[1]:.3g} m off {words}"
-    uv = vertex_uv(mesh)
-    if (uv is None) != (stored.uv is None) or _apart(stored.corner_uv, mesh.triangle_uv, slack):
+    tolerance = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
+    shapes = ((stored.rest, mesh.rest, "at rest"), (stored.start, mesh.positions, "at the start"))
+    for before, after, shape in shapes:
+        if before is not None and (row := _largest_difference(before, after, tolerance)):
+            return f"vertex {row[0]} stands {row[1]:.3g} m off {shape}"
+    one_uv, corner_uv = vertex_uv(mesh) is not None, mesh.triangle_uv
+    if one_uv != (stored.uv is not None) or _largest_difference(stored.corner_uv, corner_uv, tolerance):
         return "other material coordinates"
     for name, group in stored.groups.items():
         if name in used and name in mesh.groups:
-            pairs = zip(_parts(group).values(), _parts(mesh.groups[name]).values(), strict=True)
-            if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
+            pairs = zip(_group_arrays(group).values(), _group_arrays(mesh.groups[name]).values(), strict=True)
+            if not all(np.array_equal(before, after) for before, after in pairs):
                 return f"group {name!r} has other members"
-    before = stored.obstacles if mesh.obstacles else {}
+    obstacles = stored.obstacles if mesh.obstacles else {}
     for name, surface in mesh.obstacles.items():
-        if name not in before:
+        if name not in obstacles:
             return f"obstacle {name!r} is new"
-        slack = ROUNDING * float(np.abs(surface.points).max())
-        same = np.array_equal(before[name].triangles, surface.triangles)
-        if not same or _apart(before[name].points, surface.points, slack):
+        tolerance = ROUNDING * float(np.abs(surface.points).max())
+        same = np.array_equal(obstacles[name].triangles, surface.triangles)
+        if not same or _largest_difference(obstacles[name].points, surface.points, tolerance):
             return f"obstacle {name!r} is another mesh"
     return ""
 
 
-def _apart(stored: NDArray[Any], ours: NDArray[Any], slack: float) -> tuple[int, float] | None:
-    """The row that differs most and by how much [m], if by more than ``slack``."""
-    distance = np.abs(stored - ours).reshape(len(ours), -1).max(axis=1)
+def _largest_difference(before: Array, after: Array, tolerance: float) -> tuple[int, float] | None:
+    """The row that differs most and its difference [m], or None if it is at most ``tolerance``."""
+    distance = np.abs(before - after).reshape(len(after), -1).max(axis=1)
     row = int(np.argmax(distance))
-    return (row, float(distance[row])) if distance[row] > slack else None
+    return (row, float(distance[row])) if distance[row] > tolerance else None

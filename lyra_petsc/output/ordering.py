@@ -14,18 +14,18 @@ from lyra_petsc.arrays import Ints
 
 
 class FileOrder:
-    """A plan that moves rows between their owners and contiguous slabs in file order.
+    """Communication plan between rows in the owners' numbering and contiguous slabs in file order.
 
-    Rank r of P holds slab ``[r N // P, (r + 1) N // P)`` of the N rows of a file. Both
-    directions are one ``Alltoallv``; no rank ever holds more than its rows and its slab.
+    Rank r of P has the slab ``[r N // P, (r + 1) N // P)`` of the N rows of a file. Each
+    direction is one ``Alltoallv``; no rank ever holds more than its rows and its slab.
 
     Parameters
     ----------
     comm : MPI.Comm
         All ranks that own rows or write; construction is collective.
     original : (n_owned,) int
-        Position in the file of each row this rank owns, in any order; may be empty. Together
-        the ranks name each of ``0 … n_global − 1`` exactly once.
+        Row number in the file of each row this rank owns, in any order; may be empty. Each of
+        ``0 … n_global − 1`` occurs on exactly one rank, once.
     n_global : int
         N, the number of rows in the file.
     """
@@ -54,7 +54,7 @@ class FileOrder:
         return int(self.starts[self.comm.rank + 1]) - self.start
 
     def to_slab(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Rows in the owner's numbering → this rank's slab of the file. Collective.
+        """This rank's slab of the file, from rows in the owners' numbering. Collective.
 
         Parameters
         ----------
@@ -66,14 +66,14 @@ class FileOrder:
         (n_slab, ...) array
         """
         arrived = self._exchange(np.take(rows, self._outgoing, axis=0), self._to_ranks, self._from_ranks)
-        if self.comm.size == 1:  # from one rank they come in order
+        if self.comm.size == 1:  # rows of a single rank arrive in file order
             return arrived
         slab = np.empty_like(arrived)
         slab[self._incoming] = arrived
         return slab
 
     def from_slab(self, slab: NDArray[Any]) -> NDArray[Any]:
-        """This rank's slab of the file → rows in the owner's numbering. Collective.
+        """The rows this rank owns, in its numbering, from the slabs of the file. Collective.
 
         Parameters
         ----------
@@ -90,16 +90,28 @@ class FileOrder:
         return rows
 
     def look_up(self, rows: NDArray[Any], numbers: Ints) -> NDArray[Any]:
-        """Of any file rows (n,), whatever rank owns them, what ``rows`` (n_owned, ...) hold. Collective."""
+        """Values of any rows of the file, also of rows that other ranks own. Collective.
+
+        Parameters
+        ----------
+        rows : (n_owned, ...) array
+            Values of the rows that this rank owns, in its numbering.
+        numbers : (n,) int64
+            Row numbers in the file.
+
+        Returns
+        -------
+        (n, ...) array
+        """
         slab = self.to_slab(rows)
         holder = np.searchsorted(self.starts, numbers, side="right") - 1
-        asked = [np.flatnonzero(holder == rank) for rank in range(self.comm.size)]
-        wanted = self.comm.alltoall([numbers[at] - self.starts[rank] for rank, at in enumerate(asked)])
-        answers = self.comm.alltoall([slab[at] for at in wanted])
-        found = np.empty((len(numbers), *slab.shape[1:]), dtype=slab.dtype)
-        for at, answer in zip(asked, answers, strict=True):
-            found[at] = answer
-        return found
+        by_rank = [np.flatnonzero(holder == rank) for rank in range(self.comm.size)]
+        requests = self.comm.alltoall([numbers[at] - self.starts[rank] for rank, at in enumerate(by_rank)])
+        answers = self.comm.alltoall([slab[at] for at in requests])
+        values = np.empty((len(numbers), *slab.shape[1:]), dtype=slab.dtype)
+        for at, answer in zip(by_rank, answers, strict=True):
+            values[at] = answer
+        return values
 
     def _exchange(
         self, rows: NDArray[Any], send: NDArray[np.int32], receive: NDArray[np.int32]
@@ -121,7 +133,7 @@ def _offsets(counts: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @contextmanager
 def row_type(rows: NDArray[Any]) -> Iterator[MPI.Datatype]:
-    """A row of an array for MPI: counting in rows keeps counts within 32 bits, whatever a row is wide."""
+    """MPI datatype of one row of an array; counts of rows, unlike counts of bytes, fit 32 bits."""
     width = rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
     kind = MPI.BYTE.Create_contiguous(width).Commit()
     try:

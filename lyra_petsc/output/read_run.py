@@ -1,4 +1,4 @@
-"""A run's folder, read by one process while the run goes on or afterwards."""
+"""Reading a run's folder in one process, during the run or afterwards."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.extras import require
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.errors import InputError, suggest
+from lyra_petsc.extras import require_packages
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, check_name, read_stored
+from lyra_petsc.output.stored import StoredMesh, check_file, check_file_name, check_folder, read_stored
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
@@ -31,25 +31,24 @@ if TYPE_CHECKING:
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 
-Place: TypeAlias = tuple[str, str]
-"""File, relative to the run's folder, and name of a dataset in it."""
+DatasetPath: TypeAlias = tuple[str, str]
+"""File name, relative to the run's folder, and name of a dataset in the file."""
 
 
 ENERGIES = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
-COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"})
-NAMES = frozenset({"obstacle"})
-"""Columns of whole numbers."""
+INTEGER_COLUMNS = frozenset({"step", *ITERATIONS})
+TEXT_COLUMNS = frozenset({"obstacle"})
 
-RECENT = 0.05
-"""Seconds; clocks of file systems are coarser than those of processors."""
+CLOCK_RESOLUTION = 0.05
+"""Upper bound of the resolution of a file system's time stamps [s]."""
 
-COLUMNS: dict[str, tuple[int, ...]] = {"velocity": (3,), "displacement": (3,)}
-"""Shape of a row of the fields that are vectors."""
+VECTOR_SHAPES: dict[str, tuple[int, ...]] = {"velocity": (3,), "displacement": (3,)}
+"""Shape of a row of each field that is a vector."""
 
 
 class StoredRun:
-    """The results of one run. Nothing is read before it is asked for, no file stays open.
+    """The results of one run. Data are read when they are first used, and no file stays open.
 
     Parameters
     ----------
@@ -60,33 +59,33 @@ class StoredRun:
     ----------
     folder : Path
     times : (n_states,) float64
-        When the states were written [s]; load factors in a static analysis.
+        Times of the states [s]; load factors in a static analysis.
     fields : tuple of str
-        What the states hold besides the positions.
+        Names of the states' fields besides the positions.
 
     Raises
     ------
     InputError
-        If it is not the folder of a run, or no state is written yet.
+        If the folder is not one of a run, or no state is written yet.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self._look()
+        self._load()
 
-    def _look(self) -> None:
+    def _load(self) -> None:
         self._stamp = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
-        # else it may change again at the same time of the file system's clock
+        # a file changed just now may change again without a new time stamp
         written = self._stamp[0][0] * 1e-9 if self._stamp[0] else 0.0
-        self._settled = abs(wall.time() - written) > RECENT
-        self._states: list[AnnouncedState] = announced_states(self.folder)
+        self._settled = abs(wall.time() - written) > CLOCK_RESOLUTION
+        self._states: list[AnnouncedState] = read_announced_states(self.folder)
         self.times: Array = np.array([state.time for state in self._states])
         first = self._states[0].fields
         # a run that was resumed with other fields has them in some states only
         self.fields = tuple(name for name in first if all(name in state.fields for state in self._states))
 
     def refresh(self) -> bool:
-        """See what a run that goes on has written meanwhile.
+        """Read the states again that a running simulation may have added.
 
         Returns
         -------
@@ -106,7 +105,7 @@ class StoredRun:
         if (states, mesh) == self._stamp and self._settled:
             return False
         before, same = self._states, mesh == self._stamp[1]
-        self._look()
+        self._load()
         return not same or self._states != before
 
     @property
@@ -124,7 +123,7 @@ class StoredRun:
 
     @cached_property
     def mesh(self) -> StoredMesh:
-        """What ``mesh.h5`` holds."""
+        """The content of ``mesh.h5``."""
         return StoredMesh(self.folder)
 
     @property
@@ -139,7 +138,7 @@ class StoredRun:
 
     @property
     def uv(self) -> Array | None:
-        """(V, 2) texture coordinates (``vt``) [m]; None if the mesh has none, or has seams."""
+        """(V, 2) texture coordinates (``vt``) [m]; None without them or with texture seams."""
         return self.mesh.uv if self.mesh.textured else None
 
     @property
@@ -152,8 +151,8 @@ class StoredRun:
     @property
     def positions(self) -> StateArrays:
         """(V, 3) [m] for each state."""
-        places = [state.position for state in self._states]
-        return StateArrays(self.folder, "positions", places, (len(self.rest), 3))
+        datasets = [state.position for state in self._states]
+        return StateArrays(self.folder, "positions", datasets, (len(self.rest), 3))
 
     @property
     def velocities(self) -> StateArrays:
@@ -161,7 +160,7 @@ class StoredRun:
         return self.field("velocity")
 
     def field(self, name: str) -> StateArrays:
-        """What the states hold under a name: (V,), (V, 3), (F,) or (F, 6) for each.
+        """A field of the states by its name; (V,), (V, 3), (F,) or (F, 6) for each state.
 
         ``stress`` and ``green_strain`` are (F, 6), uu, uv, uw, vv, vw, ww in material axes (u along the warp,
         w normal to the sheet); in older folders (F, 3), uu, vv, uv.
@@ -169,20 +168,20 @@ class StoredRun:
         Raises
         ------
         InputError
-            If they do not hold it.
+            If the states do not hold the field.
         """
         if name not in self.fields:
-            what = nearest(name, self.fields) if self.fields else "the states hold positions alone"
+            hint = suggest(name, self.fields) if self.fields else "the states hold positions alone"
             raise InputError(
-                f"no field {name!r}, {what}; a scene's output.fields names them", file=self.folder
+                f"no field {name!r}, {hint}; a scene's output.fields names them", file=self.folder
             )
         first = self._states[0].fields[name]
-        places = [state.fields[name].place for state in self._states]
+        datasets = [state.fields[name].dataset for state in self._states]
         rows = self.rest if first.on == "vertex" else self.triangles
-        return StateArrays(self.folder, name, places, (len(rows), *first.columns))
+        return StateArrays(self.folder, name, datasets, (len(rows), *first.columns))
 
     def field_units(self, name: str) -> str:
-        """Unit of a field, as in ``N/m``; ``1`` for plain numbers."""
+        """Unit of a field, as in ``N/m``; ``1`` for dimensionless fields."""
         from lyra_petsc.scene.schema import FIELD_UNITS
 
         if name not in {"position", *FIELD_UNITS}:
@@ -194,7 +193,7 @@ class StoredRun:
         return self._states[0].fields[name].on
 
     def at(self, time: float) -> int:
-        """Number of the state nearest to a time [s]."""
+        """Index of the state nearest to a time [s]."""
         return int(np.abs(self.times - time).argmin())
 
     def dataset(self, every: int = 1) -> Any:
@@ -203,9 +202,9 @@ class StoredRun:
         Parameters
         ----------
         every : int
-            Take every so manieth state.
+            Take every n-th state.
         """
-        require("dataset", ("xarray",), "export")
+        require_packages("dataset", ("xarray",), "export")
         import xarray
 
         def variable(name: str, last: tuple[str, ...], arrays: StateArrays) -> tuple[Any, ...]:
@@ -214,7 +213,7 @@ class StoredRun:
 
         content = {"position": variable("position", ("axis",), self.positions)}
         for name in self.fields:
-            last = "axis" if name in COLUMNS else "component" if name in TENSORS else ""
+            last = "axis" if name in VECTOR_SHAPES else "component" if name in TENSORS else ""
             content[name] = variable(name, (last,) if last else (), self.field(name))
         content["rest"] = (("vertex", "axis"), self.rest, {"units": "m"})
         content["triangles"] = (("triangle", "corner"), self.triangles, {})
@@ -249,12 +248,12 @@ class StoredRun:
 
     @property
     def probes(self) -> Any:
-        """probes.csv [m]; empty if the scene has none."""
+        """probes.csv [m]; empty if the scene has no probes."""
         return as_frame(self._table("probes.csv"))
 
     @property
     def obstacles(self) -> Any:
-        """obstacles.csv, a row for each obstacle and step [N], [N·m]; empty if the scene has none."""
+        """obstacles.csv, a row for each obstacle and step [N], [N·m]; empty if the scene has no obstacles."""
         return as_frame(self._table("obstacles.csv"))
 
     @cached_property
@@ -269,24 +268,24 @@ class StoredRun:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene as understood; its mesh files need not be there any more."""
+        """The scene from scene.yaml; its mesh files are not needed."""
         from lyra_petsc.scene.load import load_scene
 
         return load_scene(self.folder / "scene.yaml", meshes_needed=False)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """summary.json; empty if there is none."""
+        """summary.json; empty if the file is missing."""
         return read_summary(self.folder / "summary.json")
 
     @property
     def finished(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run was completed."""
         return bool(self.summary.get("outcome") == "done")
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """A mark that changes when a file is replaced or changed."""
+    """Time stamp, size and inode of a file, which change when the file is replaced or changed."""
     try:
         status = path.stat()
     except OSError:
@@ -296,9 +295,9 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 @dataclass(frozen=True)
 class AnnouncedField:
-    """Where an array of a state is, what its rows belong to (``vertex``, ``triangle``), and their shape."""
+    """A field of a state: its dataset, what the rows belong to (``vertex``, ``triangle``), a row's shape."""
 
-    place: Place
+    dataset: DatasetPath
     on: str
     columns: tuple[int, ...]
 
@@ -312,23 +311,23 @@ class AnnouncedState:
     time : float
         [s], or the load factor of a static analysis.
     position : tuple of str
-        Where the positions are.
+        File and dataset of the positions.
     fields : mapping of str to AnnouncedField
-        What else the state holds.
+        The other arrays of the state.
     """
 
     time: float
-    position: Place
+    position: DatasetPath
     fields: Mapping[str, AnnouncedField]
 
 
-def announced_states(folder: Path) -> list[AnnouncedState]:
-    """The states of a run in the order of time.
+def read_announced_states(folder: Path) -> list[AnnouncedState]:
+    """The states that states.xdmf lists, in the order of time.
 
     Raises
     ------
     InputError
-        If the folder is none of a run, nothing is written yet, or the announcement is damaged.
+        If the folder is not one of a run, no state is written yet, or states.xdmf is damaged.
     """
     path = folder / XDMF_FILE
     check_folder(folder)
@@ -336,7 +335,7 @@ def announced_states(folder: Path) -> list[AnnouncedState]:
         root = parse(path).getroot()
         states = [_state(grid) for grid in root.iterfind("./Domain/Grid/Grid")]
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(_absent(folder), file=folder) from None
+        raise InputError(_missing_reason(folder), file=folder) from None
     except OSError as error:
         raise InputError(f"cannot be read: {reason(error)}", file=path) from None
     except (ParseError, ValueError, LookupError, AttributeError, RecursionError):
@@ -344,12 +343,12 @@ def announced_states(folder: Path) -> list[AnnouncedState]:
     if not states:
         raise InputError("no state is written yet", file=folder)
     for state in states:
-        for name, _ in (state.position, *(field.place for field in state.fields.values())):
-            check_name(name, path)
+        for name, _ in (state.position, *(field.dataset for field in state.fields.values())):
+            check_file_name(name, path)
     return states
 
 
-def _absent(folder: Path) -> str:
+def _missing_reason(folder: Path) -> str:
     if not folder.exists():
         return "no such folder; give the folder of a run, as in runs/flag"
     if not folder.is_dir():
@@ -368,22 +367,22 @@ def _state(grid: Element) -> AnnouncedState:
         raise ValueError
     attributes = {each.attrib["Name"]: each for each in grid.iterfind("Attribute")}
     fields = {name: _field(name, each) for name, each in attributes.items() if name != "rest"}
-    return AnnouncedState(seconds, _place(geometry), fields)
+    return AnnouncedState(seconds, _dataset_path(geometry), fields)
 
 
 def _field(name: str, element: Element) -> AnnouncedField:
-    columns = COLUMNS.get(name, ())
+    columns = VECTOR_SHAPES.get(name, ())
     if name in TENSORS:
         item = element.find("DataItem")
         columns = (int(item.attrib["Dimensions"].split()[-1]) if item is not None else 0,)
         if columns[0] not in COMPONENTS:
             raise ValueError
     return AnnouncedField(
-        _place(element), "triangle" if element.get("Center") == "Cell" else "vertex", columns
+        _dataset_path(element), "triangle" if element.get("Center") == "Cell" else "vertex", columns
     )
 
 
-def _place(element: Element) -> Place:
+def _dataset_path(element: Element) -> DatasetPath:
     file, colon, dataset = (element.findtext("DataItem") or "").strip().rpartition(":")
     if not colon:
         raise ValueError
@@ -391,26 +390,28 @@ def _place(element: Element) -> Place:
 
 
 class StateArrays(Sequence[NDArray[Any]]):
-    """One array of every state: ``[i]`` reads the array of one, ``[i:j]`` selects states, unread.
+    """One array of every state: ``[i]`` reads the array of state i, ``[i:j]`` selects states without reading.
 
-    ``numpy.asarray`` of it reads them all, stacked along a first axis.
+    ``numpy.asarray`` reads all states, stacked along a first axis.
 
     Parameters
     ----------
     folder : Path
         The run's folder.
     name : str
-    places : sequence of (str, str)
+    datasets : sequence of (str, str)
         File and dataset of each state.
     shape : tuple of int
-        Of the array of one state.
+        Shape of the array of one state.
     """
 
-    def __init__(self, folder: Path, name: str, places: Sequence[Place], shape: tuple[int, ...]) -> None:
-        self._folder, self._name, self._places, self._shape = folder, name, places, shape
+    def __init__(
+        self, folder: Path, name: str, datasets: Sequence[DatasetPath], shape: tuple[int, ...]
+    ) -> None:
+        self._folder, self._name, self._datasets, self._shape = folder, name, datasets, shape
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._datasets)
 
     @overload
     def __getitem__(self, index: int) -> NDArray[Any]: ...
@@ -419,22 +420,22 @@ class StateArrays(Sequence[NDArray[Any]]):
     def __getitem__(self, index: slice) -> StateArrays: ...
 
     def __getitem__(self, index: int | slice) -> NDArray[Any] | StateArrays:
-        """Read the array of a state, or choose states.
+        """Read the array of a state, or select states by a slice.
 
         Raises
         ------
         IndexError
-            If there is no such state.
+            If the state does not exist.
         InputError
-            If its file is gone or damaged.
+            If its file is missing or damaged.
         """
         if isinstance(index, slice):
-            return StateArrays(self._folder, self._name, self._places[index], self._shape)
-        file, dataset = self._places[index]
+            return StateArrays(self._folder, self._name, self._datasets[index], self._shape)
+        file, dataset = self._datasets[index]
         return read_stored(self._folder / file, dataset, self._shape)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        if not self._places:
+        if not self._datasets:
             raise ValueError(f"no states of {self._name} to stack")
         return np.stack([np.asarray(array, dtype=dtype) for array in self])
 
@@ -448,18 +449,18 @@ def read_history(folder: Path) -> Columns:
 
 
 def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
-    """The columns of a table, without a last row that is not whole yet.
+    """The columns of a table, without a last row that is still incomplete.
 
     Parameters
     ----------
     path : Path
     needed : sequence of str
-        Columns that it must have.
+        Required columns.
 
     Raises
     ------
     InputError
-        If it is missing or damaged, or has no row.
+        If the file is missing, damaged or without rows.
     """
     check_file(path)
     try:
@@ -474,12 +475,11 @@ def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
             raise ValueError("rows of different lengths")
         if lacking := [name for name in needed if name not in header]:
             raise ValueError(f"no column {lacking[0]}")
-        columns = {
-            name: np.array([row[i] for row in rows])
-            if name in NAMES
-            else np.array([row[i] for row in rows], dtype="U64").astype(np.int64 if name in COUNTS else float)
-            for i, name in enumerate(header)
-        }
+        columns: Columns = {}
+        for i, name in enumerate(header):
+            column = np.array([row[i] for row in rows], dtype=None if name in TEXT_COLUMNS else "U64")
+            number = np.int64 if name in INTEGER_COLUMNS else np.float64
+            columns[name] = column if name in TEXT_COLUMNS else column.astype(number)
     except (ValueError, OverflowError, csv.Error) as error:
         raise InputError(f"is damaged: {reason(error)}", file=path) from None
     if not rows:
@@ -491,7 +491,7 @@ def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
 
 
 def as_frame(columns: Columns) -> Any:
-    """A pandas frame where pandas is installed, else the columns as they are."""
+    """A pandas frame if pandas is installed, else the columns unchanged."""
     if importlib.util.find_spec("pandas") is None:
         return columns
     import pandas

@@ -1,4 +1,4 @@
-"""The files of a run: states, checkpoints, history and other tables; every method is collective."""
+"""Writes the files of a run: states, checkpoints, history and other tables. Every method is collective."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason, replace_text
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
-from lyra_petsc.output.fields import Field, chosen
+from lyra_petsc.output.fields import Field, chosen_fields
+from lyra_petsc.output.file_operations import reason, replace_text
 from lyra_petsc.output.hdf5 import Background, NewFile, read_slab, write_collective
 from lyra_petsc.output.history import (
     HISTORY_COLUMNS,
@@ -26,7 +26,7 @@ from lyra_petsc.output.history import (
 )
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateInTime, StateWriter, remove_failure, write_failure
+from lyra_petsc.output.states import FailureState, StateWriter, remove_failure, write_failure
 from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.tensors import plane_components
 from lyra_petsc.output.xdmf import group_name
@@ -36,18 +36,19 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_memory
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
-MOST_CHANGES = 12
-"""Changes of a resumed scene that are listed one by one."""
+MAX_LISTED_CHANGES = 12
+"""Maximum number of a resumed scene's changes that are listed one by one."""
 
-CHEAP = 100.0
-"""Time since the last checkpoint, over the time that took (with a state, if one was due), from which on
-another is written."""
+MIN_COST_RATIO = 100.0
+"""A checkpoint is also written if the time since the last one is this many times the last one's duration.
+
+The duration includes the writing of a state, if one was written together with the checkpoint."""
 
 
 class Recorder:
-    """Writes what a scene asks for.
+    """Writes the files that a scene requests.
 
-    Construction checks and plans, and touches no file; ``begin`` or ``resume`` opens them.
+    Construction only checks the requests; ``begin`` or ``resume`` opens the files.
 
     Parameters
     ----------
@@ -56,18 +57,18 @@ class Recorder:
     Attributes
     ----------
     changes : list of Change
-        What the scene says otherwise than the one that the run was begun with, after ``resume``.
+        After ``resume``: differences between the scene and the one that the run was begun with.
 
     Raises
     ------
     InputError
-        For a field that the scene cannot have.
+        For a field that cannot be computed in the scene.
     """
 
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
         problem = simulation.problem
-        self._fields: list[Field] = chosen(problem)
+        self._fields: list[Field] = chosen_fields(problem)
         points = problem.points
         self._vertices = FileOrder(points.comm, points.mesh_vertices, points.n_vertices_global)
         self._edges: FileOrder | None = None
@@ -81,7 +82,7 @@ class Recorder:
         self._comm = points.comm
         self._background = Background(points.comm)
         self._last_checkpoint = clock.monotonic()
-        self._steps_since = 0
+        self._steps_since_checkpoint = 0
         self._last_state = -1
         self._checkpoint_seconds = 0.0
         self.changes: list[Change] = []
@@ -89,7 +90,7 @@ class Recorder:
     # -- opening -------------------------------------------------------------------------------------
 
     def begin(self, folder: Path) -> None:
-        """Write the mesh, the scene as understood, the initial state, row and checkpoint."""
+        """Write the mesh, the completed scene, and the initial state, table rows and checkpoint."""
         simulation = self._simulation
         problem = simulation.problem
         scene = problem.scene
@@ -98,23 +99,23 @@ class Recorder:
         self._open(folder, None)
         self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
         self.write_state()
-        self.settle()
+        self.flush()
 
     def resume(self, folder: Path) -> None:
-        """Put the newest checkpoint into the simulation and cut the files behind it.
+        """Restore the simulation from the newest checkpoint and remove later states and rows.
 
         Raises
         ------
         InputError
-            If the run in the folder cannot go on with this scene; the folder is untouched.
+            If the run in the folder cannot continue with this scene; the folder is left unchanged.
         """
         simulation = self._simulation
         problem, scene = simulation.problem, simulation.scene
-        check_same_mesh(folder, problem.mesh, _groups(scene), self._comm)
+        check_same_mesh(folder, problem.mesh, _used_groups(scene), self._comm)
         checkpoint = read_checkpoint(folder, self._vertices, self._edges)
-        on_root(self._comm, lambda: self._check_kind(folder, checkpoint))
+        on_root(self._comm, lambda: self._check_continuable(folder, checkpoint))
         try:
-            self._put(checkpoint)
+            self._restore(checkpoint)
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(
                 f"checkpoint is damaged, or was written by another version ({reason(error)}): "
@@ -127,14 +128,14 @@ class Recorder:
         if problem.start is not None:
             problem.start = self._first_positions(folder, otherwise=problem.start)
         self._open(folder, simulation.step_number)
-        history, last = self._opened["history.csv"], simulation.step_number
+        history, last = self._tables["history.csv"], simulation.step_number
         if (kept := history.kept_until) != last:
             simulation.notes.append(f"{history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._last_state = int(checkpoint.scalars["last_state"])
 
     def _first_positions(self, folder: Path, *, otherwise: Array) -> Array:
-        """Positions [m] of this rank's vertices in state 0; the scene's start where that cannot be read."""
+        """Positions [m] of this rank's vertices in state 0, or ``otherwise`` if state 0 cannot be read."""
         file, name, order = folder / "states-0000.h5", f"{group_name(0)}/position", self._vertices
 
         def readable() -> bool:
@@ -147,8 +148,8 @@ class Recorder:
             return otherwise
         return order.from_slab(read_slab(file, name, order))
 
-    def _put(self, checkpoint: Checkpoint) -> None:
-        """Put a checkpoint into the simulation."""
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        """Restore the simulation from a checkpoint."""
         simulation, memory = self._simulation, checkpoint.scalars
         system, layout = simulation.problem.system, simulation.problem.points
         arrays = {
@@ -160,15 +161,23 @@ class Recorder:
         system.state.set(arrays["position"], arrays["velocity"])
         terms = simulation.problem.terms
         elements = {
-            name: self._elements(terms[name].registration.element_vertices, rows)
+            name: self._changing_elements(terms[name].registration.element_vertices, rows)
             for name, rows in checkpoint.elements.items()
             if name in terms
         }
         simulation.resume(memory, arrays, checkpoint.edges, elements)
-        int(memory["last_state"])
+        int(memory["last_state"])  # a bad entry must raise here, where `resume` catches it
 
-    def _elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
-        """Vertices (E, n) of elements of a checkpoint, by global numbers, and what it holds of them."""
+    def _changing_elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
+        """Changing elements from a checkpoint's rows (E, n + m).
+
+        Returns
+        -------
+        vertices : (E, n) int64
+            Global numbers of each element's vertices.
+        data : (E, m) float64
+            The other columns.
+        """
         layout = self._simulation.problem.points
         numbers = rows[:, :n].astype(np.int64)
         known = bool(((numbers >= 0) & (numbers < layout.n_vertices_global)).all())
@@ -177,8 +186,8 @@ class Recorder:
         own = layout.start + np.arange(layout.n_vertices)
         return self._vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
 
-    def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
-        """Refuse a scene that cannot continue from the checkpoint (rank 0)."""
+    def _check_continuable(self, folder: Path, checkpoint: Checkpoint) -> None:
+        """Check that the scene can continue from the checkpoint (rank 0)."""
         now = self._simulation.scene.time.scheme
         before = checkpoint.scalars.get("scheme", now)
         if "static" in (now, before) and now != before:
@@ -187,18 +196,18 @@ class Recorder:
                 file=checkpoint.file,
                 key="time.analysis",
             )
-        for name, columns in self._tables().items():
+        for name, columns in self._table_columns().items():
             check_columns(folder / name, columns)
 
     def _note_changes(self, before: Path) -> None:
-        """Note in which keys the scene differs from the one in the folder."""
+        """Add notes for the user on the keys in which the scene differs from the one in the folder."""
         scene, notes = self._simulation.scene, self._simulation.notes
         try:
             self.changes = on_root(self._comm, lambda: scene_changes(before, scene))
         except InputError as error:
             notes.append(f"{error}; what has changed since the run was begun is not known")
             return
-        for change in self.changes[:MOST_CHANGES]:
+        for change in self.changes[:MAX_LISTED_CHANGES]:
             if change.key == "time.end":
                 notes.append(str(change))
             elif change.key == "time.integrator":
@@ -207,14 +216,14 @@ class Recorder:
                 )
             else:
                 notes.append(f"changed since the run was begun: {change}")
-        if len(self.changes) > MOST_CHANGES:
-            notes.append(f"and {len(self.changes) - MOST_CHANGES} more changes, listed in summary.json")
+        if len(self.changes) > MAX_LISTED_CHANGES:
+            notes.append(f"and {len(self.changes) - MAX_LISTED_CHANGES} more changes, listed in summary.json")
 
-    def _tables(self) -> dict[str, tuple[str, ...]]:
-        """Names and columns of the tables that the scene asks for."""
+    def _table_columns(self) -> dict[str, tuple[str, ...]]:
+        """Columns of each table that the scene requests, by file name."""
         scene, system = self._simulation.scene, self._simulation.problem.system
-        more = tuple(self._simulation.ledger.column_names)
-        tables: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *more)}
+        term_columns = tuple(self._simulation.ledger.column_names)
+        tables: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *term_columns)}
         if scene.probes:
             tables["probes.csv"] = vector_columns(list(scene.probes))
         if scene.output.reactions and scene.handles:
@@ -237,16 +246,16 @@ class Recorder:
             vtkhdf=self._simulation.scene.output.vtkhdf,
             background=self._background,
         )
-        self._opened = {
+        self._tables = {
             name: History(folder / name, columns, self._comm, resume_after=resume_after)
-            for name, columns in self._tables().items()
+            for name, columns in self._table_columns().items()
         }
 
     # -- a step --------------------------------------------------------------------------------------
 
     def record(self, report: StepReport) -> None:
-        """Write all that the step just accepted requires, partly in the background of the next steps."""
-        self._steps_since += 1
+        """Write the rows, state and checkpoint due after an accepted step; files may be completed later."""
+        self._steps_since_checkpoint += 1
         due = self._write_row(report)
         control = self._simulation.control
         if control.writes_at(report.time) or self._simulation.finished:
@@ -254,20 +263,20 @@ class Recorder:
         elif due:
             self.write_checkpoint()
 
-    def _due(self) -> bool:
+    def _checkpoint_is_due(self) -> bool:
         """Whether a checkpoint is due, by steps or by wall time (rank 0).
 
-        Also where it costs next to nothing beside the steps since the last one: a step of minutes is
-        then not lost to a launcher that leaves a second to finish.
+        It is also due if its cost is negligible compared with the time since the last one, so that a step
+        of minutes is not lost if the launcher kills the run a second after its signal.
         """
         asked = self._simulation.scene.output.checkpoint
-        if asked.steps is not None and self._steps_since >= asked.steps:
+        if asked.steps is not None and self._steps_since_checkpoint >= asked.steps:
             return True
         elapsed = clock.monotonic() - self._last_checkpoint
-        return elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
+        return elapsed >= asked.seconds or elapsed >= MIN_COST_RATIO * self._checkpoint_seconds
 
     def _write_row(self, report: StepReport) -> bool:
-        """A row of each table; whether a checkpoint is due, by rank 0's clock."""
+        """Write the step's rows to all tables; returns whether a checkpoint is due by rank 0's clock."""
         budget = self._simulation.budget
         history: dict[str, float | str] = {
             **asdict(report),
@@ -280,28 +289,28 @@ class Recorder:
             **self._simulation.ledger.columns(),
         }
         rows, ledger = {"history.csv": [history]}, self._simulation.ledger
-        if "probes.csv" in self._opened:
+        if "probes.csv" in self._tables:
             means = {f"{name}_": mean for name, mean in self._probe_means().items()}
-            rows["probes.csv"] = [self._vectors(report, means)]
-        if "reactions.csv" in self._opened:
-            pulls = ledger.handle_forces(len(self._simulation.scene.handles))
-            forces = {f"handle{n}_": force for n, force in enumerate(pulls)}
+            rows["probes.csv"] = [self._vector_row(report, means)]
+        if "reactions.csv" in self._tables:
+            handle_forces = ledger.handle_forces(len(self._simulation.scene.handles))
+            forces = {f"handle{n}_": force for n, force in enumerate(handle_forces)}
             moments = {f"handle{n}_m": moment for n, moment in ledger.handle_moments().items()}
-            rows["reactions.csv"] = [self._vectors(report, forces | moments)]
+            rows["reactions.csv"] = [self._vector_row(report, forces | moments)]
         if names := list(self._simulation.scene.obstacles or {}):
-            pushes = zip(names, ledger.obstacle_forces(len(names)), strict=True)
-            rows["obstacles.csv"] = [_push(report, *each) for each in pushes]
+            loads = zip(names, ledger.obstacle_forces(len(names)), strict=True)
+            rows["obstacles.csv"] = [_obstacle_row(report, *each) for each in loads]
 
         def work() -> bool:
             for name, lines in rows.items():
-                self._opened[name].append(*lines)
-            return self._due()
+                self._tables[name].append(*lines)
+            return self._checkpoint_is_due()
 
         return bool(on_root(self._comm, work))
 
     @staticmethod
-    def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float | str]:
-        """A row with the components of vectors, each named by the vector and the axis."""
+    def _vector_row(report: StepReport, vectors: dict[str, Array]) -> dict[str, float | str]:
+        """A table row with the components of vectors; a column's name is the vector's and the axis."""
         row: dict[str, float | str] = {"step": report.step, "time": report.time}
         for name, vector in vectors.items():
             row |= {f"{name}{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
@@ -321,7 +330,7 @@ class Recorder:
     # -- states --------------------------------------------------------------------------------------
 
     def write_state(self) -> None:
-        """Write the present state, to be announced, unless it is written already, and a checkpoint of it."""
+        """Write and announce the present state, unless it is written already, and its checkpoint."""
         simulation = self._simulation
         if simulation.step_number == self._last_state:
             self.write_checkpoint()
@@ -337,18 +346,18 @@ class Recorder:
                 simulation.time,
                 problem.system.x[: problem.points.n_vertices],
                 {field.name: (field.on, value) for field, value in values.items()},
-                beside=[checkpoint],  # what is announced is not written again after a kill
+                other_files=[checkpoint],  # so a run resumed after a kill does not write the state again
             )
         self._last_state = simulation.step_number
 
     def write_checkpoint(self) -> None:
-        """Replace the checkpoint by the present state."""
+        """Write a checkpoint of the present state."""
         with self._checkpoint(self._last_state) as checkpoint:
             write_collective([checkpoint], self._comm, self._background)
 
     @contextmanager
     def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
-        """A checkpoint of the present state, to be written within the context."""
+        """A context that gives the checkpoint of the present state, in which the caller writes it."""
         simulation = self._simulation
         system, layout = simulation.problem.system, simulation.problem.points
         n = layout.n_owned
@@ -367,53 +376,53 @@ class Recorder:
         elements = term_memory.of_elements(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
         self._last_checkpoint = clock.monotonic()
-        self._steps_since = 0
+        self._steps_since_checkpoint = 0
         self._checkpoint_seconds = self._last_checkpoint - began
 
     def write_failure(self) -> None:
-        """Write why the last step could not be taken: the state before it and the failing iterate."""
+        """Write the files on a failed step: its cause, the state before it and the failing iterate."""
         simulation, failure = self._simulation, self._simulation.failure
         assert failure is not None
         system, n = simulation.problem.system, simulation.problem.points.n_vertices
         stuck = failure.stuck.of_vertices(n)
-        before = {"velocity": system.v[:n]}  # the equations of the failed step do not hold it
+        before = {"velocity": system.v[:n]}  # the equations of the failed step do not store it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
-        # a number that is not finite has no place in space
+        # positions that are not finite could not be drawn
         position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])
         write_failure(
             self._folder,
             self._vertices,
             simulation.problem.outline.n_triangles,
             simulation.step_number,
-            (StateInTime(failure.time, system.x[:n], before), StateInTime(stuck.time, position, failing)),
+            (FailureState(failure.time, system.x[:n], before), FailureState(stuck.time, position, failing)),
             failure.text,
         )
 
-    def settle(self) -> None:
-        """Return when all that was written is on the disk and announced.
+    def flush(self) -> None:
+        """Wait until all states and checkpoints are on disk and announced.
 
         Raises
         ------
         OutputError
-            If it could not be; what was announced before stands.
+            If a file could not be written; states announced before are kept.
         """
-        self._background.settle()
+        self._background.wait()
         self._states.finish()
 
     def close(self) -> None:
-        """Close the tables; for one rank. Errors of what is still being written are raised by `settle`."""
+        """Close the tables; not collective. Errors of files in the background are raised by `flush` only."""
         self._background.close()
-        for table in self._opened.values():
+        for table in self._tables.values():
             table.close()
 
 
-def _push(report: StepReport, name: str, push: Array) -> dict[str, float | str]:
-    """A row of obstacles.csv, of a force and a torque (6,)."""
-    values: list[float | str] = [report.step, report.time, name, *map(float, push)]
+def _obstacle_row(report: StepReport, name: str, load: Array) -> dict[str, float | str]:
+    """A row of obstacles.csv; ``load`` (6,) is the force [N] and the torque [N·m] on an obstacle."""
+    values: list[float | str] = [report.step, report.time, name, *map(float, load)]
     return dict(zip(OBSTACLE_COLUMNS, values, strict=True))
 
 
-def _groups(scene: Scene) -> set[str]:
+def _used_groups(scene: Scene) -> set[str]:
     """Names of the mesh's groups that a scene uses."""
     selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
     names = {block.group for block in scene.material} | {selector.group for selector in selectors}

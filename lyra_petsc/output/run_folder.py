@@ -1,4 +1,4 @@
-"""The folder of a run or a study: chosen before anything is done, then created, locked and cleared."""
+"""The folder of a run or a study: chosen before any work, then created, locked and cleaned."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.stored import check_folder, open_own
+from lyra_petsc.output.file_operations import HDF5_ERRORS, reason
+from lyra_petsc.output.stored import check_folder, open_contained
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ CHECKPOINT = "checkpoint.h5"
 PREVIOUS = "checkpoint-previous.h5"
 NEXT = "checkpoint-next.h5"
 
-# what a run writes, and nothing else: --force removes no other file
+# all files that a run writes, and no other names: --force removes these files only
 RESULT = re.compile(
     r"(states-\d{4,}\.h5|(mesh|cells)\.h5|checkpoint(-previous|-next)?\.h5|states\.(xdmf|vtkhdf)"
     r"|(history|probes|reactions|obstacles)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
@@ -42,79 +42,79 @@ def checkpoint_files(folder: str | os.PathLike[str]) -> list[Path]:
     return [file for file in files if file.is_file()]
 
 
-def present(name: str, folder: Path) -> list[Path]:
-    """The file of this name in a folder, if it is there."""
+def existing_files(name: str, folder: Path) -> list[Path]:
+    """The file of this name in a folder as a list; empty if it does not exist."""
     return [*folder.glob(name)]
 
 
 def _check_resumable(folder: Path) -> None:
-    """Refuse to resume where files of the run are links or checkpoints take data from other files."""
+    """Refuse to resume if files of the run are links or checkpoints take data from other files."""
     check_folder(folder)
     for file in checkpoint_files(folder):
-        with suppress(*HDF5_ERRORS), open_own(file):  # a damaged one has one before it
+        with suppress(*HDF5_ERRORS), open_contained(file):  # if one is damaged, the previous one is read
             pass
 
 
 @dataclass(frozen=True)
 class FolderKind:
-    """The purpose of a folder: a run or a study.
+    """The kind of a folder: of a run, a study or a fit.
 
     Attributes
     ----------
-    what : str
-        In a word.
+    noun : str
+        Name of the kind in messages, as in ``run``.
     parent : Path
-        Where folders are that the user does not name.
+        Parent of folders that the user does not name.
     lock : str
-        Name of the file that is locked.
+        Name of the lock file.
     result : re.Pattern
-        Names of the files that are written; ``--force`` removes no other file.
+        Names of the result files; ``--force`` removes no other file.
     resumable : callable
-        The files of a folder from which it goes on; empty if it cannot.
-    lacks : str
-        What is missing then, in words.
+        Returns the files from which a folder can be resumed; empty if there are none.
+    lack : str
+        Text for messages: the file that is missing if a folder cannot be resumed.
     check : callable, optional
-        Refuses a folder that cannot go on all the same.
+        Further check of a folder to be resumed, which raises InputError.
     folders : tuple of str
-        Names of folders that ``--force`` removes.
+        Names of subfolders that ``--force`` removes.
     """
 
-    what: str
+    noun: str
     parent: Path
     lock: str
     result: re.Pattern[str]
     resumable: Callable[[Path], list[Path]]
-    lacks: str
+    lack: str
     check: Callable[[Path], None] | None = None
     folders: tuple[str, ...] = ()
 
-    def exists(self, path: Path, key: str) -> InputError:
-        """The refusal of a folder that is there."""
+    def exists_error(self, path: Path, key: str) -> InputError:
+        """The error for a folder that exists already."""
         return InputError(
-            f"exists; name another folder, or give --resume to go on with its {self.what} or --force to "
+            f"exists; name another folder, or give --resume to go on with its {self.noun} or --force to "
             "replace it",
             file=path,
             key=key,
         )
 
     def newest(self, stem: str) -> Path:
-        """The folder of a scene that was worked on last.
+        """The most recently written resumable folder of a scene.
 
         Raises
         ------
         InputError
-            If there is none that can go on.
+            If the scene has no resumable folder.
         """
-        ours = re.compile(re.escape(stem) + r"(-\d+)?")
+        of_scene = re.compile(re.escape(stem) + r"(-\d+)?")
         folders = self.parent.iterdir() if self.parent.is_dir() else []
         ages = [
             (max(file.stat().st_mtime for file in files), path)
             for path in folders
-            if ours.fullmatch(path.name) and (files := self.resumable(path))
+            if of_scene.fullmatch(path.name) and (files := self.resumable(path))
         ]
         if not ages:
             raise InputError(
-                f"no {self.what} of {stem} under {self.parent} that can go on; run without --resume",
+                f"no {self.noun} of {stem} under {self.parent} that can go on; run without --resume",
                 key="--resume",
             )
         return max(ages)[1]
@@ -134,14 +134,14 @@ class FolderChoice:
     path : Path
         The folder as the user would write it.
     resume : bool
-        It holds a run that goes on.
+        The folder holds a run to be resumed.
     given : bool
-        Named by the user or taken over with ``--force``; otherwise another name is found if
-        this one is taken meanwhile.
+        The user named the folder or gave ``--force``; otherwise another name is chosen if another
+        process creates the folder first.
     force : bool
-        Results that stand there are replaced.
+        Results in the folder are replaced.
     first : Path or None
-        What a name found for it is counted on from.
+        The name without a number, if the name of the folder may get one (``…-2``, ``…-3``).
     kind : FolderKind
     """
 
@@ -153,7 +153,7 @@ class FolderChoice:
     kind: FolderKind = RUN
 
 
-def choose(
+def choose_folder(
     comm: MPI.Comm,
     scene_stem: str,
     out: str | os.PathLike[str] | None = None,
@@ -162,7 +162,7 @@ def choose(
     resume: bool = False,
     kind: FolderKind = RUN,
 ) -> FolderChoice:
-    """Decide on the folder without touching the disk; rank 0 decides for all.
+    """Choose the folder without creating it; rank 0 chooses for all. Collective.
 
     Parameters
     ----------
@@ -182,10 +182,10 @@ def choose(
     InputError
         On every rank, if the folder cannot be used.
     """
-    return on_root(comm, lambda: _choose(kind, scene_stem, out, force, resume))
+    return on_root(comm, lambda: _choose_folder(kind, scene_stem, out, force, resume))
 
 
-def _choose(
+def _choose_folder(
     kind: FolderKind, stem: str, out: str | os.PathLike[str] | None, force: bool, resume: bool
 ) -> FolderChoice:
     if force and resume:
@@ -205,37 +205,43 @@ def _choose(
             raise InputError("is empty; give the folder to write to", key=key)
         choice = FolderChoice(Path(out), resume=resume, given=True, force=force, kind=kind)
     try:
-        _check(choice, key)
+        _check_choice(choice, key)
     except OSError as error:
         raise InputError(f"cannot be used: {reason(error)}", file=choice.path, key=key) from error
     return choice
 
 
-def _check(choice: FolderChoice, key: str) -> None:
+def _check_choice(choice: FolderChoice, key: str) -> None:
     path, kind = choice.path, choice.kind
     if os.path.lexists(path) and not path.is_dir():
         raise InputError("is a file; name a folder", file=path, key=key)
     if choice.resume:
         if not path.is_dir():
             raise InputError(
-                f"does not exist, so there is no {kind.what} to resume", file=path, key="--resume"
+                f"does not exist, so there is no {kind.noun} to resume", file=path, key="--resume"
             )
         if not kind.resumable(path):
-            raise InputError(f"holds {kind.lacks}; run without --resume", file=path, key="--resume")
+            raise InputError(f"holds {kind.lack}; run without --resume", file=path, key="--resume")
         if kind.check is not None:
             kind.check(path)
     elif choice.given and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
-        raise kind.exists(path, key)
+        raise kind.exists_error(path, key)
     check_creatable(path, key)
 
 
 def check_creatable(path: Path, key: str) -> None:
-    """Refuse a folder that could not be created, or written into; ``key`` is what named it.
+    """Check that a folder can be created and written into.
+
+    Parameters
+    ----------
+    path : Path
+    key : str
+        The option that gives the folder, for messages.
 
     Raises
     ------
     InputError
-        What stands in its place or above it, or the permission that is missing.
+        If a file is in the way or permission is missing.
     """
     above = next(folder for folder in (path.absolute(), *path.absolute().parents) if os.path.lexists(folder))
     if not above.is_dir():
@@ -254,9 +260,9 @@ def free_name(first: Path) -> Path:
 
 
 class RunDirectory:
-    """The folder chosen for a run or study, created and locked until its end; construction is collective.
+    """The folder chosen for a run or study, created and locked until `release`; construction is collective.
 
-    A folder made for it that is still empty at the end is removed again.
+    Folders that were created for it and are empty in the end are removed again.
 
     Parameters
     ----------
@@ -268,35 +274,34 @@ class RunDirectory:
     ----------
     path : Path
     note : str or None
-        What the user should know of the lock.
+        Warning for the user if the file system has no locks.
 
     Raises
     ------
     InputError
-        On every rank, if it cannot be made or another run is at work in it.
+        On every rank, if the folder cannot be created or another run uses it.
     """
 
     def __init__(self, comm: MPI.Comm, choice: FolderChoice) -> None:
         self._comm, self._choice = comm, choice
-        self._made: list[Path] = []
+        self._created: list[Path] = []
         self._lock: FolderLock | None = None
-        found = on_root(comm, self._take)
-        self.path, held = found
+        self.path, held = on_root(comm, self._create_and_lock)
         self.note = None if held else f"{self.path}: this file system has no locks: keep others out of it"
 
     def clean(self) -> None:
-        """Remove old results (``--force``) or what a kill left half-written (``--resume``); collective.
+        """Remove old results (``--force``) or incomplete files of a killed run (``--resume``); collective.
 
         Raises
         ------
         InputError
-            On every rank, if they cannot be removed.
+            On every rank, if a file cannot be removed.
         """
-        on_root(self._comm, self._clear)
+        on_root(self._comm, self._remove_results)
 
     @property
     def descriptor(self) -> int:
-        """Of the locked file, on rank 0: processes that inherit it keep the folder locked."""
+        """Descriptor of the lock file, on rank 0; processes that inherit it keep the folder locked."""
         assert self._lock is not None
         return self._lock.descriptor
 
@@ -305,7 +310,7 @@ class RunDirectory:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-        self._unmake()
+        self._remove_empty_folders()
 
     def __enter__(self) -> RunDirectory:
         return self
@@ -313,22 +318,22 @@ class RunDirectory:
     def __exit__(self, *error: object) -> None:
         self.release()
 
-    def _take(self) -> tuple[Path, bool]:
+    def _create_and_lock(self) -> tuple[Path, bool]:
         choice, path, kind = self._choice, self._choice.path, self._choice.kind
         fresh = not (choice.resume or choice.force)
         while True:
             try:
-                self._make(path)
+                self._create_folders(path)
                 self._lock = FolderLock(path, kind.lock)
                 if fresh and os.listdir(path) != [kind.lock]:
                     raise FileExistsError
-                if choice.resume and not kind.resumable(path):  # replaced by another meanwhile
-                    raise InputError(f"holds {kind.lacks}; run without --resume", file=path)
+                if choice.resume and not kind.resumable(path):  # another process has replaced it
+                    raise InputError(f"holds {kind.lack}; run without --resume", file=path)
                 return path, self._lock.held
-            except (FileExistsError, FolderLocked) as obstacle:
+            except (FileExistsError, FolderLocked) as error:
                 self.release()
                 if not fresh or choice.given:
-                    raise self._refusal(path, obstacle) from None
+                    raise self._taken_error(path, error) from None
                 path = free_name(choice.first or choice.path)
             except OSError as error:
                 self.release()
@@ -337,32 +342,32 @@ class RunDirectory:
                 self.release()
                 raise
 
-    def _refusal(self, path: Path, obstacle: Exception) -> InputError:
-        if not isinstance(obstacle, FolderLocked):
-            return self._choice.kind.exists(path, "--out")
-        words = f"another {self._choice.kind.what} is at work in this folder ({obstacle}); wait for it, or "
+    def _taken_error(self, path: Path, error: Exception) -> InputError:
+        if not isinstance(error, FolderLocked):
+            return self._choice.kind.exists_error(path, "--out")
+        text = f"another {self._choice.kind.noun} is at work in this folder ({error}); wait for it, or "
         key = "--resume" if self._choice.resume else "--out"
-        return InputError(words + "name another folder", file=path, key=key)
+        return InputError(text + "name another folder", file=path, key=key)
 
-    def _make(self, path: Path) -> None:
-        """Create the folder and what is missing above it, noting what was not there before."""
+    def _create_folders(self, path: Path) -> None:
+        """Create the folder and its missing parents, and remember which folders were created."""
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
         for folder in reversed(missing):
-            with suppress(FileExistsError):  # by another run at the same moment
+            with suppress(FileExistsError):  # another run created it at the same moment
                 folder.mkdir()
-                self._made.append(folder)
+                self._created.append(folder)
         if not path.is_dir():
             raise NotADirectoryError(20, os.strerror(20))
 
-    def _unmake(self) -> None:
-        for folder in reversed(self._made):
+    def _remove_empty_folders(self) -> None:
+        for folder in reversed(self._created):
             try:
                 folder.rmdir()
             except OSError:  # no longer empty
                 break
-        self._made.clear()
+        self._created.clear()
 
-    def _clear(self) -> None:
+    def _remove_results(self) -> None:
         kind = self._choice.kind
         try:
             for entry in sorted(self.path.iterdir()):
@@ -377,33 +382,33 @@ class RunDirectory:
 
 
 class FolderLocked(Exception):
-    """Another process holds the lock; the text says which."""
+    """Another process holds the lock; the message names it."""
 
 
 class FolderLock:
-    """Lock a folder; for one rank.
+    """A lock on a folder; for one rank.
 
-    The lock is the kernel's (``flock``) on a file of its own in the folder. A process that is
-    killed leaves the file behind and the lock free; one that ends by itself removes the file.
+    The kernel locks (``flock``) a lock file in the folder. A process that is killed leaves the file
+    behind, unlocked; a process that ends normally removes it.
 
     Parameters
     ----------
     folder : Path
         An existing folder.
     name : str
-        Of the file.
+        Name of the lock file.
 
     Attributes
     ----------
     descriptor : int
-        Of the file.
+        Descriptor of the lock file.
     held : bool
-        False where the file system knows no locks.
+        False if the file system does not support locks.
 
     Raises
     ------
     FolderLocked
-        If another process holds it.
+        If another process holds the lock.
     OSError
         If the file cannot be created.
     """
@@ -414,13 +419,13 @@ class FolderLock:
             self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             try:
                 self.held = self._lock()
-                if self._stands():
+                if self._is_current():
                     break
             except BaseException:
                 os.close(self.descriptor)
                 raise
-            os.close(self.descriptor)  # its former holder removed it meanwhile
-        with suppress(OSError):  # on a full disk the lock holds without its text
+            os.close(self.descriptor)  # the former holder removed the file after it was opened here
+        with suppress(OSError):  # the lock is held even if a full disk prevents writing its text
             os.ftruncate(self.descriptor, 0)
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             os.pwrite(
@@ -440,24 +445,24 @@ class FolderLock:
         text = os.pread(self.descriptor, 200, 0).decode("utf-8", "replace")
         return "".join(c for c in text if c.isprintable()) or "a process that has not said which"
 
-    def _stands(self) -> bool:
-        """Whether the locked file is still the one at its path."""
+    def _is_current(self) -> bool:
+        """Whether the locked file is still the file at its path."""
         try:
             return os.path.samestat(os.fstat(self.descriptor), os.stat(self.path))
         except FileNotFoundError:
             return False
 
     def release(self) -> None:
-        """Remove the file, then release the lock."""
-        with suppress(OSError):  # the folder itself may be gone
-            if self._stands():
+        """Remove the lock file, then release the lock."""
+        with suppress(OSError):  # the folder may have been removed
+            if self._is_current():
                 self.path.unlink()
         with suppress(OSError):
             os.close(self.descriptor)
 
 
-def in_use(folder: Path) -> bool:
-    """Whether a process holds the lock of a folder; also True where the file system knows no locks."""
+def is_locked(folder: Path) -> bool:
+    """Whether a process holds the lock of a folder; also True if the file system does not support locks."""
     try:
         descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

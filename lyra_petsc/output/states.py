@@ -1,10 +1,12 @@
-"""states-NNNN.h5, files with room for states from number NNNN on, and the XDMF file that announces them.
+"""States of a run: files states-NNNN.h5, each for several states from number NNNN on, and states.xdmf.
 
-A file is laid out with the places of all its states. To write one is to write its rows there, and then its
-row in the file's table; nothing of HDF5 changes, so that the file can be read at any moment. The next file
-has room for as many states as there are, within bounds: so there are few files, and little room is left over.
+A file is created with preallocated datasets for several states. To write a state is to write its rows into
+these datasets, and then its row in the file's table. HDF5's metadata do not change, so the file can be read
+at any time. A new file can hold as many states as exist already, within bounds, so that there are few files
+and little unused space. A state is announced, that is, listed in states.xdmf, when it is complete on disk.
 
-failure.xdmf, failure.h5 and failure.txt hold the states before and in a step that failed, and why.
+failure.xdmf, failure.h5 and failure.txt hold the state before a failed step, the failing iterate and the
+cause.
 """
 
 from __future__ import annotations
@@ -24,10 +26,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text, writing
-from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, lay_out, write_collective
+from lyra_petsc.output.file_operations import HDF5_ERRORS, cannot_write, reason, replace_text, writing
+from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, preallocate, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_of
+from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_attribute
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import (
@@ -40,49 +42,52 @@ from lyra_petsc.output.xdmf import (
 )
 from lyra_petsc.parallel import on_root
 
-FEWEST, MOST = 4, 512
-"""States that a file has room for,"""
+MIN_STATES, MAX_STATES = 4, 512
+"""Bounds of the number of states that a file can hold."""
 
-LARGEST = 1 << 26
-"""and their bytes, unless one alone has more."""
+MAX_BYTES = 1 << 26
+"""Upper bound of the size of a file's states, unless it holds a single state [bytes]."""
 
-MORE = 0.1
-"""States that ``states.vtkhdf`` may lack while a run goes on, over those it has."""
+MAX_LAG = 0.1
+"""During a run, states missing in ``states.vtkhdf``, relative to the states in it."""
 
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
 Fields = Mapping[str, tuple[str, NDArray[Any]]]
-"""By their names: what their rows belong to (``vertex`` or ``triangle``), and this rank's rows."""
+"""Fields by name: what the rows belong to (``vertex`` or ``triangle``), and this rank's rows."""
 
 
 class StateWriter:
-    """Writes states in the mesh's order; a state is announced only when its file is complete.
+    """Writes states in the order of the mesh file; a state is announced only when it is complete on disk.
 
     Parameters
     ----------
     folder : path
         The run's folder; holds ``mesh.h5``.
     vertices : FileOrder
-        Order of the vertices each rank owns.
+        File order of the vertices that each rank owns.
     triangles : FileOrder, optional
-        Order of the triangles each rank owns; needed for fields on triangles.
+        File order of the triangles that each rank owns; needed for fields on triangles.
     n_triangles : int
-        Triangles of the whole mesh.
+        Number of triangles of the whole mesh.
     resume_after : int, optional
-        Keep the states up to and including this step, remove later ones and go on with the
+        Keep the states up to and including this step, remove later ones and continue with the
         next number. Otherwise the first state is number 0.
     vtkhdf : bool
         Announce the states in ``states.vtkhdf``, too.
+    background : Background, optional
+        Completes and announces states while the run continues.
 
     Attributes
     ----------
     in_plane : frozenset of str
-        Tensors that the states before hold by three components, as older versions wrote them; they go on so.
+        Tensor fields that existing states hold with three components, as older versions wrote them; new
+        states must do so, too.
 
     Raises
     ------
     OutputError
-        On every rank, if the folder's states cannot be tidied up.
+        On every rank, if later states cannot be removed.
     """
 
     def __init__(
@@ -100,10 +105,10 @@ class StateWriter:
         self.vertices = vertices
         self._orders = {"vertex": vertices} | ({} if triangles is None else {"triangle": triangles})
         self.n_triangles = n_triangles
-        self._room: _PreallocatedFile | None = None
+        self._file: _PreallocatedFile | None = None
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
         self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
-        self._in_vtk = 0
+        self._n_in_vtkhdf = 0
         self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
@@ -111,8 +116,7 @@ class StateWriter:
             on_root(self._comm, lambda: write_cells(self.folder))
         self.in_plane: frozenset[str] = frozenset()
         if resume_after is not None:
-            found = on_root(self._comm, lambda: self._truncate(resume_after))
-            self._next, self.in_plane = found
+            self._next, self.in_plane = on_root(self._comm, lambda: self._truncate(resume_after))
 
     @property
     def _comm(self) -> MPI.Comm:
@@ -124,7 +128,7 @@ class StateWriter:
         time: float,
         position: Array,
         fields: Fields,
-        beside: Sequence[NewFile] = (),
+        other_files: Sequence[NewFile] = (),
     ) -> int:
         """Write and announce one state; collective. Returns its number.
 
@@ -137,15 +141,16 @@ class StateWriter:
         position : (n_owned, 3) float64
             Current positions of this rank's vertices [m].
         fields : mapping of str to (str, (n_owned, ...) array)
-            Further fields on ``vertex`` or ``triangle``, on this rank's: floats or integers, the same names,
-            types and trailing shapes on every rank.
-        beside : sequence of NewFile
-            Files that are there, too, when the state is announced.
+            Further fields on this rank's vertices or triangles: floats or integers; names, types and
+            trailing shapes are the same on every rank.
+        other_files : sequence of NewFile
+            Files that are completed before the state is announced.
 
         Raises
         ------
         OutputError
-            On every rank; the states announced before stand. With a background, of the state before.
+            On every rank, if a file cannot be written; states announced before are kept. With a background,
+            the error may be that of the previous state.
         """
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
         slabs |= {name: self._orders[on].to_slab(rows) for name, (on, rows) in fields.items()}
@@ -154,38 +159,38 @@ class StateWriter:
             for name, (on, _) in fields.items()
         )
         number = self._next
-        room = self._room
-        if room is None or room.fields != described or number >= room.first + len(room.places):
-            room = self._room = self._lay_out(slabs, described)
-        state = WrittenState(number, int(step), float(time), room.path.name, described)
-        written = partial(room.say_written, state, check_sums(slabs.values(), self._comm))
+        file = self._file
+        if file is None or file.fields != described or number >= file.first + len(file.offsets):
+            file = self._file = self._preallocate(slabs, described)
+        state = WrittenState(number, int(step), float(time), file.path.name, described)
+        record = partial(file.record_written, state, check_sums(slabs.values(), self._comm))
         datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
-        places = room.places[number - room.first].tolist()
-        file = NewFile(room.path, datasets, {}, lambda: self._announce(state), places, written)
-        write_collective([file, *beside], self._comm, self._background)
+        offsets = file.offsets[number - file.first].tolist()
+        new = NewFile(file.path, datasets, {}, lambda: self._announce(state), offsets, record)
+        write_collective([new, *other_files], self._comm, self._background)
         self._next += 1
         return number
 
     def finish(self) -> None:
-        """Announce also in ``states.vtkhdf`` what is announced already; collective, with nothing under way.
+        """List all announced states in ``states.vtkhdf``; collective, when the background is idle.
 
         Raises
         ------
         OutputError
-            On every rank, if it could not be written.
+            On every rank, if ``states.vtkhdf`` cannot be written.
         """
         if self._vtkhdf:
-            on_root(self._comm, lambda: self._announce_to_vtk(late=True))
+            on_root(self._comm, lambda: self._write_vtkhdf(complete=True))
 
-    def _lay_out(
+    def _preallocate(
         self, slabs: Mapping[str, NDArray[Any]], fields: tuple[StoredField, ...]
     ) -> _PreallocatedFile:
-        """A file with room for the next states; collective."""
+        """Create a file for the next states; collective."""
         first, names = self._next, list(slabs)
         rows = [self.vertices.n_global, *(field.shape[0] for field in fields)]
         widths = [slab.itemsize * int(np.prod(slab.shape[1:], dtype=int)) for slab in slabs.values()]
         size = sum(n * width for n, width in zip(rows, widths, strict=True))
-        slots = max(1, min(max(first, FEWEST), MOST, LARGEST // max(size, 1)))
+        slots = max(1, min(max(first, MIN_STATES), MAX_STATES, MAX_BYTES // max(size, 1)))
         path = self.folder / f"states-{first:04d}.h5"
         table: dict[str, NDArray[Any]] = {
             f"{TABLE}/step": np.empty(0, np.int64),
@@ -193,60 +198,63 @@ class StateWriter:
             f"{TABLE}/sums": np.empty((0, len(names)), np.uint64),
         }
         planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
-        told = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
-        attributes: Attributes = {TABLE: {"first": first, "columns": told}}
+        columns = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
+        attributes: Attributes = {TABLE: {"first": first, "columns": columns}}
 
         def work() -> list[int]:
             part = path.with_name(path.name + ".part")
             try:
-                places = lay_out(part, table | planned, [slots] * len(table) + rows * slots, attributes)
+                offsets = preallocate(part, table | planned, [slots] * len(table) + rows * slots, attributes)
                 with open(part, "r+b", buffering=0) as file:
-                    os.pwrite(file.fileno(), np.full(slots, -1, np.int64).tobytes(), places[0])
+                    os.pwrite(file.fileno(), np.full(slots, -1, np.int64).tobytes(), offsets[0])
                     os.fsync(file.fileno())
                 os.replace(part, path)
             except HDF5_ERRORS as error:
                 part.unlink(missing_ok=True)
                 raise cannot_write(path, error) from error
-            return places
+            return offsets
 
-        places = np.array(on_root(self._comm, work), dtype=np.int64)
-        return _PreallocatedFile(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
+        offsets = np.array(on_root(self._comm, work), dtype=np.int64)
+        return _PreallocatedFile(path, first, fields, offsets[:3], offsets[3:].reshape(slots, len(names)))
 
     def _announce(self, state: WrittenState) -> None:
-        """Announce a state (rank 0)."""
+        """List a state in states.xdmf and, unless too few are new, states.vtkhdf (rank 0)."""
         grid = self._series.grid(state)
         try:
             if state.number == 0:
                 self._document.replace([grid])
             else:
                 self._document.append(grid)
-        except FileNotFoundError:  # removed or changed: made anew from the files of the states
+        except FileNotFoundError:  # removed or changed by somebody: write it again from the states' files
             if not self.folder.is_dir():
                 raise cannot_write(self._document.path, FileNotFoundError()) from None
             self._document.replace(map(self._series.grid, stored_states(self.folder)))
         if self._vtkhdf:
             self._states.append(state)
-            self._announce_to_vtk()
+            self._write_vtkhdf()
 
-    def _announce_to_vtk(self, *, late: bool = False) -> None:
-        """Write ``states.vtkhdf``, which is written as a whole: the more states the less often."""
-        new = len(self._states) - self._in_vtk
-        if new == 0 or not (late or new >= MORE * self._in_vtk):
+    def _write_vtkhdf(self, *, complete: bool = False) -> None:
+        """Write ``states.vtkhdf`` if it must be ``complete`` or lacks more states than `MAX_LAG` allows.
+
+        The file is always written as a whole, so it is written less often the more states there are.
+        """
+        new = len(self._states) - self._n_in_vtkhdf
+        if new == 0 or not (complete or new >= MAX_LAG * self._n_in_vtkhdf):
             return
         write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles)
-        self._in_vtk = len(self._states)
+        self._n_in_vtkhdf = len(self._states)
 
     def _truncate(self, last_step: int) -> tuple[int, frozenset[str]]:
-        """Announce the states up to ``last_step``, only then remove the others.
+        """Announce the states up to ``last_step``, and only then remove the later ones.
 
-        Returns the next number, and which tensors have three components.
+        Returns the number of the next state, and the tensor fields that have three components.
         """
         found = stored_states(self.folder)
         keep = [state for state in found if state.step <= last_step]
         self._document.replace(map(self._series.grid, keep))
         if self._vtkhdf:
             self._states = keep
-            self._announce_to_vtk(late=True)
+            self._write_vtkhdf(complete=True)
         stale = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
         kept = {state.file for state in keep}
         try:
@@ -254,7 +262,7 @@ class StateWriter:
                 if path.name not in kept:
                     path.unlink()
                 else:
-                    _forget(path, last_step)
+                    _discard_states_after(path, last_step)
             for path in stale:
                 path.unlink(missing_ok=True)
         except OSError as error:
@@ -266,18 +274,28 @@ class StateWriter:
 
 @dataclass(frozen=True)
 class _PreallocatedFile:
-    """A file with room for states: its first state, what each holds, and where [bytes] these stand.
+    """A file with preallocated datasets for several states.
 
-    ``table`` has the places of the table's columns, ``places`` (slots, datasets) those of each state.
+    Attributes
+    ----------
+    path : Path
+    first : int
+        Number of the first state in the file.
+    fields : tuple of StoredField
+        Fields of each state.
+    table : (3,) int64
+        Offsets in the file of the table's columns [bytes].
+    offsets : (slots, datasets) int64
+        Offsets in the file of each state's datasets [bytes].
     """
 
     path: Path
     first: int
     fields: tuple[StoredField, ...]
     table: Ints
-    places: Ints
+    offsets: Ints
 
-    def say_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
+    def record_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
         """Write a state's row of the table (rank 0)."""
         entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
         with writing(self.path), open(self.path, "r+b", buffering=0) as file:
@@ -285,8 +303,8 @@ class _PreallocatedFile:
                 os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
 
 
-def _forget(path: Path, last_step: int) -> None:
-    """Mark in a file that it holds no states after ``last_step``."""
+def _discard_states_after(path: Path, last_step: int) -> None:
+    """Mark the states after ``last_step`` in a file as not written."""
     with open_stored(path) as file:
         if TABLE not in file:
             return
@@ -297,18 +315,18 @@ def _forget(path: Path, last_step: int) -> None:
 
 
 def state_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """The files of states of a run's folder, by number."""
+    """The states files of a run's folder, ordered by number."""
     numbered = [(STATE_FILE.fullmatch(path.name), path) for path in Path(folder).iterdir()]
     return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
 
 
 def stored_states(folder: Path) -> list[WrittenState]:
-    """The states in a run's folder, by number; damaged files are passed over.
+    """The states in a run's folder, ordered by number; damaged files are skipped.
 
     Raises
     ------
     InputError
-        For files that lead out of the folder.
+        For links out of the folder.
     """
     found: list[WrittenState] = []
     for path in state_files(folder):
@@ -322,22 +340,22 @@ def stored_states(folder: Path) -> list[WrittenState]:
 
 
 def _states_of(path: Path) -> list[WrittenState]:
-    """The states of a file, which in older folders is one.
+    """The states of a file; in older folders, a file holds one state.
 
     Raises
     ------
     InputError
-        If it is damaged.
+        If the file is damaged.
     """
     with open_stored(path) as file:
         if TABLE not in file:
             (name,) = file["states"]
             group = file["states"][name]
-            on = {key: text_of(data, "on") for key, data in group.items() if key != "position"}
+            on = {key: text_attribute(data, "on") for key, data in group.items() if key != "position"}
             step, time = int(group.attrs["step"]), float(group.attrs["time"])
             return [WrittenState(int(name), step, time, path.name, _fields(group, on))]
         table = file[TABLE]
-        first, on = int(table.attrs["first"]), dict(json.loads(text_of(table, "columns")))
+        first, on = int(table.attrs["first"]), dict(json.loads(text_attribute(table, "columns")))
         fields = _fields(file[group_name(first)], on)
         rows = zip(table["step"][()].tolist(), table["time"][()].tolist(), strict=True)
         return [
@@ -359,8 +377,8 @@ FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failur
 
 
 @dataclass(frozen=True)
-class StateInTime:
-    """Positions and fields at one time.
+class FailureState:
+    """Positions and fields of the state before a failed step, or of the failing iterate.
 
     Attributes
     ----------
@@ -382,30 +400,30 @@ def write_failure(
     vertices: FileOrder,
     n_triangles: int,
     step: int,
-    states: tuple[StateInTime, StateInTime],
+    states: tuple[FailureState, FailureState],
     text: str,
 ) -> None:
-    """Write the state before a step and the iterate at which it failed; collective.
+    """Write the state before a failed step and the failing iterate; collective.
 
     Parameters
     ----------
     folder : path
         The run's folder; holds ``mesh.h5``.
     vertices : FileOrder
-        Order of the vertices each rank owns.
+        File order of the vertices that each rank owns.
     n_triangles : int
-        Triangles of the whole mesh.
+        Number of triangles of the whole mesh.
     step : int
-        Number of the state before.
-    states : pair of StateInTime
-        The two.
+        Number of accepted steps.
+    states : pair of FailureState
+        The state before the step and the failing iterate.
     text : str
-        For ``failure.txt``.
+        Content of ``failure.txt``.
 
     Raises
     ------
     OutputError
-        On every rank, if something could not be written.
+        On every rank, if a file cannot be written.
     """
     folder = Path(folder)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_TEXT, text))
@@ -428,12 +446,12 @@ def write_failure(
 
 
 def remove_failure(folder: str | os.PathLike[str]) -> None:
-    """Remove what an earlier run wrote here. Call on one rank.
+    """Remove the failure files of an earlier run. Call on one rank.
 
     Raises
     ------
     OutputError
-        If it cannot be removed.
+        If a file cannot be removed.
     """
     try:
         for name in (FAILURE_XDMF, FAILURE_DATA, FAILURE_TEXT):

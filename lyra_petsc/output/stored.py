@@ -1,9 +1,9 @@
-"""Reading a run's folder: files that lead out of it are refused, and damaged ones are one line of words.
+"""Safe reading of a run's folder: links out of the folder and damaged files raise InputError.
 
-A folder holds all of its results. Otherwise one from somebody else could make a program show or change the
-user's own files: HDF5 follows links to other files and takes data from any file, and a symbolic link may lead
-anywhere. h5py and the library below it raise nearly anything for a file with changed bytes, and numbers that
-were changed raise nothing at all: datasets have check sums, beside them or in the table of the states' file.
+A folder must hold all of its results. Otherwise a folder from somebody else could make a program show or
+change the user's own files: HDF5 follows links to other files and takes data from any file, and a symbolic
+link may lead anywhere. For damaged bytes, h5py raises nearly any exception, or none if numbers have changed.
+Datasets therefore have check sums, in an attribute or in the table of the states' file.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.mesh import Group, TriangleSurface
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.xdmf import MESH_FILE
 
 if TYPE_CHECKING:
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 
 def import_h5py() -> Any:
-    """h5py, with HDF5's file locks off: they fail on some cluster file systems.
+    """The module h5py, with HDF5's file locks disabled, as they fail on some cluster file systems.
 
-    Nothing is lost with them: files are written under a name that no other process opens, and have
-    their final name only when complete. ``HDF5_USE_FILE_LOCKING`` set by the user stands.
+    Locks are not needed: incomplete files have names that no other process opens. If the user has set
+    ``HDF5_USE_FILE_LOCKING``, the value is kept.
     """
     os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
     import h5py
@@ -44,33 +44,33 @@ def import_h5py() -> Any:
     return h5py
 
 
-def import_ahead() -> None:
-    """Import h5py in a thread, while this one waits for gmsh's process."""
+def import_h5py_in_background() -> None:
+    """Import h5py in another thread, while the calling thread waits for gmsh's process."""
 
     def work() -> None:
-        with suppress(ImportError):  # told where it is needed
+        with suppress(ImportError):  # raised again by the first use
             import_h5py()
 
     Thread(target=work, name="lyra-petsc h5py").start()
 
 
 ENDINGS = (".h5", ".xdmf", ".vtkhdf", ".csv", ".yaml", ".json", ".txt", ".part")
-"""Of what a run writes and its readers read."""
+"""Endings of the files that a run writes."""
 
 _REMEDY = "a run's folder must hold all of its results"
 
 
 class OutsideFolderError(InputError):
-    """A file that is no part of its folder, or takes data from elsewhere."""
+    """A file that lies outside of its folder, or takes data from another file."""
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse results outside of the run's folder.
+    """Check that all results are regular files in the run's folder.
 
     Raises
     ------
     InputError
-        Naming the first one.
+        For the first file that is not.
     """
     try:
         names = sorted(entry.name for entry in os.scandir(folder) if entry.name.endswith(ENDINGS))
@@ -81,7 +81,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that stands outside the folder where it seems to be, or is no file.
+    """Check that a path is a regular file or folder and no link out of its folder; it may be missing.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def check_file(path: Path) -> None:
     try:
         target, kind = path.resolve(), path.stat().st_mode
         inside = target.is_relative_to(path.parent.resolve())
-    except (OSError, ValueError, RuntimeError):  # missing, or a circle of links
+    except (OSError, ValueError, RuntimeError):  # missing, or circular links
         if path.is_symlink():
             raise OutsideFolderError(f"is a link that leads nowhere; {_REMEDY}", file=path) from None
         return
@@ -100,8 +100,8 @@ def check_file(path: Path) -> None:
         raise InputError("is no plain file", file=path)
 
 
-def check_name(name: str, file: Path) -> None:
-    """Refuse a name in ``file`` that is not that of another file in its folder.
+def check_file_name(name: str, file: Path) -> None:
+    """Check that ``name``, which ``file`` refers to, is the name of a file in the same folder.
 
     Raises
     ------
@@ -112,8 +112,8 @@ def check_name(name: str, file: Path) -> None:
 
 
 @contextmanager
-def open_own(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """An HDF5 file of a run's folder, to read, whose data are all its own.
+def open_contained(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """A context with an HDF5 file open for reading that contains all of its data.
 
     Yields
     ------
@@ -122,9 +122,9 @@ def open_own(path: str | os.PathLike[str]) -> Iterator[Any]:
     Raises
     ------
     InputError
-        For data of other files, and links to them.
-    OSError and what else h5py raises
-        If it cannot be read.
+        If the file has links to other files or data in them.
+    OSError and other exceptions of h5py
+        If the file cannot be read.
     """
     path = Path(path)
     check_file(path)
@@ -133,14 +133,14 @@ def open_own(path: str | os.PathLike[str]) -> Iterator[Any]:
         yield file
 
 
-_known: dict[Path, tuple[int, ...]] = {}
+_checked_files: dict[Path, tuple[int, ...]] = {}
 
 
 def _check_content(file: Any, path: Path) -> None:
-    """Look at all links and datasets of a file, once as long as it does not change."""
+    """Check all links and datasets of a file; an unchanged file is checked once only."""
     status = path.stat()
     stamp = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-    if _known.get(path) == stamp:
+    if _checked_files.get(path) == stamp:
         return
     h5py = import_h5py()
     root = h5py.h5g.open(file, b"/")
@@ -153,7 +153,7 @@ def _check_content(file: Any, path: Path) -> None:
                 raise OutsideFolderError(f"{where!r} is a link to elsewhere; {_REMEDY}", file=path)
             member = h5py.h5o.open(group, name)
             if isinstance(member, h5py.h5g.GroupID):
-                # hard links may make circles, and few groups look like very many
+                # hard links may form cycles, and make few groups look like very many
                 address = h5py.h5o.get_info(member).addr
                 if address in seen:
                     raise InputError(f"{where!r}: a group in several places; is no file of a run", file=path)
@@ -165,21 +165,23 @@ def _check_content(file: Any, path: Path) -> None:
                     raise OutsideFolderError(
                         f"{where!r} takes its data from other files; {_REMEDY}", file=path
                     )
-    _known[path] = stamp
+    _checked_files[path] = stamp
 
 
 SUM = "sum"
-"""Attribute of a dataset: its check sum, as text."""
+"""Attribute of a dataset with its check sum as text."""
 
 TABLE = "written"
-"""Group of a file of states with a row for each that it has room for: ``step`` (−1: not written), ``time``
-and ``sums``, whose columns are named by the attribute ``columns``; row 0 is of the state ``first``."""
+"""Group of a states file: a table with one row for each state that the file can hold.
+
+Datasets ``step`` (−1: not written), ``time`` and ``sums``; the attribute ``columns`` names the columns of
+``sums``, and the attribute ``first`` is the number of the state in row 0."""
 
 STATE = re.compile(r"/?states/(\d+)/[^/]+")
 
 
 def check_sum(array: NDArray[Any]) -> int:
-    """Sum modulo 2⁶⁴ of all 64-bit words (of bytes, where elements are shorter); sums of parts add up."""
+    """Sum modulo 2⁶⁴ of all 64-bit words, or of all bytes for smaller types; sums of parts are additive."""
     words = np.ascontiguousarray(array).reshape(-1).view(np.uint64 if array.dtype.itemsize == 8 else np.uint8)
     return int(words.sum(dtype=np.uint64))
 
@@ -194,15 +196,15 @@ def check_sums(slabs: Iterable[NDArray[Any]], comm: MPI.Comm) -> NDArray[np.uint
 
 @contextmanager
 def open_stored(path: Path) -> Iterator[Any]:
-    """A file, open for reading.
+    """A context with a file open for reading, as `open_contained`.
 
     Raises
     ------
     InputError
-        For whatever goes wrong with it, also within the context.
+        For any failure to read the file, also within the context.
     """
     try:
-        with open_own(path) as file:
+        with open_contained(path) as file:
             yield file
     except LyraError:
         raise
@@ -214,33 +216,34 @@ def open_stored(path: Path) -> Iterator[Any]:
 def read_stored(
     path: Path, dataset: str, shape: tuple[int | None, ...] | None = None, kinds: str = "fiu"
 ) -> NDArray[Any]:
-    """A whole dataset of a file.
+    """Read a dataset and check it.
 
     Parameters
     ----------
     path : Path
     dataset : str
     shape : tuple of int or None
-        What it must have; ``None`` stands for any length.
+        Required shape; ``None`` stands for any length.
     kinds : str
-        numpy's letters of the kinds of numbers that it may hold.
+        Allowed values of numpy's ``dtype.kind``.
 
     Raises
     ------
     InputError
-        If it is missing, of another shape or kind, differs from its check sum, or is not finite.
+        If the dataset is missing, has another shape or kind, differs from its check sum, or holds
+        numbers that are not finite.
     """
     with open_stored(path) as file:
         stored = file[dataset]
-        if stored.dtype.kind not in kinds or not _fits(stored.shape, shape):
-            words = " × ".join("any" if n is None else str(n) for n in shape or ())
+        if stored.dtype.kind not in kinds or not _shape_matches(stored.shape, shape):
+            required = " × ".join("any" if n is None else str(n) for n in shape or ())
             raise InputError(
                 f"is damaged: {dataset.lstrip('/')} holds {stored.dtype} of shape {stored.shape}"
-                + (f", not numbers of shape {words}" if words else ""),
+                + (f", not numbers of shape {required}" if required else ""),
                 file=path,
             )
         array: NDArray[Any] = stored[()]
-        expected = _expected(file, stored, dataset)
+        expected = _expected_check_sum(file, stored, dataset)
     if expected is not None and check_sum(array) != expected:
         raise InputError(f"is damaged: the check sum of {dataset.lstrip('/')} does not fit", file=path)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -248,33 +251,33 @@ def read_stored(
     return array
 
 
-def text_of(owner: Any, name: str) -> str:
-    """An attribute that is text, of fixed or (in older files) variable length."""
+def text_attribute(owner: Any, name: str) -> str:
+    """A text attribute, of fixed or (in older files) variable length."""
     value = owner.attrs[name]
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
-def _fits(found: tuple[int, ...], shape: tuple[int | None, ...] | None) -> bool:
+def _shape_matches(found: tuple[int, ...], shape: tuple[int | None, ...] | None) -> bool:
     if shape is None:
         return True
     return len(found) == len(shape) and all(n in (None, m) for n, m in zip(shape, found, strict=True))
 
 
-def _expected(file: Any, stored: Any, dataset: str) -> int | None:
-    """The check sum of a dataset; None where an older version wrote none."""
+def _expected_check_sum(file: Any, stored: Any, dataset: str) -> int | None:
+    """The stored check sum of a dataset; None if an older version wrote none."""
     if SUM in stored.attrs:
-        return int(text_of(stored, SUM))
+        return int(text_attribute(stored, SUM))
     state = STATE.fullmatch(dataset)
     if state is None or TABLE not in file:
         return None
     table = file[TABLE]
     row = int(state[1]) - int(table.attrs["first"])
-    columns = [name for name, _ in json.loads(text_of(table, "columns"))]
+    columns = [name for name, _ in json.loads(text_attribute(table, "columns"))]
     return int(table["sums"][row, columns.index(dataset.rpartition("/")[2])])
 
 
 class StoredMesh:
-    """The mesh of a run's folder; an array is read when it is first asked for, and checked.
+    """The mesh of a run's folder; an array is read and checked when it is first used.
 
     Parameters
     ----------
@@ -284,7 +287,7 @@ class StoredMesh:
     Raises
     ------
     InputError
-        By each attribute, if ``mesh.h5`` is missing or damaged.
+        When an attribute is read, if ``mesh.h5`` is missing or damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -298,11 +301,11 @@ class StoredMesh:
     @cached_property
     def triangles(self) -> Ints:
         """(F, 3) vertices of each triangle."""
-        return self._numbers("mesh/triangles", (None, 3), len(self.rest))
+        return self._indices("mesh/triangles", (None, 3), len(self.rest))
 
     @cached_property
     def start(self) -> Array | None:
-        """(V, 3) start positions [m]; None where an older version wrote none."""
+        """(V, 3) start positions [m]; None if an older version wrote none."""
         with open_stored(self.path) as file:
             if "start" not in file:
                 return None
@@ -310,10 +313,10 @@ class StoredMesh:
 
     @cached_property
     def uv(self) -> Array | None:
-        """(V, 2) material coordinates [m]; None where a vertex has more than one."""
+        """(V, 2) material coordinates [m]; None if a vertex has several."""
         with open_stored(self.path) as file:
-            there = "uv" in file["mesh"]
-        return read_stored(self.path, "mesh/uv", (len(self.rest), 2), "f") if there else None
+            exists = "uv" in file["mesh"]
+        return read_stored(self.path, "mesh/uv", (len(self.rest), 2), "f") if exists else None
 
     @cached_property
     def corner_uv(self) -> Array:
@@ -324,48 +327,49 @@ class StoredMesh:
 
     @cached_property
     def textured(self) -> bool:
-        """Whether the material coordinates came with the mesh, as texture coordinates."""
+        """Whether the material coordinates are texture coordinates from the mesh file."""
         with open_stored(self.path) as file:
             return bool(file["mesh"].attrs.get("vt", 0))
 
     @property
     def groups(self) -> dict[str, Group]:
-        """The groups by their names; their dimension is not stored."""
+        """The groups by name; their dimension is not stored."""
         with open_stored(self.path) as file:
             stored = file.get("groups", {})
-            names = {number: text_of(group, "name") for number, group in stored.items()}
-            filled = {f"groups/{number}/{part}" for number, group in stored.items() for part in group}
+            names = {number: text_attribute(group, "name") for number, group in stored.items()}
+            datasets = {f"groups/{number}/{array}" for number, group in stored.items() for array in group}
 
-        def part(place: str, width: tuple[int, ...], end: int) -> Ints:
-            if place not in filled:
+        def indices(dataset: str, width: tuple[int, ...], end: int) -> Ints:
+            if dataset not in datasets:
                 return np.empty((0, *width), np.int64)
-            return self._numbers(place, (None, *width), end)
+            return self._indices(dataset, (None, *width), end)
 
         n = len(self.rest)
         return {
             name: Group(
                 0,
-                part(f"groups/{number}/vertices", (), n),
-                part(f"groups/{number}/triangles", (), len(self.triangles)),
-                part(f"groups/{number}/edges", (2,), n),
+                indices(f"groups/{number}/vertices", (), n),
+                indices(f"groups/{number}/triangles", (), len(self.triangles)),
+                indices(f"groups/{number}/edges", (2,), n),
             )
             for number, name in names.items()
         }
 
     @property
     def obstacles(self) -> dict[str, TriangleSurface]:
-        """The obstacles that are meshes, at t = 0, by their names."""
+        """The surfaces at t = 0 of the obstacles that are meshes, by name."""
         with open_stored(self.path) as file:
-            names = {number: text_of(group, "name") for number, group in file.get("obstacles", {}).items()}
-        found = {}
+            stored = file.get("obstacles", {})
+            names = {number: text_attribute(group, "name") for number, group in stored.items()}
+        surfaces = {}
         for number, name in names.items():
             points = read_stored(self.path, f"obstacles/{number}/points", (None, 3), "f")
-            triangles = self._numbers(f"obstacles/{number}/triangles", (None, 3), len(points))
-            found[name] = TriangleSurface(points, triangles)
-        return found
+            triangles = self._indices(f"obstacles/{number}/triangles", (None, 3), len(points))
+            surfaces[name] = TriangleSurface(points, triangles)
+        return surfaces
 
-    def _numbers(self, dataset: str, shape: tuple[int | None, ...], end: int) -> Ints:
-        """Whole numbers from 0 to before ``end``."""
+    def _indices(self, dataset: str, shape: tuple[int | None, ...], end: int) -> Ints:
+        """A dataset of indices from 0 to ``end`` − 1."""
         found = read_stored(self.path, dataset, shape, "iu")
         if found.size and (found.min() < 0 or found.max() >= end):
             raise InputError(f"is damaged: {dataset} holds numbers beyond 0 … {end - 1}", file=self.path)

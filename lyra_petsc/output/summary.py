@@ -1,4 +1,4 @@
-"""summary.json: what ran, with what, how long, and how it ended."""
+"""summary.json: the scene's sizes and options, versions, wall times and outcome of a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason, replace_text
+from lyra_petsc.output.file_operations import reason, replace_text
 from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.parallel import on_root
 
@@ -26,7 +26,7 @@ REMEDY = "remove it: the run can be read without"
 
 
 def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm: MPI.Comm) -> None:
-    """Write a summary in one instant, so that a reader finds the old or the new one.
+    """Write a summary atomically, so that a reader finds either the old or the new one.
 
     Parameters
     ----------
@@ -41,23 +41,23 @@ def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm
     Raises
     ------
     OutputError
-        On every rank, if it could not be written.
+        On every rank, if the file cannot be written.
     """
 
     def work() -> None:
-        text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(_to_json(content), indent=2, ensure_ascii=False, allow_nan=False)
         replace_text(path, text + "\n")
 
     on_root(comm, work)
 
 
 def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a summary holds; empty if there is none. For one rank.
+    """The content of a summary; empty if the file is missing. Call on one rank.
 
     Raises
     ------
     InputError
-        If it is damaged: no JSON, or an entry of another kind than ours.
+        If the file is damaged: it is not JSON, or an entry has the wrong type.
     """
     try:
         with open(path, encoding="utf-8") as file:
@@ -82,8 +82,8 @@ def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
     return content
 
 
-def versions() -> dict[str, str]:
-    """Names and versions of what takes part in a run; numba only if a term has loaded it."""
+def library_versions() -> dict[str, str]:
+    """Versions of this program and its libraries by name; numba's only if a term has loaded it."""
     import mpi4py
     import petsc4py
     from mpi4py import MPI
@@ -106,16 +106,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _plain(value: Any) -> Any:
-    """The value in JSON's own types."""
+def _to_json(value: Any) -> Any:
+    """The value converted to types that JSON supports."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): _to_json(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return _to_json(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(entry) for entry in value]
+        return [_to_json(entry) for entry in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return _to_json(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, os.PathLike):

@@ -1,4 +1,4 @@
-"""What readers take for granted of a run's summary.json."""
+"""Types of the entries of summary.json that readers rely on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class _Failure(BaseModel):
 
 
 class Summary(BaseModel):
-    """Any entry may be missing, and there are others."""
+    """Entries of summary.json; any entry may be missing, and further entries are allowed."""
 
     title: str | None = None
     outcome: str = ""

@@ -1,11 +1,11 @@
-"""states.vtkhdf: the states as one time series in VTK's own HDF5 layout, read by ParaView and VTK.
+"""states.vtkhdf: the states as one time series in VTK's HDF5 format, read by ParaView and VTK.
 
-The file holds no state. Its datasets are *virtual*: they map onto those of ``states-NNNN.h5``, so that it is
-small, is replaced in one instant like ``states.xdmf``, and stands for exactly the states that it announces.
-The triangles, which VTK wants in another form than ``mesh.h5`` has, are in ``cells.h5``.
+The file holds no states. Its datasets are *virtual datasets* that refer to ``states-NNNN.h5``, so that the
+file is small and can be replaced atomically, as ``states.xdmf``. The triangles, which VTK needs in another
+form than that of ``mesh.h5``, are in ``cells.h5``.
 
-Layout: VTK's documentation, "VTKHDF file format", version 2.0, a transient UnstructuredGrid of one part; as
-all steps share the triangles, their offsets are 0 at every step.
+Format: VTK's documentation, "VTKHDF file format", version 2.0, a transient UnstructuredGrid of one part. All
+steps share the triangles, so their offsets are 0 at every step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.output.agreement import HDF5_ERRORS, replace_bytes, writing
+from lyra_petsc.output.file_operations import HDF5_ERRORS, replace_bytes, writing
 from lyra_petsc.output.stored import StoredMesh, import_h5py
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
 from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
@@ -28,13 +28,13 @@ VTKHDF_FILE = "states.vtkhdf"
 CELLS_FILE = "cells.h5"
 
 TRIANGLE = 5
-"""VTK's number of the cell type."""
+"""VTK's cell type of a triangle."""
 
 GROUPS = {"vertex": "PointData", "triangle": "CellData"}
 
 
 def cells(triangles: Ints) -> dict[str, NDArray[Any]]:
-    """``Connectivity`` (3 F,), ``Offsets`` (F + 1,) and ``Types`` (F,) of triangles (F, 3)."""
+    """VTK's arrays ``Connectivity`` (3 F,), ``Offsets`` (F + 1,) and ``Types`` (F,) of triangles (F, 3)."""
     n = len(triangles)
     return {
         "Connectivity": np.ascontiguousarray(triangles, dtype=np.int64).ravel(),
@@ -44,7 +44,7 @@ def cells(triangles: Ints) -> dict[str, NDArray[Any]]:
 
 
 def write_cells(folder: Path) -> None:
-    """Write ``cells.h5`` from the mesh of the folder, once. Call on one rank.
+    """Write ``cells.h5`` from the mesh of the folder. Call on one rank.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def write_cells(folder: Path) -> None:
     OutputError
     """
     path, triangles = folder / CELLS_FILE, StoredMesh(folder).triangles
-    with _replaced(path) as file:
+    with _atomic_hdf5_file(path) as file:
         for name, array in cells(triangles).items():
             file[name] = array
 
@@ -61,37 +61,37 @@ def write_cells(folder: Path) -> None:
 def write_vtkhdf(folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int) -> None:
     """Write ``states.vtkhdf`` for these states. Call on one rank.
 
-    A field that some states lack is NaN there (0 if it is of whole numbers).
+    Where a state lacks a field, its values are NaN (0 for integers).
 
     Parameters
     ----------
     folder : Path
-        With ``cells.h5`` and the files of the states.
+        The run's folder, with ``cells.h5`` and the states files.
     states : sequence of WrittenState
     n_vertices, n_triangles : int
 
     Raises
     ------
     OutputError
-        If it could not be written; what stood there before stands.
+        If the file cannot be written; then the old file is kept.
     """
     path = folder / VTKHDF_FILE
     rows = {"vertex": n_vertices, "triangle": n_triangles}
-    with _replaced(path) as file:
-        root = describe(file, [state.time for state in states], n_vertices, n_triangles)
+    with _atomic_hdf5_file(path) as file:
+        root = create_metadata(file, [state.time for state in states], n_vertices, n_triangles)
         lengths = {"Connectivity": 3 * n_triangles, "Offsets": n_triangles + 1, "Types": n_triangles}
         for name, length in lengths.items():
             kind = np.dtype(np.uint8 if name == "Types" else np.int64)
-            _virtual(root, name, (length,), kind, {0: (CELLS_FILE, name)}, length)
+            _add_virtual_dataset(root, name, (length,), kind, {0: (CELLS_FILE, name)}, length)
         real = np.dtype(np.float64)
         positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
-        _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
+        _add_virtual_dataset(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
         rest = {0: (MESH_FILE, "mesh/rest")}
-        _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
+        _add_virtual_dataset(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
         add_offsets(root, "vertex", "rest", len(states), 0)
-        # each name once: as the newest state has it
+        # each name once, with the shape and type of the newest state
         for field in {field.name: field for state in states for field in state.fields}.values():
-            places = {
+            sources = {
                 i: (state.file, f"{group_name(state.number)}/{field.name}")
                 for i, state in enumerate(states)
                 if field in state.fields
@@ -99,18 +99,18 @@ def write_vtkhdf(folder: Path, states: Sequence[WrittenState], n_vertices: int, 
             n = rows[field.on]
             name = f"{GROUPS[field.on]}/{field.name}"
             shape = (len(states) * n, *field.shape[1:])
-            _virtual(root, name, shape, np.dtype(field.dtype), places, n)
+            _add_virtual_dataset(root, name, shape, np.dtype(field.dtype), sources, n)
             add_offsets(root, field.on, field.name, len(states), n)
 
 
-def describe(file: Any, times: Sequence[float], n_vertices: int, n_triangles: int) -> Any:
-    """Create and return the group ``/VTKHDF`` with all metadata; the data of states come later.
+def create_metadata(file: Any, times: Sequence[float], n_vertices: int, n_triangles: int) -> Any:
+    """Create and return the group ``/VTKHDF`` with all metadata but without the data of the states.
 
     Parameters
     ----------
     file : h5py.File
     times : sequence of float
-        [s].
+        Times of the states [s].
     """
     h5py = import_h5py()
     n = len(times)
@@ -140,39 +140,39 @@ def describe(file: Any, times: Sequence[float], n_vertices: int, n_triangles: in
 
 
 def add_offsets(root: Any, on: str, name: str, n_states: int, rows: int) -> None:
-    """Say where each step's rows of a field begin: ``rows`` for each state, 0 if all states share them."""
+    """Write each step's first row in a field that has ``rows`` rows per state; 0: all states share rows."""
     root[f"Steps/{GROUPS[on]}Offsets/{name}"] = rows * np.arange(n_states, dtype=np.int64)
 
 
-def _virtual(
+def _add_virtual_dataset(
     root: Any,
     name: str,
     shape: tuple[int, ...],
     kind: np.dtype[Any],
-    places: Mapping[int, tuple[str, str]],
+    sources: Mapping[int, tuple[str, str]],
     rows: int,
 ) -> None:
-    """A dataset whose rows ``i rows`` to ``(i + 1) rows`` are the dataset ``places[i]`` of another file.
+    """Add a virtual dataset whose i-th block of ``rows`` rows is the dataset ``sources[i]`` of another file.
 
-    Tensors of six components get VTK's order.
+    Tensors of six components are mapped to VTK's order.
     """
     h5py = import_h5py()
     layout = h5py.VirtualLayout(shape, kind)
-    for i, (file, dataset) in places.items():
+    for i, (file, dataset) in sources.items():
         source = h5py.VirtualSource(file, dataset, (rows, *shape[1:]))
-        here = slice(i * rows, (i + 1) * rows)
+        block = slice(i * rows, (i + 1) * rows)
         if not is_tensor(shape):
-            layout[here] = source
-        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else ():
-            layout[here, ours] = source[:, theirs]
+            layout[block] = source
+        for vtk, xdmf in VTK_COLUMNS if is_tensor(shape) else ():
+            layout[block, vtk] = source[:, xdmf]
     root.create_virtual_dataset(name, layout, np.nan if kind.kind == "f" else None)
 
 
 @contextmanager
-def _replaced(path: Path) -> Iterator[Any]:
-    """A file, built in memory, that takes the place of another in one instant.
+def _atomic_hdf5_file(path: Path) -> Iterator[Any]:
+    """A context with an HDF5 file in memory that replaces the file ``path`` atomically at its end.
 
-    One on disk takes the process down if it cannot grow while it is closed.
+    HDF5 would crash the process if a file on disk could not grow while it is closed.
     """
     in_memory = {"driver": "core", "backing_store": False}
     with writing(path, HDF5_ERRORS), import_h5py().File("unnamed", "w", **in_memory) as file:

@@ -1,12 +1,12 @@
-"""The XDMF text that shows state files as a time series in ParaView.
+"""states.xdmf: the XDMF document that presents the states files as a time series to ParaView.
 
-states.xdmf grows by one state at a time, and is a whole document at every moment.
-
-Behind the end of the document stands an XML processing instruction full of spaces. A state is written into
-it, with another end of the document and the opening of another such instruction behind it: so far nothing of
-this counts. Then the former end is overwritten with spaces, in one write within one page of the file, and
-what was the instruction's is the document's. Who reads meanwhile sees one or the other. Only where the room
-is used up is the file copied, with an eighth more.
+states.xdmf grows by one state at a time, and is a valid XML document at any time. The end of the document
+is followed by reserved space: an XML processing instruction that is filled with spaces. Appending a state
+takes two writes. The first writes, into the reserved space, the state's text, another end of the document
+and the opening of another such instruction; readers still ignore all of it. The second overwrites the former
+end of the document with spaces, within one page of the file, so that a concurrent reader sees either the old
+or the new document. If the reserved space is used up, the file is copied and gets an eighth of its size as
+new reserved space.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from lyra_petsc.output.agreement import cannot_write, replaced
+from lyra_petsc.output.file_operations import atomic_write, cannot_write
 
 XDMF_FILE = "states.xdmf"
 MESH_FILE = "mesh.h5"
@@ -36,7 +36,7 @@ class StoredField:
     on : str
         ``"vertex"`` or ``"triangle"``: what its rows belong to.
     shape : tuple of int
-        Rows first.
+        Number of rows, then the shape of a row.
     dtype : str
         numpy's name of the stored type.
     """
@@ -49,20 +49,20 @@ class StoredField:
 
 @dataclass(frozen=True)
 class WrittenState:
-    """A state file that is complete on disk.
+    """A state on disk.
 
     Attributes
     ----------
     number : int
         0 for the initial state, then one more for each written state.
     step : int
-        Accepted steps before it.
+        Number of accepted steps before the state.
     time : float
         [s].
     file : str
-        File name, relative to the XDMF file.
+        Name of the states file, relative to the XDMF file.
     fields : tuple of StoredField
-        What it holds besides the positions.
+        The state's datasets besides the positions.
     """
 
     number: int
@@ -72,7 +72,7 @@ class WrittenState:
     fields: tuple[StoredField, ...]
 
 
-# a row's number of components, as XDMF names it; other widths are matrices
+# XDMF's attribute type by the number of components of a row; other numbers are matrices
 ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", 6: "Tensor6", 9: "Tensor"}
 CENTERS = {"vertex": "Node", "triangle": "Cell"}
 
@@ -90,12 +90,11 @@ def group_name(number: int) -> str:
 
 
 class TimeSeries:
-    """The document that shows states of one mesh.
+    """The XDMF text of states that share one mesh.
 
     Parameters
     ----------
     n_vertices, n_triangles : int
-        Rows of positions and of triangles.
     """
 
     def __init__(self, n_vertices: int, n_triangles: int) -> None:
@@ -112,7 +111,7 @@ class TimeSeries:
         return DOCUMENT_START + "".join(map(self.grid, states)) + DOCUMENT_END
 
     def grid(self, state: WrittenState) -> str:
-        """A state's part of it."""
+        """The part of the document on one state."""
         group = f"{state.file}:/{group_name(state.number)}"
         position = _item((self._n_vertices, 3), "float64", f"{group}/position")
         return (
@@ -142,19 +141,19 @@ def _item(shape: tuple[int, ...], dtype: str, where: str) -> str:
 
 
 SEAM = (DOCUMENT_END + "<?room ").encode()
-"""The end of the document, and the opening of the room behind it."""
+"""End of the document and beginning of the reserved space after it."""
 
-ROOM_END = b"?>\n"
+RESERVE_END = b"?>\n"
 
 PAGE = 4096
-"""What a process that is killed writes whole or not at all [bytes]."""
+"""Size of a block that a killed process writes either completely or not at all [bytes]."""
 
-LEAST_ROOM, MOST_ROOM = 1 << 14, 1 << 20
-"""Bytes; XML readers keep an instruction in memory, and refuse one of 10 MB."""
+MIN_RESERVE, MAX_RESERVE = 1 << 14, 1 << 20
+"""Bounds of the reserved space [bytes]; XML readers keep it in memory and refuse 10 MB."""
 
 
 class GrowingXdmf:
-    """The file; for one rank.
+    """The file states.xdmf, to which states are appended; for one rank.
 
     Parameters
     ----------
@@ -167,24 +166,24 @@ class GrowingXdmf:
         self._size = -1
 
     def replace(self, grids: Iterable[str]) -> None:
-        """Write the document of these states.
+        """Replace the document by one with these states.
 
         Raises
         ------
         OutputError
-            If it could not be written; what stood there before stands.
+            If the file cannot be written; then the old file is kept.
         """
-        self._make([DOCUMENT_START.encode(), *(grid.encode() for grid in grids)], copied=0)
+        self._write_document([DOCUMENT_START.encode(), *(grid.encode() for grid in grids)], copied=0)
 
     def append(self, grid: str) -> None:
-        """Announce one more state.
+        """Append one state.
 
         Raises
         ------
         OutputError
-            If it could not be; what was announced stands.
+            If the file cannot be written; the document is then unchanged.
         FileNotFoundError
-            If somebody has removed or changed the file.
+            If another process has removed or changed the file.
         """
         text = grid.encode()
         begin = self._seam + len(SEAM)
@@ -193,12 +192,12 @@ class GrowingXdmf:
             status = self.path.stat()
             if status.st_size != self._size:
                 raise FileNotFoundError
-            if begin + len(text) + len(SEAM) + len(ROOM_END) > self._size:
-                self._make([text], copied=self._seam)
+            if begin + len(text) + len(SEAM) + len(RESERVE_END) > self._size:
+                self._write_document([text], copied=self._seam)
                 return
             with open(self.path, "r+b", buffering=0) as file:
                 os.pwrite(file.fileno(), text + SEAM, begin)
-                os.fdatasync(file.fileno())  # never after what makes it count
+                os.fdatasync(file.fileno())  # must be on disk before the write that makes it valid
                 os.pwrite(file.fileno(), b" " * len(SEAM), self._seam)
         except FileNotFoundError:
             raise
@@ -206,22 +205,22 @@ class GrowingXdmf:
             raise cannot_write(self.path, error) from error
         self._seam = begin + len(text)
 
-    def _make(self, pieces: list[bytes], copied: int) -> None:
-        """The first ``copied`` bytes of the file and these pieces, with new room, under its name."""
-        with replaced(self.path) as new:
+    def _write_document(self, pieces: list[bytes], copied: int) -> None:
+        """Replace the file by its first ``copied`` bytes, the pieces and new reserved space."""
+        with atomic_write(self.path) as new:
             if copied:
                 with open(self.path, "rb") as old:
                     while new.tell() < copied:
-                        new.write(old.read(min(copied - new.tell(), MOST_ROOM)))
+                        new.write(old.read(min(copied - new.tell(), MAX_RESERVE)))
             new.writelines(pieces)
             new.write(b" " * _pad(new.tell()))
             seam = new.tell()
             new.write(SEAM)
-            new.write(b" " * min(max(seam // 8, LEAST_ROOM), MOST_ROOM) + ROOM_END)
+            new.write(b" " * min(max(seam // 8, MIN_RESERVE), MAX_RESERVE) + RESERVE_END)
             size = new.tell()
         self._seam, self._size = seam, size
 
 
 def _pad(seam: int) -> int:
-    """Bytes by which a seam has to move to lie within one page."""
+    """Number of bytes by which `SEAM` at offset ``seam`` must move to lie within one page."""
     return -seam % PAGE if seam % PAGE + len(SEAM) > PAGE else 0

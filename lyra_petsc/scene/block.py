@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validato
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
-from lyra_petsc.errors import nearest
+from lyra_petsc.errors import suggest
 from lyra_petsc.scene.rules import Rule, holds
 from lyra_petsc.scene.values import problem, shown
 
@@ -58,7 +58,7 @@ class Block(BaseModel):
                 word = key if isinstance(key, str) else shown(key)
                 if word in cls.unsupported:
                     raise problem(cls.unsupported[word], word)
-                raise problem(f"unknown key, {nearest(word, known)}", word)
+                raise problem(f"unknown key, {suggest(word, known)}", word)
         kept = {key: value for key, value in data.items() if value is not None or key in cls.null_is_a_value}
         return cls.with_defaults(kept)
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import Self
 
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.materials.library import ClothTable, library_entries, shell_of_table
 from lyra_petsc.scene.messages import validated
@@ -243,7 +243,7 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
         name = Path(data).stem
         if name not in cloths:
             raise InputError(
-                f"neither a file nor a library cloth: {data!r}, {nearest(name, cloths)}", file=scene, key=key
+                f"neither a file nor a library cloth: {data!r}, {suggest(name, cloths)}", file=scene, key=key
             )
         table = cloths[name]
     c11, c12, c22, c33 = (max(c, 0.0) for c in (table.c11, table.c12, table.c22, table.c33))

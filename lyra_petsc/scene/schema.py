@@ -27,7 +27,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
@@ -552,7 +552,7 @@ class Material(Block):
     @classmethod
     def _check_cloth(cls, cloth: str | None) -> str | None:
         if cloth is not None and cloth not in material_names():
-            raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, material_names())}")
+            raise problem(f"unknown cloth {cloth!r}, {suggest(cloth, material_names())}")
         return cloth
 
 
@@ -1209,7 +1209,7 @@ class Output(Block):
         for name in value:
             if name not in FIELDS:
                 word = name if isinstance(name, str) else shown(name)
-                raise problem(f"unknown field {word!r}, {nearest(word, FIELDS)}")
+                raise problem(f"unknown field {word!r}, {suggest(word, FIELDS)}")
         return list(dict.fromkeys(value))
 
 
@@ -1533,7 +1533,7 @@ class Scene(Block):
 
     def _check_motion(self, motion: str | None, *at: str | int) -> None:
         if motion is not None and motion not in self.motions:
-            raise problem(f"unknown motion {motion!r}, {nearest(motion, self.motions)}", *at, "motion")
+            raise problem(f"unknown motion {motion!r}, {suggest(motion, self.motions)}", *at, "motion")
 
     def keyframes(self, obstacle: Obstacle) -> list[Keyframe]:
         """Keyframes of the motion of an obstacle of the scene; none if it is at rest."""

@@ -1,4 +1,4 @@
-"""Output of a run for people: pictures and films, a live page, reports, other formats.
+"""Pictures, films, a live page, reports and exports of a run.
 
 In: a run's folder, read by ``output``. Out: files for people and other programs.
 """

@@ -1,12 +1,12 @@
-"""States of a run in the formats of other programs: OBJ, PLY, npz, vtkhdf, glTF, USD.
+"""Export of a run's states to formats of other programs: OBJ, PLY, npz, vtkhdf, glTF, USD.
 
-In: a run's folder. Out: a folder of files, which is complete or not there.
+In: a run's folder. Out: a folder of files, which appears when it is complete.
 
-Positions are exactly those of the states; vertices and triangles are in the order of the mesh file. Of OBJ
-and PLY each state has a file; OBJ is written here, as meshio writes neither all digits nor texture
-coordinates with seams. The others hold all states in one file: NumPy's .npz and VTK's .vtkhdf as arrays, glTF
-2.0 the first state, a morph target for each further one and an animation, USD a mesh whose points and fields
-are sampled over time.
+Positions are exactly those of the states; vertices and triangles are in the order of the mesh file. OBJ and
+PLY have one file per state; OBJ is written here, as meshio writes neither all digits nor texture coordinates
+with seams. The other formats hold all states in one file: NumPy's .npz and VTK's .vtkhdf as arrays; glTF 2.0
+as the first state, a morph target for each further state and an animation; USD as a mesh whose points and
+fields are sampled over time.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, OutputError, nearest
-from lyra_petsc.extras import require
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.hdf5 import properties
+from lyra_petsc.errors import InputError, OutputError, suggest
+from lyra_petsc.extras import require_packages
+from lyra_petsc.output.file_operations import HDF5_ERRORS, reason
+from lyra_petsc.output.hdf5 import hdf5_properties
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
 from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.output.tensors import in_vtk_order, is_tensor
-from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, describe
-from lyra_petsc.show.render.render_plan import numbers, pick_state
+from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, create_metadata
+from lyra_petsc.show.render.render_plan import parse_numbers, pick_state
 from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-OURS = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
-"""Files that an export writes: --force removes no folder that holds others."""
+EXPORTED_FILE = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
+"""Names of the files that an export writes; --force removes no folder with other files."""
 
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format, which ``write_<name>`` writes.
+    """A format that the function ``write_<name>`` writes.
 
     Attributes
     ----------
     packages : tuple of str
-        What it needs of the extra ``export``.
+        Packages of the extra ``export`` that it needs.
     fields : bool
-        Whether it holds more than positions.
+        Whether it can hold fields besides positions.
     sequence : bool
-        Whether each state has a file, which does not hold its time.
+        Whether each state has a file of its own, without its time.
     """
 
     packages: tuple[str, ...] = ()
@@ -75,19 +75,20 @@ FORMATS = {
     "vtkhdf": ExportFormat(),
     "npz": ExportFormat(),
 }
-"""Formats by the names that ``--to`` takes."""
+"""Formats by their names in ``--to``."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """The result of an export.
 
     Attributes
     ----------
     folder : Path
     files : tuple of str
-        Their names, sorted.
+        Names of the files, sorted.
     states : int
+        Number of states.
     """
 
     folder: Path
@@ -114,35 +115,35 @@ def export_run(
     to : str
         One of ``FORMATS``.
     out : path, optional
-        Else a folder in the run's, with the name of the format.
+        By default a folder in the run's folder with the name of the format.
     times : str, optional
-        Numbers [s] with commas between: the states nearest to them.
+        Comma-separated times [s]: export the states nearest to them.
     every : int, optional
-        Every nth state.
+        Export every n-th state.
     displacement : bool
         Add the displacement from the run's first state as a field.
     force : bool
-        Replace a former export.
+        Replace an earlier export.
 
     Raises
     ------
     InputError
         Bad input; nothing is written.
     OutputError
-        If the files cannot be written; nothing is left of them.
+        If the files cannot be written; incomplete files are removed.
     """
     if to not in FORMATS:
-        raise InputError(f"unknown format {to!r}, {nearest(to, FORMATS)}", key="--to")
+        raise InputError(f"unknown format {to!r}, {suggest(to, FORMATS)}", key="--to")
     if displacement and not FORMATS[to].fields:
         able = ", ".join(name for name, form in FORMATS.items() if form.fields)
         raise InputError(f"{to} holds positions alone; take --to {able}", key="--displacement")
-    require(f"export --to {to}", FORMATS[to].packages, "export")
-    found = StoredRun(run)
-    folder = out if out is not None else found.folder / to
+    require_packages(f"export --to {to}", FORMATS[to].packages, "export")
+    stored = StoredRun(run)
+    folder = out if out is not None else stored.folder / to
     check_folder(folder, force=force)
-    states = replace(choose(found, times, every), displacement=displacement)
-    # without characters that Windows or a shell treats specially; letters of any script stay
-    name = re.sub(r"[^\w.+-]", "_", found.name).strip(".") or "run"
+    states = replace(select_states(stored, times, every), displacement=displacement)
+    # without characters that Windows or a shell treats specially; letters of any script are kept
+    name = re.sub(r"[^\w.+-]", "_", stored.name).strip(".") or "run"
 
     def work(part: Path) -> None:
         globals()[f"write_{to}"](states, part, name)
@@ -150,15 +151,15 @@ def export_run(
             with open(part / "times.csv", "w", encoding="utf-8", newline="") as file:
                 table = csv.writer(file, lineterminator="\n")
                 table.writerow(("file", "state", "time"))
-                numbered = enumerate(zip(states.chosen, states.times.tolist(), strict=True))
+                numbered = enumerate(zip(states.indices, states.times.tolist(), strict=True))
                 table.writerows((number, state, repr(time)) for number, (state, time) in numbered)
 
-    fill_folder(folder, work)
+    replace_folder(folder, work)
     return Exported(folder, tuple(sorted(file.name for file in folder.iterdir())), len(states))
 
 
 def check_folder(path: Path, *, force: bool) -> None:
-    """Check that a folder can be created or replaced, before anything is done.
+    """Check that a folder can be created or replaced, before any work begins.
 
     Raises
     ------
@@ -181,20 +182,20 @@ def _check_replaceable(path: Path, *, force: bool) -> None:
         raise InputError("is a file; name a folder", file=path, key="--out")
     if not force:
         raise InputError("exists; name another folder, or give --force to replace it", file=path, key="--out")
-    foreign = sorted(entry.name for entry in path.iterdir() if not OURS.fullmatch(entry.name))
+    foreign = sorted(entry.name for entry in path.iterdir() if not EXPORTED_FILE.fullmatch(entry.name))
     if foreign:
         raise InputError(
             f"holds '{foreign[0]}', which no export wrote; name another folder", file=path, key="--out"
         )
 
 
-def fill_folder(path: Path, work: Callable[[Path], None]) -> None:
-    """Let ``work`` write into a new folder, which gets its name at the end and replaces a former one.
+def replace_folder(path: Path, work: Callable[[Path], None]) -> None:
+    """Let ``work`` write into a new folder, which at the end replaces the folder ``path``.
 
     Raises
     ------
     OutputError
-        If it could not be written; a former folder is left as it was.
+        If the files cannot be written; an existing folder is then unchanged.
     """
     part, old = (path.with_name(path.name + ending) for ending in (".part", ".old"))
     created = [folder for folder in path.absolute().parents if not folder.exists()]
@@ -229,42 +230,42 @@ def _remove(folder: Path) -> None:
 
 
 SINGLE_RATE = 24.0
-"""ExportedStates a second where there is a single state."""
+"""States per second of an animation of a single state."""
 
 
 @dataclass(frozen=True)
 class ExportedStates:
-    """Some states of a run.
+    """States of a run to be exported.
 
     Attributes
     ----------
     run : StoredRun
-    chosen : tuple of int
+    indices : tuple of int
         Numbers of the states, ascending.
     displacement : bool
-        Whether the displacement from the run's first state is among the fields, if it was not written.
+        Whether to add the displacement from the run's first state to the fields, if the run lacks it.
     """
 
     run: StoredRun
-    chosen: tuple[int, ...]
+    indices: tuple[int, ...]
     displacement: bool = False
 
     def __len__(self) -> int:
-        return len(self.chosen)
+        return len(self.indices)
 
     @property
     def times(self) -> Array:
-        """(n,) [s]."""
-        return self.run.times[list(self.chosen)]
+        """(n,) times of the states [s]."""
+        return self.run.times[list(self.indices)]
 
     @property
     def positions(self) -> Iterator[Array]:
         """(V, 3) positions [m] of each state."""
-        return (self.run.positions[i] for i in self.chosen)
+        return (self.run.positions[i] for i in self.indices)
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """What is exported besides positions."""
+        """Names of the exported fields besides the positions."""
         written = self.run.fields
         return (*written, "displacement") if self._adds_displacement else written
 
@@ -273,7 +274,7 @@ class ExportedStates:
         return self.displacement and "displacement" not in self.run.fields
 
     def field_on(self, name: str) -> str:
-        """``vertex`` or ``triangle``."""
+        """``vertex`` or ``triangle``: what a field's rows belong to."""
         added = name == "displacement" and self._adds_displacement
         return "vertex" if added else self.run.field_on(name)
 
@@ -282,11 +283,11 @@ class ExportedStates:
         if name == "displacement" and self._adds_displacement:
             start = self.run.positions[0]
             return (position - start for position in self.positions)
-        return (self.run.field(name)[i] for i in self.chosen)
+        return (self.run.field(name)[i] for i in self.indices)
 
     @cached_property
     def obstacles(self) -> dict[str, ObstacleSurface]:
-        """The run's obstacles by unique names of letters, digits and underscores, none of them ``cloth``."""
+        """The run's obstacles by unique names of letters, digits and underscores other than ``cloth``."""
         if not self.run.scene.obstacles:
             return {}
         from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
@@ -302,13 +303,13 @@ class ExportedStates:
             named[label] = surface
         return {label: surface for label, surface in named.items() if surface is not None}
 
-    def places(self, obstacle: ObstacleSurface) -> Iterator[Array]:
-        """(n, 3) positions [m] of an obstacle's points in each state."""
+    def obstacle_points(self, obstacle: ObstacleSurface) -> Iterator[Array]:
+        """Positions (n, 3) [m] of an obstacle's points in each state."""
         return (obstacle.positions(float(time)) for time in self.times)
 
     @property
     def up(self) -> tuple[int, int]:
-        """Axis (0, 1, 2) and sign of the direction against gravity; +z without gravity."""
+        """Coordinate axis (0, 1, 2) and sign of the direction against gravity; +z without gravity."""
         gravity = np.asarray(self.run.scene.gravity or (0.0, 0.0, -1.0))
         axis = int(np.abs(gravity).argmax())
         if gravity[axis] == 0.0:
@@ -317,26 +318,26 @@ class ExportedStates:
 
     @property
     def rate(self) -> float:
-        """States a second, from the median of their intervals."""
+        """States per second, from the median of their intervals."""
         spacing = np.diff(self.times)
         return round(1.0 / float(np.median(spacing)), 6) if len(spacing) else SINGLE_RATE
 
 
-def choose(run: StoredRun, times: str | None, every: int | None) -> ExportedStates:
-    """The states nearest to some times, every nth state, or all.
+def select_states(run: StoredRun, times: str | None, every: int | None) -> ExportedStates:
+    """The states nearest to given times, every n-th state, or all states.
 
     Parameters
     ----------
     run : StoredRun
     times : str or None
-        ``--times``: numbers [s] with commas between.
+        ``--times``: comma-separated times [s].
     every : int or None
         ``--every``.
 
     Raises
     ------
     InputError
-        If both are given, for text that is not a number, or a time outside the run.
+        If both options are given, or for invalid numbers or times outside the run.
     """
     if times is not None and every is not None:
         raise InputError("choose states either by --times or by --every", key="--every")
@@ -344,70 +345,70 @@ def choose(run: StoredRun, times: str | None, every: int | None) -> ExportedStat
         raise InputError(f"must be at least 1, not {every}", key="--every")
     if times is None:
         return ExportedStates(run, tuple(range(0, len(run), every or 1)))
-    found = {pick_state(run, time, "--times") for time in numbers(times, "--times", "0,0.5,1")}
-    return ExportedStates(run, tuple(sorted(found)))
+    indices = {pick_state(run, time, "--times") for time in parse_numbers(times, "--times", "0,0.5,1")}
+    return ExportedStates(run, tuple(sorted(indices)))
 
 
-def turned_up(up: tuple[int, int], target: int) -> tuple[float, float, float, float]:
-    """Quaternion x, y, z, w of the rotation from the axis ``up``, with its sign, to the axis ``target``."""
+def rotation_to_up(up: tuple[int, int], target: int) -> tuple[float, float, float, float]:
+    """Quaternion (x, y, z, w) of the rotation from the axis ``up`` (axis, sign) to the axis ``target``."""
     start, end = np.zeros(3), np.zeros(3)
     start[up[0]], end[target] = up[1], 1.0
-    if start @ end < -0.5:  # half a turn about either of the other axes
-        about = np.zeros(3)
-        about[(target + 1) % 3] = 1.0
-        return (*about.tolist(), 0.0)
-    turn = np.append(np.cross(start, end), 1.0 + start @ end)
-    x, y, z, w = (turn / np.linalg.norm(turn)).tolist()
+    if start @ end < -0.5:  # opposite: half a turn about one of the other axes
+        axis = np.zeros(3)
+        axis[(target + 1) % 3] = 1.0
+        return (*axis.tolist(), 0.0)
+    quaternion = np.append(np.cross(start, end), 1.0 + start @ end)
+    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
     return x, y, z, w
 
 
 def write_obj(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>_0000.obj``, …; texture coordinates where the mesh came with them.
+    """Write ``<name>_0000.obj``, …, with the mesh's texture coordinates if it has any.
 
-    Where there are obstacles, they and the cloth are objects (``o``), the cloth first.
+    In a scene with obstacles, the cloth and the obstacles are objects (``o``), the cloth first.
     """
     texture, faces = _texture_and_faces(states)
-    moving = {label: states.places(obstacle) for label, obstacle in states.obstacles.items()}
+    moving = {label: states.obstacle_points(obstacle) for label, obstacle in states.obstacles.items()}
     for number, (time, position) in enumerate(zip(states.times, states.positions, strict=True)):
-        text = [f"# state {states.chosen[number]}, t = {time!r} s; m\n", "o cloth\n" if moving else ""]
-        text += [_points(position), texture, faces]
-        before = len(position)
-        for label, places in moving.items():
-            x = next(places)
-            text += [f"o {label}\n", _points(x), _faces(states.obstacles[label].triangles + before + 1)]
-            before += len(x)
+        text = [f"# state {states.indices[number]}, t = {time!r} s; m\n", "o cloth\n" if moving else ""]
+        text += [_vertex_lines(position), texture, faces]
+        first = len(position) + 1
+        for label, points in moving.items():
+            x = next(points)
+            text += [f"o {label}\n", _vertex_lines(x), _face_lines(states.obstacles[label].triangles + first)]
+            first += len(x)
         (folder / f"{name}_{number:04d}.obj").write_text("".join(text), encoding="utf-8")
 
 
-def _points(x: Array) -> str:
+def _vertex_lines(x: Array) -> str:
     return "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in x.tolist())
 
 
-def _faces(corners: Ints) -> str:
+def _face_lines(corners: Ints) -> str:
     return "".join(f"f {a} {b} {c}\n" for a, b, c in corners.tolist())
 
 
 def _texture_and_faces(states: ExportedStates) -> tuple[str, str]:
-    """The ``vt`` lines and the ``f`` lines, which all states share; numbers count from 1."""
+    """The ``vt`` lines and the ``f`` lines, which all states share; indices count from 1."""
     run = states.run
     corners = run.triangles + 1
     if run.corner_uv is None:
-        return "", _faces(corners)
+        return "", _face_lines(corners)
     if run.uv is not None:
-        uv, places = run.uv, corners
+        uv, uv_corners = run.uv, corners
     else:
-        uv, found = np.unique(run.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
-        places = found.reshape(-1, 3) + 1
+        uv, inverse = np.unique(run.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
+        uv_corners = inverse.reshape(-1, 3) + 1
     texture = "".join(f"vt {u!r} {v!r}\n" for u, v in uv.tolist())
-    rows = np.stack([corners, places], axis=2).reshape(-1, 6).tolist()
+    rows = np.stack([corners, uv_corners], axis=2).reshape(-1, 6).tolist()
     return texture, "".join(f"f {a}/{p} {b}/{q} {c}/{r}\n" for a, p, b, q, c, r in rows)
 
 
 def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>_0000.ply``, …: binary, double precision, with the fields on vertices.
 
-    Texture coordinates are ``s`` and ``t``; a texture with seams is left out. Obstacles have files of their
-    own, ``<name>-<obstacle>_0000.ply``, ….
+    Texture coordinates are ``s`` and ``t``; those with seams are omitted. Obstacles have files of their own,
+    ``<name>-<obstacle>_0000.ply``, ….
     """
     import meshio
 
@@ -427,7 +428,7 @@ def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
         meshio.write(folder / f"{name}_{number:04d}.ply", mesh, binary=True)
     for label, obstacle in states.obstacles.items():
         cells = [("triangle", obstacle.triangles.astype(np.int32))]
-        for number, x in enumerate(states.places(obstacle)):
+        for number, x in enumerate(states.obstacle_points(obstacle)):
             meshio.write(folder / f"{name}-{label}_{number:04d}.ply", meshio.Mesh(x, cells), binary=True)
 
 
@@ -438,9 +439,9 @@ OVERHEAD = 1 << 17
 def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>.npz``, one state in memory at a time.
 
-    ``time`` (T,), ``position`` (T, V, 3), each field (T, …), ``triangles`` (F, 3), ``rest`` (V, 3), where the
-    mesh has them ``uv`` (V, 2) or ``corner_uv`` (F, 3, 2), of each obstacle ``obstacle_<name>`` (T, n, 3) and
-    ``triangles_of_<name>`` (m, 3), and ``names`` and ``units`` (n,) of all of these.
+    Arrays: ``time`` (T,), ``position`` (T, V, 3), each field (T, …), ``triangles`` (F, 3), ``rest`` (V, 3);
+    texture coordinates ``uv`` (V, 2) or ``corner_uv`` (F, 3, 2), if the mesh has any; ``obstacle_<name>``
+    (T, n, 3) and ``triangles_of_<name>`` (m, 3) of each obstacle; ``names`` and ``units`` (n,) of the arrays.
     """
     run = states.run
     fixed = {"time": states.times, "triangles": run.triangles, "rest": run.rest}
@@ -452,7 +453,7 @@ def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     units |= {field: run.field_units(field) for field in states.fields}
     moving = {"position": states.positions} | {field: states.field(field) for field in states.fields}
     for label, obstacle in states.obstacles.items():
-        moving[f"obstacle_{label}"] = states.places(obstacle)
+        moving[f"obstacle_{label}"] = states.obstacle_points(obstacle)
         fixed[f"triangles_of_{label}"] = obstacle.triangles
         units |= {f"obstacle_{label}": "m", f"triangles_of_{label}": "1"}
     names = [*fixed, *moving]
@@ -486,36 +487,36 @@ def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
     Raises
     ------
     OutputError
-        If it cannot be written.
+        If a file cannot be written.
     """
     run = states.run
     fields = {field: (states.field_on(field), states.field(field)) for field in states.fields}
     moving = {"Points": ("vertex", states.positions), **fields}
-    _write_moving(folder / f"{name}.vtkhdf", states.times, run.triangles, {"rest": run.rest}, moving)
+    _write_series(folder / f"{name}.vtkhdf", states.times, run.triangles, {"rest": run.rest}, moving)
     for label, obstacle in states.obstacles.items():
-        path, places = folder / f"{name}-{label}.vtkhdf", states.places(obstacle)
-        _write_moving(path, states.times, obstacle.triangles, {}, {"Points": ("vertex", places)})
+        path, points = folder / f"{name}-{label}.vtkhdf", states.obstacle_points(obstacle)
+        _write_series(path, states.times, obstacle.triangles, {}, {"Points": ("vertex", points)})
 
 
-def _write_moving(
+def _write_series(
     path: Path,
     times: Array,
     triangles: Ints,
     fixed: dict[str, Array],
     moving: dict[str, tuple[str, Iterator[NDArray[Any]]]],
 ) -> None:
-    """Write a file of triangles.
+    """Write a time series of triangles to a VTKHDF file.
 
     Parameters
     ----------
     path : Path
     times : (T,)
-        Of the states [s].
+        Times of the states [s].
     triangles : (F, 3)
     fixed : dict of arrays
-        On vertices, the same in all states.
+        Arrays on vertices that all states share.
     moving : dict of (str, iterator)
-        For each state an array on the vertices or triangles; ``Points`` are the positions [m].
+        ``vertex`` or ``triangle``, and an array for each state; ``Points`` are the positions [m].
     """
     n, arrays, samples = len(times), {}, {}
     for field, (_, each) in moving.items():
@@ -523,10 +524,10 @@ def _write_moving(
         arrays[field] = chain([samples[field]], each)
     size = n * sum(array.nbytes for array in samples.values()) + 2 * triangles.nbytes + 64 * n + OVERHEAD
     try:
-        _reserve(path, size + 2 * sum(array.nbytes for array in fixed.values()))
-        places = {}
+        _reserve_bytes(path, size + 2 * sum(array.nbytes for array in fixed.values()))
+        datasets = {}
         with import_h5py().File(path, "w") as file:
-            root = describe(file, times.tolist(), len(samples["Points"]), len(triangles))
+            root = create_metadata(file, times.tolist(), len(samples["Points"]), len(triangles))
             for key, array in cells(triangles).items():
                 root[key] = array
             for key, array in fixed.items():
@@ -534,14 +535,14 @@ def _write_moving(
                 add_offsets(root, "vertex", key, n, 0)
             for field, first in samples.items():
                 on = moving[field][0]
-                places[field] = field if field == "Points" else f"{GROUPS[on]}/{field}"
-                _allocate(root, places[field], (n * len(first), *first.shape[1:]), first.dtype)
+                datasets[field] = field if field == "Points" else f"{GROUPS[on]}/{field}"
+                _create_dataset(root, datasets[field], (n * len(first), *first.shape[1:]), first.dtype)
                 if field != "Points":
                     add_offsets(root, on, field, n, len(first))
-        _reserve(path, path.stat().st_size)
+        _reserve_bytes(path, path.stat().st_size)
         with import_h5py().File(path, "r+") as file:
             for field, each in arrays.items():
-                stored = file[f"VTKHDF/{places[field]}"]
+                stored = file[f"VTKHDF/{datasets[field]}"]
                 for i, array in enumerate(each):
                     stored[i * len(array) : (i + 1) * len(array)] = in_vtk_order(array)
     except InputError:
@@ -550,35 +551,35 @@ def _write_moving(
         raise OutputError(f"{path.name}: cannot be written: {reason(error)}") from error
 
 
-def _reserve(path: Path, size: int) -> None:
-    """Allocate a file's bytes first: HDF5 crashes if the disk is full when a file is closed."""
+def _reserve_bytes(path: Path, size: int) -> None:
+    """Allocate a file's bytes in advance: HDF5 crashes if the disk is full when a file is closed."""
     with open(path, "r+b" if path.exists() else "wb") as raw:
         os.posix_fallocate(raw.fileno(), 0, size)
 
 
-def _allocate(root: Any, name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
-    """Create a dataset whose place in the file is allocated at once; its values are written later."""
+def _create_dataset(root: Any, name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
+    """Create a dataset whose space in the file is allocated at once; its values are written later."""
     h5py = import_h5py()
     space, stored = h5py.h5s.create_simple(shape), h5py.h5t.py_create(kind, logical=True)
-    h5py.h5d.create(root.id, name.encode(), stored, space, properties()[0])
+    h5py.h5d.create(root.id, name.encode(), stored, space, hdf5_properties()[0])
 
 
-LARGEST = 2**32
-"""Bytes of a file; the format counts them in 32 bits."""
+MAX_FILE_BYTES = 2**32
+"""Maximum size of a file [bytes], as the format counts them in 32 bits."""
 
 CLOTH = {"baseColorFactor": [0.75, 0.72, 0.66, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
 OBSTACLE = [0.35, 0.37, 0.4]
-"""Looks of the materials, which are seen from both sides."""
+"""Materials of glTF, which are visible from both sides."""
 
 VERTICES, INDICES, UNSIGNED_INT, FLOAT = 34962, 34963, 5125, 5126
-"""Numbers of the format: targets ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER, and component types."""
+"""glTF's codes of the targets ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER, and of component types."""
 
 
 def write_gltf(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>.glb``, single precision. Vertices on a texture seam are stored once for each side.
+    """Write ``<name>.glb`` in single precision.
 
-    ``extras.vertex`` of the mesh then holds the number of each of its vertices in the mesh file. Obstacles
-    are meshes and nodes of their own.
+    Vertices on a texture seam are stored once for each side; ``extras.vertex`` of the mesh then holds the
+    vertex numbers of the mesh file. Obstacles are meshes and nodes of their own.
 
     Raises
     ------
@@ -591,46 +592,46 @@ def write_gltf(states: ExportedStates, folder: Path, name: str) -> None:
     source, triangles, uv = np.arange(len(run.rest)), run.triangles, run.uv
     if uv is None and run.corner_uv is not None:
         source, triangles, uv = split_at_seams(triangles, run.corner_uv)
-    # positions are not changed; a rotation makes y, the format's upward axis, point up
-    document = _Document(states.times, turned_up(states.up, 1))
+    # positions stay unchanged: a rotation makes y, the format's upward axis, point up
+    document = _GltfDocument(states.times, rotation_to_up(states.up, 1))
     document.check_size(n * len(source) + sum(len(s.positions(0.0)) * n for s in states.obstacles.values()))
     title = run.scene.title or run.name
     cloth = document.add(title, 0, triangles, (position[source] for position in states.positions))
-    if uv is not None:  # v runs downwards
+    if uv is not None:  # glTF's v points downwards
         texture = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
         cloth["primitives"][0]["attributes"]["TEXCOORD_0"] = document.buffer.add(texture, target=VERTICES)
     if len(source) != len(run.rest):
         cloth["extras"] = {"vertex": source.tolist()}
     for obstacle in states.obstacles.values():
-        places = islice(states.places(obstacle), 1 if obstacle.still else n)
+        points = islice(states.obstacle_points(obstacle), 1 if obstacle.fixed else n)
         material = 1 if obstacle.opacity == 1.0 else 2
-        document.add(obstacle.name, material, obstacle.triangles, places)
+        document.add(obstacle.name, material, obstacle.triangles, points)
     gltf = GLTF2.from_dict(document.content(title, obstacles=bool(states.obstacles)))
     gltf.set_binary_blob(bytes(document.buffer.data))
     gltf.save_binary(str(folder / f"{name}.glb"))
 
 
-class _Document:
-    """Meshes that move, each with a node of its own; see `write_gltf`.
+class _GltfDocument:
+    """A glTF document of moving meshes, each with a node of its own; see `write_gltf`.
 
     Parameters
     ----------
     times : (n,) float64
-        Of the states [s].
+        Times of the states [s].
     rotation : (4,) float
         Quaternion of all nodes.
     """
 
     def __init__(self, times: Array, rotation: tuple[float, ...]) -> None:
-        self.buffer = _Buffer()
+        self.buffer = _GltfBuffer()
         self._times, self._rotation = times, rotation
         self._meshes: list[dict[str, Any]] = []
         self._nodes: list[dict[str, Any]] = []
         self._moving: list[int] = []
 
     def check_size(self, points: int) -> None:
-        """Refuse more ``points`` in all states than the format can count."""
-        if (size := points * 24) >= LARGEST:
+        """Check that the format can hold this number of points of all states together."""
+        if (size := points * 24) >= MAX_FILE_BYTES:
             raise InputError(
                 f"{len(self._times)} states take {size / 2**30:.0f} GiB, 4 are the most; choose fewer by "
                 "--every, or another format",
@@ -644,9 +645,10 @@ class _Document:
         triangles: Ints,
         positions: Iterator[Array],
     ) -> dict[str, Any]:
-        """Add a mesh: positions and normals of the first state, differences from them for the others.
+        """Add a mesh: positions and normals of the first state, and differences from them for the others.
 
-        ``positions`` has one for each state, or a single one of what stands still.
+        ``positions`` yields an array (V, 3) [m] for each state, or a single one of a mesh that does not move.
+        Returns the mesh's entry, to which attributes can be added.
         """
         start = next(positions)
         position, normal = start.astype(np.float32), _normals(start, triangles).astype(np.float32)
@@ -670,7 +672,7 @@ class _Document:
         return mesh
 
     def content(self, title: str, *, obstacles: bool) -> dict[str, Any]:
-        """The whole document, after which nothing is added."""
+        """The complete document; no mesh may be added afterwards."""
         materials = [{"name": "cloth", "pbrMetallicRoughness": CLOTH, "doubleSided": True}]
         for name, opacity in (("obstacle", 1.0), ("see-through obstacle", 0.3)) if obstacles else ():
             look = {**CLOTH, "baseColorFactor": [*OBSTACLE, opacity]}
@@ -696,14 +698,14 @@ class _Document:
 
 
 def _normals(x: Array, triangles: Ints) -> Array:
-    """(V, 3) unit normals; z where the triangles have no area."""
+    """(V, 3) unit normals of vertices; z if a vertex's triangles have no area."""
     normals = vertex_normals(x, triangles)
     normals[~normals.any(axis=1)] = 0.0, 0.0, 1.0
     return normals
 
 
-class _Buffer:
-    """The binary part of the file, with the views and accessors that say what is where in it."""
+class _GltfBuffer:
+    """The binary part of a glTF file, with the views and accessors that describe its arrays."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -711,7 +713,7 @@ class _Buffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, array: NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append (n,), (n, 2) or (n, 3) numbers; the number of their accessor."""
+        """Append an array (n,), (n, 2) or (n, 3); returns the index of its accessor."""
         rows = array if array.dtype == np.uint32 else array.astype(np.float32)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": rows.nbytes, "target": target}
         accessor = {
@@ -735,29 +737,28 @@ OBSTACLE_COLOUR = (0.6, 0.63, 0.66)
 
 
 def write_usd(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>.usdc``, single precision; metres, seconds times ``timeCodesPerSecond``.
+    """Write ``<name>.usdc`` in single precision; units are metres, and seconds times ``timeCodesPerSecond``.
 
-    Up is the direction against gravity. Velocities are the mesh's, other fields primvars of their names.
-    Obstacles are meshes beside the cloth.
+    The stage's up axis is the direction against gravity. Velocities are the mesh's ``velocities``, other
+    fields primvars. Obstacles are further meshes.
 
     Raises
     ------
     OutputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     from pxr import Tf, Usd
 
     path = folder / f"{name}.usdc"
     try:
         stage = Usd.Stage.CreateNew(str(path))
-        _fill(stage, states)
+        _fill_stage(stage, states)
         stage.GetRootLayer().Save()
     except Tf.ErrorException as error:
-        words = " ".join(str(error).split())
-        raise OutputError(f"{path.name}: cannot be written: {words[:200]}") from error
+        raise OutputError(f"{path.name}: cannot be written: {reason(error)}") from error
 
 
-def _fill(stage: Any, states: ExportedStates) -> None:
+def _fill_stage(stage: Any, states: ExportedStates) -> None:
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     run = states.run
@@ -769,7 +770,7 @@ def _fill(stage: Any, states: ExportedStates) -> None:
         UsdGeom.SetStageUpAxis(stage, "XYZ"[states.up[0]])
     else:
         UsdGeom.SetStageUpAxis(stage, "Z")
-        x, y, z, w = turned_up(states.up, 2)
+        x, y, z, w = rotation_to_up(states.up, 2)
         root.AddOrientOp().Set(Gf.Quatf(w, x, y, z))
 
     rate = states.rate
@@ -784,31 +785,31 @@ def _fill(stage: Any, states: ExportedStates) -> None:
     mesh = _mesh(stage, MESH, run.triangles)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     if run.corner_uv is not None:
-        uv, place = run.uv, UsdGeom.Tokens.vertex
+        uv, interpolation = run.uv, UsdGeom.Tokens.vertex
         if uv is None:  # the texture has seams
-            uv, place = run.corner_uv.reshape(-1, 2), UsdGeom.Tokens.faceVarying
-        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, place)
+            uv, interpolation = run.corner_uv.reshape(-1, 2), UsdGeom.Tokens.faceVarying
+        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, interpolation)
         st.Set(Vt.Vec2fArray.FromNumpy(uv.astype(np.float32)))
 
-    for moment, position in zip(codes, states.positions, strict=True):
-        _put(mesh, position, moment)
+    for code, position in zip(codes, states.positions, strict=True):
+        _set_points(mesh, position, code)
     for field in states.fields:
-        _sample(mesh, primvars, states, field, codes)
+        _set_field(mesh, primvars, states, field, codes)
     for label, obstacle in states.obstacles.items():
         mesh = _mesh(stage, f"{ROOT}/{label}", obstacle.triangles)
         mesh.GetPrim().SetDisplayName(obstacle.name)
         mesh.CreateDisplayColorAttr([Gf.Vec3f(*OBSTACLE_COLOUR)])
         mesh.CreateDisplayOpacityAttr([obstacle.opacity])
-        moments = codes[:1] if obstacle.still else codes
-        for moment, position in zip(moments, states.places(obstacle), strict=False):
-            _put(mesh, position, Usd.TimeCode.Default() if obstacle.still else moment)
+        obstacle_codes = [Usd.TimeCode.Default()] if obstacle.fixed else codes
+        for code, position in zip(obstacle_codes, states.obstacle_points(obstacle), strict=False):
+            _set_points(mesh, position, code)
 
 
-def _mesh(stage: Any, place: str, triangles: Ints) -> Any:
-    """A mesh without points, seen from both sides."""
+def _mesh(stage: Any, path: str, triangles: Ints) -> Any:
+    """Create a mesh without points, visible from both sides."""
     from pxr import UsdGeom, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, place)
+    mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr("none")
@@ -816,8 +817,8 @@ def _mesh(stage: Any, place: str, triangles: Ints) -> Any:
     return mesh
 
 
-def _put(mesh: Any, x: Array, code: Any) -> None:
-    """The points (n, 3) [m] of a mesh at a time code."""
+def _set_points(mesh: Any, x: Array, code: Any) -> None:
+    """Set the points (n, 3) [m] of a mesh at a time code."""
     from pxr import Vt
 
     single = np.ascontiguousarray(x, dtype=np.float32)
@@ -826,8 +827,8 @@ def _put(mesh: Any, x: Array, code: Any) -> None:
     mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(corners), code)
 
 
-def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes: list[float]) -> None:
-    """A field at each time code."""
+def _set_field(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes: list[float]) -> None:
+    """Set a field at each time code."""
     from pxr import Sdf, UsdGeom, Vt
 
     attribute: Any = None
@@ -839,8 +840,8 @@ def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes:
             else:
                 kind = Sdf.ValueTypeNames.Float3Array if vector else Sdf.ValueTypeNames.FloatArray
                 on_vertices = states.field_on(field) == "vertex"
-                place = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
-                primvar = primvars.CreatePrimvar(field, kind, place)
+                interpolation = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
+                primvar = primvars.CreatePrimvar(field, kind, interpolation)
                 if is_tensor(rows.shape):
                     primvar.SetElementSize(rows.shape[1])
                 attribute = primvar.GetAttr()

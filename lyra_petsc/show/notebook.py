@@ -1,4 +1,4 @@
-"""Runs as notebooks and scripts use them: progress while they go on, pictures, films and the page inline."""
+"""Runs for notebooks and scripts: simulating with progress, and pictures, films and reports shown inline."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lyra_petsc.errors import in_python
-from lyra_petsc.extras import require
+from lyra_petsc.errors import python_argument_names
+from lyra_petsc.extras import require_packages
 from lyra_petsc.output.read_run import StoredRun
 
 if TYPE_CHECKING:
@@ -30,16 +30,16 @@ class Media:
     Attributes
     ----------
     data : bytes
-        Of the file.
+        Content of the file.
     kind : str
-        Its MIME type.
+        MIME type.
     """
 
     def __init__(self, data: bytes, kind: str) -> None:
         self.data, self.kind = data, kind
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it to a file."""
+        """Write ``data`` to a file."""
         Path(path).write_bytes(self.data)
         return Path(path)
 
@@ -71,25 +71,25 @@ class Run(StoredRun):
     Raises
     ------
     InputError
-        If there is no run, or nothing of it can be read yet.
+        If the folder is not one of a run, or no state is written yet.
     """
 
     def __init__(self, folder: str | Path) -> None:
-        with in_python():
+        with python_argument_names():
             super().__init__(folder)
 
     def render(self, at: float | None = None, *, film: bool | str = False, **options: Any) -> Media:
-        """A picture or a film, as of the command ``render``; not collective.
+        """A picture or a film, as drawn by the command ``render``; not collective.
 
         Parameters
         ----------
         at : float, optional
-            Time of the picture [s]; the last state without it.
+            Time of the picture [s]; by default that of the last state.
         film : bool or str
             A film of the whole run instead: True for mp4, or ``"gif"``, ``"webm"``.
         **options
-            ``field``, ``range``, ``size``, ``fps``, ``speed``, ``texture``, ``colors``, ``handles``,
-            ``wind``, ``cells``, ``ground``, ``label``, ``settings``: as of the command.
+            The command's options ``field``, ``range``, ``size``, ``fps``, ``speed``, ``texture``, ``colors``,
+            ``handles``, ``wind``, ``cells``, ``ground``, ``label``, ``settings``.
 
         Returns
         -------
@@ -99,42 +99,41 @@ class Run(StoredRun):
         Raises
         ------
         InputError
-            For what cannot be drawn, or packages that are missing.
+            For options or data that cannot be drawn, or missing packages.
         TypeError
-            For an option that there is none of.
+            For an unknown option.
         """
-        with in_python():
+        with python_argument_names():
             from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 
-            require("render", PACKAGES, "view")
+            require_packages("render", PACKAGES, "view")
             from mpi4py import MPI
 
             from lyra_petsc.show.render.draw import draw
 
             with tempfile.TemporaryDirectory() as folder:
                 ending = film if isinstance(film, str) else "mp4"
-                asked: dict[str, Any] = {"out": Path(folder), "size": SIZE, **options}
+                chosen: dict[str, Any] = {"out": Path(folder), "size": SIZE, **options}
                 if film:
-                    asked["film"] = Path(folder) / f"film.{ending.lstrip('.')}"
+                    chosen["film"] = Path(folder) / f"film.{ending.lstrip('.')}"
                 else:
-                    asked["at"] = repr(float(self.times[-1] if at is None else at))
-                if isinstance(asked.get("range"), tuple | list):
-                    asked["range"] = ",".join(map(str, asked["range"]))
-                (path,) = draw(
-                    MPI.COMM_SELF, make_plan(RenderOptions(self.folder, **asked)), lambda done, count: None
-                )
+                    chosen["at"] = repr(float(self.times[-1] if at is None else at))
+                if isinstance(chosen.get("range"), tuple | list):
+                    chosen["range"] = ",".join(map(str, chosen["range"]))
+                plan = make_plan(RenderOptions(self.folder, **chosen))
+                (path,) = draw(MPI.COMM_SELF, plan, lambda done, count: None)
                 return Media(path.read_bytes(), TYPES[path.suffix.lower()])
 
     def report(self, out: str | os.PathLike[str] | None = None) -> Media:
-        """The page about the run, as of the command ``report``; written to ``out`` or the run's folder.
+        """The report page of the run, as written by the command ``report`` to ``out`` or the run's folder.
 
         Raises
         ------
         InputError, OutputError
-            If it cannot be made or written.
+            If the page cannot be created or written.
         """
-        with in_python():
-            require("report", ("matplotlib", "jinja2"))
+        with python_argument_names():
+            require_packages("report", ("matplotlib", "jinja2"))
             from lyra_petsc.show.report.run_page import write_page
 
             path = write_page(self.folder, None if out is None else Path(out))
@@ -154,26 +153,26 @@ def run(
 ) -> Run:
     """Simulate a scene and write its results, as the command ``run`` does; collective.
 
-    An interrupt (the stop button of a notebook, Ctrl-C) lets the step end, writes a checkpoint and raises
-    KeyboardInterrupt; ``resume=True`` goes on from there.
+    After an interrupt (the stop button of a notebook, Ctrl-C) the run finishes its step, writes a checkpoint
+    and raises KeyboardInterrupt; ``resume=True`` continues from the checkpoint.
 
     Parameters
     ----------
     scene : Scene, path or mapping
     out : path, optional
-        Folder of the results; else ``runs/<scene file stem>``, or ``…-2``, ``…-3`` when that exists.
+        Folder of the results; by default ``runs/<scene file stem>``, or ``…-2``, ``…-3`` if it exists.
     force : bool
         Replace the results in ``out``.
     resume : bool
-        Go on from the newest checkpoint.
+        Continue from the newest checkpoint.
     trust_mesh : bool
-        Give gmsh this scene's scripts (.geo) whatever they say.
+        Pass this scene's gmsh scripts (.geo) to gmsh without checking their commands.
     on_step : callable, optional
         Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
     comm : MPI.Comm, optional
-        COMM_WORLD unless given.
+        By default COMM_WORLD.
     progress : bool, optional
-        Show how far it is in the notebook; without it where there is one.
+        Show the progress in the notebook; by default in notebooks only.
 
     Returns
     -------
@@ -184,10 +183,10 @@ def run(
     InputError
         Bad input; nothing is written.
     SolverError, OutputError
-        The run could not go on; what was written stands.
+        The run failed; the states written before are kept.
     """
     from lyra_petsc.api.runs import run as simulate
 
-    with in_python():
-        how: dict[str, Any] = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
-        return Run(simulate(scene, out, **how, on_step=on_step, comm=comm, progress=progress))
+    with python_argument_names():
+        options: dict[str, Any] = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
+        return Run(simulate(scene, out, **options, on_step=on_step, comm=comm, progress=progress))

@@ -1,4 +1,4 @@
-"""The surfaces of a run's obstacles as triangles, for pictures and exports."""
+"""Triangulated surfaces of a run's obstacles, for pictures and exports."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     Raises
     ------
     InputError
-        If the run does not hold a mesh that its scene names, or is damaged.
+        If the run is damaged or lacks a mesh that its scene names.
     """
     obstacles = run.scene.obstacles or {}
     meshes = {name for name, obstacle in obstacles.items() if obstacle.mesh is not None}
@@ -41,10 +41,10 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     return build_obstacles(run.scene, stored, Motion)
 
 
-AROUND = 48
-"""Points of a circle of a sphere or capsule."""
+CIRCLE_POINTS = 48
+"""Points per circle of a sphere or capsule."""
 PLANE_SIZE = 1.5
-"""Side of the square that is shown of a plane, over the size of the sheets' motion."""
+"""Side of the square that represents a plane, relative to the size of the sheets' motion."""
 PLANE_OPACITY, CONTAINER_OPACITY = 0.5, 0.2
 
 _SQUARE: Ints = np.array([[0, 1, 2], [0, 2, 3]])
@@ -53,81 +53,83 @@ _AXES = np.eye(3)
 
 @dataclass(frozen=True)
 class ObstacleSurface:
-    """What is shown of an obstacle.
+    """The surface of an obstacle as triangles.
 
     Attributes
     ----------
     name : str
     triangles : (m, 3) int64
     positions : callable
-        Of a time [s]: its points (n, 3) [m].
-    still : bool
-        Whether they are the same at all times.
-    endless : bool
-        It is a plane, of which a square is shown.
+        Returns the points (n, 3) [m] at a time [s].
+    fixed : bool
+        Whether the points do not move.
+    infinite : bool
+        Whether the obstacle is a plane, represented by a square.
     opacity : float
-        Below 1 where it would hide the sheets.
-    round : bool
-        Whether its triangles stand for a smooth surface.
+        Below 1 if the surface would hide the sheets.
+    smooth : bool
+        Whether the triangles approximate a smooth surface.
     """
 
     name: str
     triangles: Ints
     positions: Callable[[float], Array]
-    still: bool
-    endless: bool = False
+    fixed: bool
+    infinite: bool = False
     opacity: float = 1.0
-    round: bool = False
+    smooth: bool = False
 
 
 def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[ObstacleSurface]:
-    """Of a run's obstacles, in the order of its scene.
+    """The surfaces of a run's obstacles, in the order of its scene.
 
     Parameters
     ----------
     run : StoredRun
     middle : (3,)
-        Of the sheets' motion [m]: there, or beside it, the square of a plane has its centre.
+        Centre of the sheets' motion [m]; its projection on a plane is the centre of the plane's square.
     size : float
-        Of the sheets' motion [m].
+        Size of the sheets' motion [m].
 
     Raises
     ------
     InputError
-        If the run does not hold a mesh that its scene names.
+        If the run lacks a mesh that its scene names.
     """
     scene = run.scene
     if not scene.obstacles:
         return []
-    shown = []
-    for one, obstacle in zip(run_obstacles(run), scene.obstacles.values(), strict=True):
-        still = one.motion is None
-        if obstacle.plane is not None:
-            assert isinstance(one, Container)
-            place = partial(_square, one, _tangents(one.normals[0]), middle, 0.5 * PLANE_SIZE * size)
-            shown.append(ObstacleSurface(one.name, _SQUARE, place, still, True, PLANE_OPACITY))
+    surfaces = []
+    for obstacle, spec in zip(run_obstacles(run), scene.obstacles.values(), strict=True):
+        fixed = obstacle.motion is None
+        if spec.plane is not None:
+            assert isinstance(obstacle, Container)
+            tangents, half = _tangents(obstacle.normals[0]), 0.5 * PLANE_SIZE * size
+            positions = partial(_square, obstacle, tangents, middle, half)
+            surfaces.append(ObstacleSurface(obstacle.name, _SQUARE, positions, fixed, True, PLANE_OPACITY))
             continue
-        if obstacle.mesh is not None:
-            assert isinstance(one, Solid)
-            surface = TriangleSurface(one.points, one.triangles)
+        if spec.mesh is not None:
+            assert isinstance(obstacle, Solid)
+            surface = TriangleSurface(obstacle.points, obstacle.triangles)
         else:
-            surface = shape_surface(obstacle)
-        place = partial(_carried, one, surface.points)
-        opacity = CONTAINER_OPACITY if obstacle.inside else 1.0
-        smooth = obstacle.shape in ("sphere", "capsule")
-        shown.append(ObstacleSurface(one.name, surface.triangles, place, still, False, opacity, smooth))
-    return shown
+            surface = shape_surface(spec)
+        positions = partial(_moved_points, obstacle, surface.points)
+        opacity, smooth = CONTAINER_OPACITY if spec.inside else 1.0, spec.shape in ("sphere", "capsule")
+        surfaces.append(
+            ObstacleSurface(obstacle.name, surface.triangles, positions, fixed, False, opacity, smooth)
+        )
+    return surfaces
 
 
-def _carried(obstacle: Solid | Container, points: Array, time: float) -> Array:
+def _moved_points(obstacle: Solid | Container, points: Array, time: float) -> Array:
     rotation, translation = obstacle.rigid_motion(time)
     return points @ rotation.T + translation
 
 
 def _square(plane: Container, tangents: Array, middle: Array, half: float, time: float) -> Array:
-    """(4, 3) corners of a square in a plane at a time [s], whose centre is nearest to ``middle``."""
-    normal, place = plane.normals_at(time)[0], plane.positions(time)[0]
-    centre = middle - ((middle - place) @ normal) * normal
+    """(4, 3) corners [m] of a square in a plane at a time [s]; its centre is the projection of ``middle``."""
+    normal, point = plane.normals_at(time)[0], plane.positions(time)[0]
+    centre = middle - ((middle - point) @ normal) * normal
     first, second = half * tangents @ plane.rigid_motion(time)[0].T
     return np.array(
         [centre - first - second, centre + first - second, centre + first + second, centre - first + second]
@@ -135,7 +137,7 @@ def _square(plane: Container, tangents: Array, middle: Array, half: float, time:
 
 
 def _tangents(normal: Array) -> Array:
-    """(2, 3) unit vectors that make a right-handed frame with a unit normal."""
+    """(2, 3) unit vectors that form a right-handed frame with a unit normal."""
     first = np.cross(_AXES[np.abs(normal).argmin()], normal)
     first /= np.linalg.norm(first)
     return np.array([first, np.cross(normal, first)])
@@ -150,24 +152,24 @@ def shape_surface(obstacle: Obstacle) -> TriangleSurface:
     length = float(np.linalg.norm(along))
     up = along / length if length > 0.0 else _AXES[2]
     across = _tangents(up)
-    angles = np.linspace(0.0, np.pi, AROUND // 2 + 1)[1:-1]
+    angles = np.linspace(0.0, np.pi, CIRCLE_POINTS // 2 + 1)[1:-1]
     middle = len(angles) // 2
     if length > 0.0:  # a circle around either end
         angles = np.insert(angles, middle, angles[middle])
-    circle = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    circle = 2.0 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
     rings = np.stack([np.cos(circle), np.sin(circle)], axis=1) @ across
     ends = np.where((np.arange(len(angles)) <= middle)[:, None], axis[-1], axis[0])
     points = ends[:, None] + radius * (
         np.sin(angles)[:, None, None] * rings + np.cos(angles)[:, None, None] * up
     )
     poles = np.array([axis[-1] + radius * up, axis[0] - radius * up])
-    here, n = np.arange(AROUND), AROUND * len(angles)
-    after = (here + 1) % AROUND
-    first = np.arange(len(angles) - 1)[:, None] * AROUND
-    a, b, c, d = first + here, first + AROUND + here, first + AROUND + after, first + after
-    top = np.stack([np.full(AROUND, n), here, after], axis=1)
-    last = n - AROUND
-    bottom = np.stack([np.full(AROUND, n + 1), last + after, last + here], axis=1)
+    here, n = np.arange(CIRCLE_POINTS), CIRCLE_POINTS * len(angles)
+    after = (here + 1) % CIRCLE_POINTS
+    first = np.arange(len(angles) - 1)[:, None] * CIRCLE_POINTS
+    a, b, c, d = first + here, first + CIRCLE_POINTS + here, first + CIRCLE_POINTS + after, first + after
+    top = np.stack([np.full(CIRCLE_POINTS, n), here, after], axis=1)
+    last = n - CIRCLE_POINTS
+    bottom = np.stack([np.full(CIRCLE_POINTS, n + 1), last + after, last + here], axis=1)
     sides = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)]).reshape(-1, 3)
     triangles = np.concatenate([top, sides, bottom]).astype(np.int64)
     return TriangleSurface(np.concatenate([points.reshape(-1, 3), poles]), triangles)

@@ -146,7 +146,7 @@ def build_problem(
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = known or build_scene_mesh(scene, phases.tell)
+        mesh = known or build_scene_mesh(scene, phases.report)
         outline, whole = _whole(scene, mesh)
         whole.owner = owner
         return outline

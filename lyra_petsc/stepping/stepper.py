@@ -16,7 +16,7 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.petsc_options import PYTHON_SUFFIXES, Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.parallel import all_here
+from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.blend import Blend
@@ -385,7 +385,7 @@ class Stepper:
         except Exception as error:
             if not isinstance(error, PETSc.Error) and not _runs_foreign_python():
                 raise
-            together = all_here(equations.points.comm)
+            together = all_ranks_arrive(equations.points.comm)
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.error_message(error)}; "

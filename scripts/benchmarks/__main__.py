@@ -22,8 +22,8 @@ from tables import document, growth
 
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
-from lyra_petsc.errors import InputError, OutputError, nearest
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.errors import InputError, OutputError, suggest
+from lyra_petsc.output.file_operations import replace_text
 
 DEFAULT = {"vertices": [1024, 10201, 50176], "weak": 25_000, "output": 200_000}
 QUICK = {"vertices": [1024, 4900], "weak": 2_500, "output": 10_201}
@@ -101,7 +101,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     if asked.bending is not None:
         for kind in asked.bending:
             if kind not in BENDING_MESHES:
-                raise InputError(f"unknown mesh {kind!r}, {nearest(kind, BENDING_MESHES)}", key="--bending")
+                raise InputError(f"unknown mesh {kind!r}, {suggest(kind, BENDING_MESHES)}", key="--bending")
         asked.bending = asked.bending or list(BENDING_MESHES)
     if asked.against is not None:
         asked.against = asked.against.resolve()

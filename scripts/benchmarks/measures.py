@@ -27,7 +27,7 @@ from peers import measure_peer
 from processes import HERE, Limits, measure, run
 
 from lyra_petsc.api.mpirun import find_launcher
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.experiments.study.study_report import processor
 from lyra_petsc.linear.presets import PRESETS
 
@@ -175,7 +175,7 @@ def preset_names(names: Sequence[str]) -> list[str]:
     """
     for name in names:
         if name not in PRESETS:
-            raise InputError(f"unknown preset {name!r}, {nearest(name, PRESETS)}", key="--presets")
+            raise InputError(f"unknown preset {name!r}, {suggest(name, PRESETS)}", key="--presets")
     return list(names) or list(PRESETS)
 
 

@@ -38,7 +38,7 @@ from lyra_petsc.errors import LyraError  # noqa: E402
 from lyra_petsc.linear.matrix import AssembledMatrix  # noqa: E402
 from lyra_petsc.output.read_run import StoredRun  # noqa: E402
 from lyra_petsc.output.recorder import Recorder  # noqa: E402
-from lyra_petsc.output.summary import versions  # noqa: E402
+from lyra_petsc.output.summary import library_versions  # noqa: E402
 from lyra_petsc.scene.schema import Scene  # noqa: E402
 from lyra_petsc.stepping.simulation import SteppedScene  # noqa: E402
 
@@ -244,7 +244,7 @@ def output(comm: Comm, job: Result) -> Result:
         simulation.step_number, simulation.time = number, number * simulation.control.step
         began = now(comm)
         recorder.write_state()
-        recorder.settle()
+        recorder.flush()
         ours.append(now(comm) - began)
         run = StoredRun(folder)
         state = run.positions[number].nbytes + sum(run.field(name)[number].nbytes for name in run.fields)
@@ -279,7 +279,7 @@ def main() -> None:
     comm = MPI.COMM_WORLD
     job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     try:
-        result = KINDS[job["kind"]](comm, job) | {"ranks": comm.size, "versions": versions()}
+        result = KINDS[job["kind"]](comm, job) | {"ranks": comm.size, "versions": library_versions()}
     except LyraError as error:
         if comm.rank == 0:
             print(f"lyra-petsc: {error}", file=sys.stderr, flush=True)

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from lyra_petsc.cli.check_run import check_run
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter

@@ -26,29 +26,29 @@ def test_it_goes_on_meanwhile_and_is_waited_for(comm: MPI.Comm) -> None:
         go.wait()
         done.append(comm.rank)
 
-    background.begin(work)
+    background.submit(work)
     assert not done
     go.set()
-    background.settle()
+    background.wait()
     assert done == [0] * (comm.rank == 0)
     background.close()
 
 
 def test_failures_are_told_once_and_to_every_rank(comm: MPI.Comm) -> None:
     background = Background(comm)
-    background.begin(fail)
+    background.submit(fail)
     with pytest.raises(OutputError, match="No space left"):
-        background.settle()
-    background.settle()
+        background.wait()
+    background.wait()
     background.close()
 
 
 def test_mistakes_are_not_hidden(comm: MPI.Comm) -> None:
     background = Background(comm)
-    background.begin(lambda: [][0])
+    background.submit(lambda: [][0])
     if comm.rank == 0:
         with pytest.raises(IndexError):
-            background.settle()
+            background.wait()
     background.close()
 
 

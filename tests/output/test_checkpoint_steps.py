@@ -27,7 +27,7 @@ def test_checkpoints_by_steps(
     shared_tmp: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "CHEAP", float("inf"))  # none because it costs little
+    monkeypatch.setattr(module, "MIN_COST_RATIO", float("inf"))  # none because it costs little
     checkpoint = {} if every is None else {"steps": every}
     scene = scene_of(
         {
@@ -45,7 +45,7 @@ def test_checkpoints_by_steps(
     steps = [written(comm, shared_tmp)]
     while not simulation.finished:
         recorder.record(simulation.step())
-        recorder.settle()
+        recorder.flush()
         steps.append(written(comm, shared_tmp))
     recorder.close()
     simulation.destroy()

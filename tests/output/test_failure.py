@@ -18,7 +18,7 @@ from lyra_petsc.output.states import (
     FAILURE_DATA,
     FAILURE_TEXT,
     FAILURE_XDMF,
-    StateInTime,
+    FailureState,
     remove_failure,
     write_failure,
 )
@@ -33,8 +33,8 @@ def write(comm: MPI.Comm, folder: Path) -> None:
     mesh = Mesh(REST, REST, TRIANGLES, REST[TRIANGLES][..., :2].copy(), np.zeros(3, dtype=bool))
     write_mesh(folder, mesh if comm.rank == 0 else None, comm)
     owned = np.arange(5)[::-1][comm.rank :: comm.size]
-    before = StateInTime(0.25, REST[owned], {"velocity": REST[owned]})
-    failing = StateInTime(0.375, REST[owned] + 1, {"velocity": 1 + REST[owned], "residual": 2 * REST[owned]})
+    before = FailureState(0.25, REST[owned], {"velocity": REST[owned]})
+    failing = FailureState(0.375, REST[owned] + 1, {"velocity": 1 + REST[owned], "residual": 2 * REST[owned]})
     write_failure(folder, FileOrder(comm, owned, 5), 3, 7, (before, failing), "why\n")
 
 
@@ -71,6 +71,6 @@ def test_a_new_run_removes_them(comm: MPI.Comm, shared_tmp: Path) -> None:
 
 def test_a_folder_that_is_gone_is_told_on_all_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     owned = np.arange(5)[comm.rank :: comm.size]
-    moment = StateInTime(0.0, REST[owned], {})
+    moment = FailureState(0.0, REST[owned], {})
     with pytest.raises(OutputError, match=r"failure\.txt: cannot be written"):
         write_failure(shared_tmp / "gone", FileOrder(comm, owned, 5), 3, 0, (moment, moment), "")

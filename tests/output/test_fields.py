@@ -8,7 +8,7 @@ from mpi4py import MPI
 from physics import Simulation, grid
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.fields import FIELDS, check_field, chosen
+from lyra_petsc.output.fields import FIELDS, check_field, chosen_fields
 from lyra_petsc.scene import schema as control
 from lyra_petsc.terms.bending import Bending
 
@@ -92,4 +92,4 @@ def test_a_scene_that_does_not_name_it_keeps_no_start() -> None:
 def test_a_field_of_an_absent_term_is_refused() -> None:
     content = ALL | {"material": MATERIAL | {"bending": 0}, "output": {"fields": ["curvature"]}}
     with Simulation(content, MPI.COMM_SELF) as simulation, pytest.raises(InputError, match="bending"):
-        chosen(simulation.problem)
+        chosen_fields(simulation.problem)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.parallel(3)
 h5py = import_h5py()
 
 
-WAYS = {"one machine": "_write_alone", "MPI-IO": "_write_through_mpi", "in turn": "_write_alone"}
+WAYS = {"one machine": "_write_serial", "MPI-IO": "_write_with_mpi_io", "in turn": "_write_serial"}
 
 
 @pytest.fixture(params=WAYS)
@@ -133,7 +133,7 @@ def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
 def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, way, monkeypatch):
     path = shared_tmp / "a.h5"
     write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
-    name = "_write_rows_together" if way == "_write_through_mpi" else "_write_rows"
+    name = "_write_rows_collective" if way == "_write_with_mpi_io" else "_write_rows"
     right = getattr(hdf5, name)
 
     def write_and_fail(*arguments):

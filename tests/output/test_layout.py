@@ -7,14 +7,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lyra_petsc.output.hdf5 import LARGEST_OVERHEAD, Attributes, lay_out
-from lyra_petsc.output.stored import text_of
+from lyra_petsc.output.hdf5 import MAX_OVERHEAD, Attributes, preallocate
+from lyra_petsc.output.stored import text_attribute
 
 
 def check(path: Path, rows: dict[str, int], attributes: Attributes, columns: int = 3) -> int:
     """Lay a file out, fill its places, and read all back; its size."""
     slabs = {name: np.random.default_rng(n).random((n, columns)) for name, n in rows.items()}
-    places = lay_out(path, slabs, list(rows.values()), attributes)
+    places = preallocate(path, slabs, list(rows.values()), attributes)
     with open(path, "r+b") as file:
         for place, slab in zip(places, slabs.values(), strict=True):
             file.seek(place)
@@ -27,7 +27,9 @@ def check(path: Path, rows: dict[str, int], attributes: Attributes, columns: int
             np.testing.assert_array_equal(file[name][:], slab)
         for owner, values in attributes.items():
             texts = {key for key, value in values.items() if isinstance(value, str)}
-            found = {k: text_of(file[owner], k) if k in texts else v for k, v in file[owner].attrs.items()}
+            found = {
+                k: text_attribute(file[owner], k) if k in texts else v for k, v in file[owner].attrs.items()
+            }
             assert found == values
     return path.stat().st_size
 
@@ -39,7 +41,7 @@ def test_a_state(tmp_path: Path) -> None:
         f"{group}/position": {"time": 0.1, "step": 3, "on": "vertex"},
     }
     size = check(tmp_path / "a.h5", {f"{group}/position": 50, f"{group}/velocity": 50}, attributes)
-    assert size < 2 * 50 * 24 + LARGEST_OVERHEAD
+    assert size < 2 * 50 * 24 + MAX_OVERHEAD
 
 
 def test_long_texts_and_groups_at_any_depth(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.study.comparison import read_local
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_folder import choose
-from lyra_petsc.output.stored import open_own, open_stored
+from lyra_petsc.output.run_folder import choose_folder
+from lyra_petsc.output.stored import open_contained, open_stored
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 POSITION = "states/000001/position"
@@ -165,7 +165,7 @@ def test_groups_that_hold_themselves_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["a/b"] = 1.0
         file["a/c"] = file["a"]
-    with pytest.raises(InputError, match="a group in several places"), open_own(tmp_path / "x.h5"):
+    with pytest.raises(InputError, match="a group in several places"), open_contained(tmp_path / "x.h5"):
         pass
 
 
@@ -175,7 +175,7 @@ def test_few_groups_that_look_like_very_many_are_refused_at_once(tmp_path: Path)
         for above, below in pairwise(groups):
             for number in range(60):  # 60⁶ paths
                 above[f"{number}"] = below
-    with pytest.raises(InputError, match="a group in several places"), open_own(tmp_path / "x.h5"):
+    with pytest.raises(InputError, match="a group in several places"), open_contained(tmp_path / "x.h5"):
         pass
 
 
@@ -183,11 +183,11 @@ def test_a_file_that_changes_is_looked_at_again(tmp_path: Path) -> None:
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
         file["a"] = np.zeros(3)
-    with open_own(path) as file:
+    with open_contained(path) as file:
         assert list(file) == ["a"]
     with h5py.File(path, "r+") as file:
         file["b"] = h5py.ExternalLink("other.h5", "/b")
-    with pytest.raises(InputError, match="'/b' is a link to elsewhere"), open_own(path):
+    with pytest.raises(InputError, match="'/b' is a link to elsewhere"), open_contained(path):
         pass
 
 
@@ -205,9 +205,9 @@ def test_a_resumed_run_follows_no_link(shared_tmp: Path, comm: MPI.Comm) -> None
                 os.symlink("/etc/passwd", folder / "history.csv")
     comm.Barrier()
     with pytest.raises(InputError, match="'/vertices/position' is a link to elsewhere"):
-        choose(comm, "scene", shared_tmp / "one", resume=True)
+        choose_folder(comm, "scene", shared_tmp / "one", resume=True)
     with pytest.raises(InputError, match=r"history\.csv: is a link out of the folder"):
-        choose(comm, "scene", shared_tmp / "two", resume=True)
+        choose_folder(comm, "scene", shared_tmp / "two", resume=True)
     from lyra_petsc.output.hdf5 import read_slab
 
     order = FileOrder(comm, np.arange(4) if comm.rank == 0 else np.arange(0), 4)

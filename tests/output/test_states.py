@@ -240,7 +240,7 @@ def test_an_older_folder_goes_on(comm, shared_tmp):
 def test_few_files_and_a_document_that_grows(comm, shared_tmp, run, monkeypatch):
     """Files double; the document is copied now and then only, and is whole after every write to it."""
     copies, whole = [], []
-    make, pwrite = xdmf.GrowingXdmf._make, os.pwrite
+    make, pwrite = xdmf.GrowingXdmf._write_document, os.pwrite
 
     def counted(self, *arguments, **keywords):
         copies.append(1)
@@ -252,7 +252,7 @@ def test_few_files_and_a_document_that_grows(comm, shared_tmp, run, monkeypatch)
             whole.append(len(ElementTree.parse(shared_tmp / XDMF_FILE).findall("./Domain/Grid/Grid")))
         return done
 
-    monkeypatch.setattr(xdmf.GrowingXdmf, "_make", counted)
+    monkeypatch.setattr(xdmf.GrowingXdmf, "_write_document", counted)
     monkeypatch.setattr(xdmf.os, "pwrite", checked)
     for step in range(90):
         run.write(step)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.output.summary import library_versions, write_summary
 
 pytestmark = pytest.mark.parallel(3)
 
@@ -45,7 +45,7 @@ def test_versions_name_what_takes_part(monkeypatch):
     from petsc4py import PETSc
 
     monkeypatch.delitem(sys.modules, "numba", raising=False)
-    found = versions()
+    found = library_versions()
     assert found["petsc"] == "{}.{}.{}".format(*PETSc.Sys.getVersion())
     assert found["numpy"] == np.__version__
     assert found["python"] == sys.version.split()[0]

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import lyra_petsc
-from lyra_petsc.errors import InputError, SolverError, in_python
+from lyra_petsc.errors import InputError, SolverError, python_argument_names
 
 SCENE = {
     "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 3, "ny": 3}},
@@ -90,7 +90,7 @@ def test_errors_are_short_and_in_pythons_words(run, tmp_path) -> None:
 
 
 def test_details_are_said_in_pythons_words_too() -> None:
-    with pytest.raises(SolverError) as caught, in_python():
+    with pytest.raises(SolverError) as caught, python_argument_names():
         raise SolverError("stopped", details=("--resume goes on", "take --set"))
     assert caught.value._render_traceback_() == [
         "SolverError: stopped",

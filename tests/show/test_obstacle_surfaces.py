@@ -57,8 +57,8 @@ def test_a_plane_is_a_square_nearest_to_the_sheets_at_all_times(tmp_path: Path) 
     ]
     plane = {"plane": {"point": [0, 0, -1], "normal": [0, 0, 2]}, "motion": frames}
     surface = shown(tmp_path / "run", plane, [3, 4, 5], 2.0)
-    assert surface.endless
-    assert not surface.still
+    assert surface.infinite
+    assert not surface.fixed
     assert 0 < surface.opacity < 1
     # turned about the origin by 90°, z = -1 becomes x = -1, then it is moved by 90
     for time, centre, normal in ((0, [3, 4, -1], 2), (1, [3, 4, 0], 2), (2, [89, 4, 5], 0)):
@@ -75,6 +75,6 @@ def test_only_containers_and_planes_are_seen_through(tmp_path: Path) -> None:
     shape = {"sphere": {"center": [0, 0, 0], "radius": 2}}
     ball = shown(tmp_path / "out", shape, [0, 0, 0], 1.0)
     hull = shown(tmp_path / "in", shape | {"inside": True}, [0, 0, 0], 1.0)
-    assert (ball.opacity, ball.still, ball.round, ball.endless) == (1.0, True, True, False)
+    assert (ball.opacity, ball.fixed, ball.smooth, ball.infinite) == (1.0, True, True, False)
     assert 0 < hull.opacity < 1
     np.testing.assert_array_equal(ball.positions(0.0), hull.positions(9.0))

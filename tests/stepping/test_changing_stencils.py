@@ -216,7 +216,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
     for _ in range(18):  # the sheets touch
         recorder.record(simulation.step())
     recorder.write_checkpoint()
-    recorder.settle()
+    recorder.flush()
     recorder.close()
     touched = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
     assert touched.max() > 1.0
@@ -238,7 +238,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
         np.testing.assert_array_equal(kept, touched)
         while not resumed.finished:
             again.record(resumed.step())
-        again.settle()
+        again.flush()
         again.close()
         np.testing.assert_allclose(shape(resumed), x, rtol=0, atol=1e-8)
         np.testing.assert_array_equal(

@@ -991,7 +991,7 @@ def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path, row: int = -1
     recorder.begin(folder)
     while not simulation.finished:
         recorder.record(simulation.step())
-    recorder.settle()
+    recorder.flush()
     recorder.close()
     simulation.destroy()
     lines = (folder / "reactions.csv").read_text().splitlines()

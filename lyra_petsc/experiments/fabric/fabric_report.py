@@ -11,7 +11,7 @@ from typing import Any
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.results import Line, View, verdict_line, write_csv
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
-from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure
+from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def pictures(outcome: FabricOutcome) -> list[Drawing]:
             axes.set_aspect("equal", adjustable="datalim")  # a shape, not a diagram
         if len(record.curves) > 1:
             axes.legend(fontsize=8)
-        found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))
+        found.append(make_drawing(figure, f"{PLOTS}/{name}", outcome.case.title))
     if record.shadow:
         figure = empty_figure(HEIGHT)
         axes = figure.add_subplot(xlabel="x [cm]", ylabel="y [cm]")
@@ -196,5 +196,5 @@ def pictures(outcome: FabricOutcome) -> list[Drawing]:
             record.shadow, cmap="Greys", origin="lower", extent=(-half, half, -half, half),
             interpolation="nearest", vmin=0, vmax=1.4,
         )  # fmt: skip
-        found.append(drawn(figure, f"{PLOTS}/{name}-shadow", f"{name}: the shadow of the last start"))
+        found.append(make_drawing(figure, f"{PLOTS}/{name}-shadow", f"{name}: the shadow of the last start"))
     return found

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.materials.library import ShellMaterial, material_names, measured_names, resolve_material
@@ -96,7 +96,7 @@ def fabric_of(material: str, settings: Sequence[str] = ()) -> Fabric:
         scene = load_scene(path, settings)
     else:
         raise InputError(
-            f"no cloth of the library and no scene file, {nearest(material, material_names())}", key=material
+            f"no cloth of the library and no scene file, {suggest(material, material_names())}", key=material
         )
     block = dict(parse_yaml(dump_scene(scene), file=path)["material"][0])
     for key in ("group", "rest_curvature"):

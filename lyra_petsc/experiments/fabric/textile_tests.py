@@ -20,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, SolverError, nearest
+from lyra_petsc.errors import InputError, SolverError, suggest
 from lyra_petsc.experiments.bench import Bench, failure_message
 from lyra_petsc.experiments.case import Launcher, Watch
 from lyra_petsc.experiments.drape import (
@@ -567,7 +567,7 @@ def cases_of(test: str) -> list[FabricCase]:
         For an unknown test.
     """
     if test != ALL and test not in TESTS:
-        raise InputError(f"unknown test, {nearest(test, [*TESTS, ALL])}", key=test)
+        raise InputError(f"unknown test, {suggest(test, [*TESTS, ALL])}", key=test)
     found = []
     for name in TESTS if test == ALL else [test]:
         each = TESTS[name]

@@ -14,7 +14,7 @@ from lyra_petsc.experiments.fit.estimate import Estimate
 from lyra_petsc.experiments.fit.fit_runner import Fitted
 from lyra_petsc.experiments.results import View, align_columns
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
-from lyra_petsc.show.report.plots import colour, drawn, empty_figure, surface
+from lyra_petsc.show.report.plots import colour, empty_figure, make_drawing, surface
 
 MAX_ROWS = 60
 """Largest number of measurements in the table of the page; fit.json has all."""
@@ -169,7 +169,7 @@ def _residuals(fitted: Fitted) -> Drawing:
     axes.set_yscale("symlog", linthresh=3.0)
     axes.grid(True, color="#dfe3e8", lw=0.8)
     axes.legend(fontsize=8)
-    return drawn(
+    return make_drawing(
         figure, f"{PLOTS}/residuals", "How far the scene is from each measurement, before and after the fit."
     )
 
@@ -180,4 +180,4 @@ def _costs(fitted: Fitted) -> Drawing:
     costs = [max(2.0 * trial.cost, 1e-300) for trial in fitted.trials]
     axes.plot(range(1, len(costs) + 1), costs, color=colour(0), marker="o", ms=4)
     axes.grid(True, color="#dfe3e8", lw=0.8)
-    return drawn(figure, f"{PLOTS}/search", "Sum of squares over the evaluations.")
+    return make_drawing(figure, f"{PLOTS}/search", "Sum of squares over the evaluations.")

@@ -21,7 +21,7 @@ from mpi4py import MPI
 
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError, in_python
+from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import (
     Conclusion,
@@ -33,7 +33,7 @@ from lyra_petsc.experiments.fit.estimate import (
 )
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
 from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
-from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose, present
+from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder, existing_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
@@ -53,7 +53,7 @@ FIT = FolderKind(
     Path("fits"),
     "fit.lock",
     re.compile(r"(trials\.json|fit\.(csv|json)|report\.(html|md)|[\w-]+\.(png|svg))(\.part)?"),
-    partial(present, TRIALS_FILE),
+    partial(existing_files, TRIALS_FILE),
     "no evaluations to go on from",
     folders=("plots",),
 )
@@ -364,7 +364,7 @@ def gradient(
         If the simulation fails.
     """
     comm = MPI.COMM_WORLD if comm is None else comm
-    with in_python():
+    with python_argument_names():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
 
         def prepare() -> Any:
@@ -441,13 +441,13 @@ def fit(
         If a simulation fails.
     """
     comm = MPI.COMM_WORLD if comm is None else comm
-    with in_python():
+    with python_argument_names():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
         if out is None:
             if resume:
                 raise InputError("needs the folder, out, that holds evaluations", key="resume")
             return fit_scene(comm, loaded)
-        choice = choose(comm, "scene", out, force=force, resume=resume, kind=FIT)
+        choice = choose_folder(comm, "scene", out, force=force, resume=resume, kind=FIT)
         with RunDirectory(comm, choice) as directory:
             directory.clean()
             return fit_scene(comm, loaded, folder=directory.path)

@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import read_text
@@ -300,7 +300,7 @@ def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Re
 
 def _check_probe(scene: Scene, name: str, key: str) -> None:
     if name not in scene.probes:
-        hint = nearest(name, list(scene.probes)) if scene.probes else "the scene has no probes"
+        hint = suggest(name, list(scene.probes)) if scene.probes else "the scene has no probes"
         raise InputError(f"unknown probe {name!r}, {hint}", file=scene.source, key=key)
 
 
@@ -352,7 +352,7 @@ class _Table:
         """
         for name in self.names:
             if name not in known:
-                raise InputError(f"unknown column {name!r}, {nearest(name, known)}", file=self.path)
+                raise InputError(f"unknown column {name!r}, {suggest(name, known)}", file=self.path)
 
     def texts(self, name: str) -> list[str]:
         """A column of texts.

@@ -24,7 +24,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
-from lyra_petsc.output.agreement import on_each
+from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
 from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
@@ -124,7 +124,7 @@ class Samples:
                     return _read_rows(stored, wanted)
                 return stored[slice(*slab(comm, self.n_vertices))]
 
-        return on_each(comm, read)
+        return on_every_rank(comm, read)
 
 
 def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:

@@ -22,9 +22,9 @@ from lyra_petsc.errors import InputError, OutputError, SolverError
 from lyra_petsc.experiments.bench import failure_message, open_simulation
 from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, present
+from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, existing_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -173,7 +173,7 @@ STUDY = FolderKind(
     Path("studies"),
     "study.lock",
     RESULT,
-    partial(present, REQUEST_FILE),
+    partial(existing_files, REQUEST_FILE),
     "no study to resume",
     folders=(CASES,),
 )
@@ -272,7 +272,7 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
             watch((repeat + min(1.0, simulation.time / simulation.control.end)) / job.repeats)
         if recorder is not None:
             with phases("files"):
-                recorder.settle()
+                recorder.flush()
         if not simulation.control.is_end(simulation.time):
             raise SolverError(
                 f"stopped at t = {simulation.time:g} s, before the end (-ts_max_steps?)", collective=True

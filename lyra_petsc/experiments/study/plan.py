@@ -13,12 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.experiments.case import Case, load_record
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.measures import mean_edge_length
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.document import seconds, short
@@ -166,7 +166,7 @@ def scene_key(key: str) -> str:
         return key
     if OPTION.fullmatch(key) and key not in SYNONYMS:
         return f"petsc.{key}"
-    hint = nearest(SYNONYMS.get(key.lower(), key), [*SHORT_NAMES, *USUAL_OPTIONS])
+    hint = suggest(SYNONYMS.get(key.lower(), key), [*SHORT_NAMES, *USUAL_OPTIONS])
     raise InputError(
         f"unknown key, {hint}; any key of the scene can vary by its path, as in time.step",
         key=f"--vary {key}",
@@ -188,7 +188,7 @@ def _split_at_commas(text: str) -> list[str]:
 def _parse_value(path: str, word: str, text: str) -> Value:
     if path == "time.integrator":
         if word not in INTEGRATORS:
-            raise InputError(f"unknown integrator '{word}', {nearest(word, INTEGRATORS)}", key=_option(text))
+            raise InputError(f"unknown integrator '{word}', {suggest(word, INTEGRATORS)}", key=_option(text))
         return word
     with suppress(ValueError):
         if math.isfinite(number := float(word)):
@@ -424,7 +424,7 @@ def parse_quantities(text: str, probes: Iterable[str]) -> list[Quantity]:
         if not word:
             raise InputError("has an empty name between its commas", key=key)
         if word not in known:
-            raise InputError(f"unknown quantity '{word}', {nearest(word, known)}", key=key)
+            raise InputError(f"unknown quantity '{word}', {suggest(word, known)}", key=key)
         if not known[word] and text.strip():
             raise InputError("the scene has no probes; add some, as in probes: {tip: {group: tip}}", key=key)
         if any(quantity in found for quantity in known[word]):

@@ -30,7 +30,7 @@ from lyra_petsc.experiments.study.plan import (
 )
 from lyra_petsc.experiments.study.study_runner import SAFETY, Reference, StudyRow, StudyRunner, refines_time
 from lyra_petsc.extras import PACKAGES
-from lyra_petsc.output.summary import versions
+from lyra_petsc.output.summary import library_versions
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
 
@@ -647,7 +647,7 @@ class Study(View[Outcome[Any]]):
 
 def all_versions() -> dict[str, str]:
     """Versions of the program and of the packages that it uses."""
-    found = versions()
+    found = library_versions()
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
             found[name] = version(name)

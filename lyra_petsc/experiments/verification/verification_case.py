@@ -19,7 +19,7 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Bench, failure_message
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.results import Line, View, align_columns, verdict_line
-from lyra_petsc.extras import remedy
+from lyra_petsc.extras import install_hint
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
@@ -345,7 +345,7 @@ def _measure_rows(
         except (InputError, SolverError) as error:
             problem = failure_message(comm, error)
         except ModuleNotFoundError as error:  # on all ranks
-            problem = remedy([str(error.name)])
+            problem = install_hint([str(error.name)])
     if not isinstance(measured, Generator):
         whole = time.perf_counter() - began
         for row in rows:

@@ -1,4 +1,4 @@
-"""What a sheet can be coloured by; a new quantity is one function and one line in ``DERIVED``."""
+"""Quantities that can colour a sheet; a new one is one function and one line in ``DERIVED``."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS, plane_components
 
-COVERED = 98.0
-"""Percentage of a state's values below the upper end of its colours, and above the lower."""
-MOST_STATES = 80.0
-"""Percentage of the states whose colours reach no further: the start of a motion does not set them."""
+COVERED_VALUES = 98.0
+"""Percentage of a state's values below the upper limit of its colours, and above the lower limit."""
+COVERED_STATES = 80.0
+"""Percentage of the states whose limits the common range includes, so that few states do not set it."""
 
 PERCENTILES = np.linspace(0.0, 100.0, 401)
-"""Of a state's values, from which ranges are made."""
+"""Percentiles of a state's values from which ranges are computed."""
 
 
 @dataclass(frozen=True)
 class ColourRange:
-    """The range of the colours that was asked for.
+    """A range of colours that the user has chosen.
 
     Attributes
     ----------
     low, high : float
-        Values, or percentages of all values of the run.
+        Values or, if ``percent``, percentiles of all values of the run.
     percent : bool
     """
 
@@ -38,7 +38,7 @@ class ColourRange:
 
     @classmethod
     def parse(cls, text: str) -> ColourRange:
-        """``0,5`` or ``2%,98%``.
+        """The range given by a text such as ``0,5`` or ``2%,98%``.
 
         Raises
         ------
@@ -51,8 +51,8 @@ class ColourRange:
         except ValueError:
             ends = []
         if len(ends) != 2 or not -np.inf < ends[0] < ends[1] < np.inf:
-            words = f"must be two numbers, the lower first, as in 0,5 or 2%,98%, not {text!r}"
-            raise InputError(words, key="--range")
+            message = f"must be two numbers, the lower first, as in 0,5 or 2%,98%, not {text!r}"
+            raise InputError(message, key="--range")
         if percent and not 0.0 <= ends[0] < ends[1] <= 100.0:
             raise InputError(f"must be from 0% to 100%, not {text!r}", key="--range")
         return cls(ends[0], ends[1], percent)
@@ -65,15 +65,15 @@ class ColourQuantity:
     Attributes
     ----------
     label : str
-        Name and unit, shown at the bar of colours.
+        Name and unit, shown at the colour bar.
     values : callable
-        Gives the values, (V,) or (F,), of the state with a number.
+        Returns the values, (V,) or (F,), of a state by its number.
     on_triangles : bool
         Whether there is a value for each triangle; else for each vertex.
     signed : bool
         Whether zero belongs in the middle of the colours.
     averages : bool
-        Whether means of it have a meaning; ranks have none.
+        Whether mean values are meaningful; those of ranks are not.
     """
 
     label: str
@@ -83,33 +83,32 @@ class ColourQuantity:
     averages: bool = True
 
     def percentiles(self, state: int) -> Array:
-        """(401,) the ``PERCENTILES`` of a state's values; NaN if none is finite."""
+        """(401,) the ``PERCENTILES`` of a state's values; NaN if no value is finite."""
         values = self.values(state)
         finite = values[np.isfinite(values)]
-        found = np.percentile(finite, PERCENTILES) if len(finite) else np.full(len(PERCENTILES), np.nan)
-        return np.asarray(found)
+        return np.percentile(finite, PERCENTILES) if len(finite) else np.full(len(PERCENTILES), np.nan)
 
-    def limits(self, found: Array, asked: ColourRange | None = None) -> tuple[float, float]:
+    def limits(self, percentiles: Array, chosen: ColourRange | None = None) -> tuple[float, float]:
         """Values at both ends of the colours.
 
         Parameters
         ----------
-        found : (n, 401)
-            The percentiles of some states.
-        asked : ColourRange, optional
-            Without it 98 % of the values on each side, in 80 % of the states.
+        percentiles : (n, 401)
+            The `percentiles` of some states.
+        chosen : ColourRange, optional
+            By default, the range covers 98 % of the values on each side, in 80 % of the states.
         """
-        if asked is not None and not asked.percent:
-            return asked.low, asked.high
-        found = found[np.isfinite(found).all(axis=1)]
-        if len(found) == 0:
+        if chosen is not None and not chosen.percent:
+            return chosen.low, chosen.high
+        percentiles = percentiles[np.isfinite(percentiles).all(axis=1)]
+        if len(percentiles) == 0:
             return colour_limits(np.inf, -np.inf)
-        if asked is not None:
-            low, high = np.percentile(found, [asked.low, asked.high])
+        if chosen is not None:
+            low, high = np.percentile(percentiles, [chosen.low, chosen.high])
         else:
-            lowest, highest = (np.searchsorted(PERCENTILES, end) for end in (100.0 - COVERED, COVERED))
-            low = np.percentile(found[:, lowest], 100.0 - MOST_STATES, method="lower")
-            high = np.percentile(found[:, highest], MOST_STATES, method="higher")
+            lowest, highest = np.searchsorted(PERCENTILES, [100.0 - COVERED_VALUES, COVERED_VALUES])
+            low = np.percentile(percentiles[:, lowest], 100.0 - COVERED_STATES, method="lower")
+            high = np.percentile(percentiles[:, highest], COVERED_STATES, method="higher")
         if self.signed:
             high = max(abs(low), abs(high))
             low = -high
@@ -118,10 +117,10 @@ class ColourQuantity:
         return colour_limits(float(low), float(high))
 
     def on_vertices(self, run: StoredRun) -> ColourQuantity:
-        """The same with values on vertices: means over their triangles, weighted by rest area.
+        """The same quantity on vertices: means over the triangles of a vertex, weighted by rest area.
 
-        Constant strain triangles alternate from one to the next around the field that they stand for; the
-        means follow it. Ranks are no such field.
+        Values of constant strain triangles alternate around the field that they approximate; the means
+        follow the field. Quantities without meaningful means are returned unchanged.
         """
         if not self.on_triangles or not self.averages:
             return self
@@ -140,7 +139,7 @@ class ColourQuantity:
 
 
 def colour_limits(low: float, high: float) -> tuple[float, float]:
-    """Range of the colours, which must not be empty."""
+    """The range from ``low`` to ``high``, or a small range if it is empty."""
     if low < high:
         return low, high
     middle = low if np.isfinite(low) else 0.0
@@ -148,19 +147,19 @@ def colour_limits(low: float, high: float) -> tuple[float, float]:
 
 
 def quantity(run: StoredRun, name: str) -> ColourQuantity:
-    """The quantity of a name.
+    """The quantity with a name.
 
     Raises
     ------
     InputError
-        If there is none of that name, or the states lack the field that it is computed from.
+        If the name is unknown, or the states lack the field that the quantity is computed from.
     """
     if name in DERIVED:
         return DERIVED[name](run, name)
     if name not in run.fields:
         known = [*DERIVED, *run.fields]
         raise InputError(
-            f"no field {name!r}, {nearest(name, known)}; a scene's output.fields names further ones",
+            f"no field {name!r}, {suggest(name, known)}; a scene's output.fields names further ones",
             file=run.folder,
             key="--field",
         )
@@ -170,11 +169,11 @@ def quantity(run: StoredRun, name: str) -> ColourQuantity:
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
     on_triangles = run.field_on(name) == "triangle"
     values: Callable[[int], Array] = lambda i: reduce(np.asarray(stored[i]))  # noqa: E731
-    return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NAMES)
+    return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NOT_AVERAGED)
 
 
 _SIGNED = {"curvature"}
-_NAMES = {"rank"}
+_NOT_AVERAGED = {"rank"}
 
 
 def _speed(run: StoredRun, name: str) -> ColourQuantity:
@@ -212,7 +211,7 @@ DERIVED: dict[str, Callable[[StoredRun, str], ColourQuantity]] = {
     "displacement": _displacement,
     "strain": _strain,
 }
-"""Quantities computed from positions and velocities, besides the fields that the run has written."""
+"""Quantities that are computed from positions and velocities; further ones are the run's fields."""
 
 
 def material_coordinates(run: StoredRun) -> Array:
@@ -226,7 +225,7 @@ def _edges(corners: Array) -> Array:
 
 
 def _largest_principal(symmetric: Array) -> Array:
-    """(F,) larger eigenvalue in the plane of tensors uu, vv, uv (F, 3), or with six components (F, 6)."""
+    """(F,) larger in-plane eigenvalue of tensors uu, vv, uv (F, 3), or with six components (F, 6)."""
     uu, vv, uv = plane_components(symmetric).T
     return (uu + vv) / 2.0 + np.hypot((uu - vv) / 2.0, uv)
 
@@ -237,5 +236,5 @@ def _magnitude(values: Array) -> Array:
 
 
 def _label(name: str, unit: str) -> str:
-    words = name.replace("_", " ")
-    return words if unit == "1" else f"{words} [{unit}]"
+    title = name.replace("_", " ")
+    return title if unit == "1" else f"{title} [{unit}]"

@@ -1,4 +1,4 @@
-"""Draws a plan: fits camera and colours to the whole motion, then the ranks share the states."""
+"""Drawing a plan: camera and colours are fitted to the whole motion, then the ranks share the states."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.output.agreement import on_each
+from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.show.render.camera import Fit, upwards
+from lyra_petsc.show.render.camera import CameraFit, up_direction
 from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
 from lyra_petsc.show.render.render_plan import RenderPlan, run_line_of_sight
-from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, near_points, wind_arrows
+from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, near_obstacle_points, wind_arrows
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
@@ -55,70 +55,70 @@ def draw(comm: MPI.Comm, plan: RenderPlan, show_progress: Callable[[int, int], N
     with ExitStack() as opened:
         drawing = _fitted_drawing(comm, plan)
         opened.callback(drawing.close)
-        files = on_each(comm, lambda: PictureFiles(plan, opened) if comm.rank == 0 else None)
+        files = on_every_rank(comm, lambda: PictureFiles(plan, opened) if comm.rank == 0 else None)
         for first in range(0, len(states), size):
             show_progress(first, len(states))
             mine = states[first + comm.rank : first + comm.rank + 1]
-            images = comm.gather(on_each(comm, lambda: [drawing.image(i) for i in mine]))  # noqa: B023
-            on_each(comm, lambda: _write(files, states[first:], images))  # noqa: B023
-        written = on_each(comm, lambda: files.finish() if files else [])
+            images = comm.gather(on_every_rank(comm, lambda: [drawing.image(i) for i in mine]))  # noqa: B023
+            on_every_rank(comm, lambda: _write(files, states[first:], images))  # noqa: B023
+        written = on_every_rank(comm, lambda: files.finish() if files else [])
         show_progress(len(states), len(states))
         return written
 
 
 def _write(files: PictureFiles | None, states: list[int], images: list[list[Image]] | None) -> None:
-    """Write the images that the ranks have drawn of the first of ``states``, one a rank or none (rank 0)."""
+    """Write the images of the first of ``states``, of which each rank has drawn one or none (rank 0)."""
     if files is not None and images is not None:
         for state, image in zip(states, chain.from_iterable(images), strict=False):
             files.write(state, image)
 
 
 def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
-    """The drawing with a camera and colours that fit most of the motion; collective."""
-    shown = on_each(comm, lambda: _shown(plan))
-    sight = on_each(comm, lambda: run_line_of_sight(plan.run, plan.scene))
-    axes = Bounds.axes_of(upwards(plan.scene))
-    fit = Fit(plan.scene, sight, axes[2], plan.size[0] / plan.size[1], bar=shown is not None)
+    """The drawing, with camera and colours that fit most of the motion; collective."""
+    shown = on_every_rank(comm, lambda: _colour_quantity(plan))
+    sight = on_every_rank(comm, lambda: run_line_of_sight(plan.run, plan.scene))
+    axes = Bounds.axes_of(up_direction(plan.scene))
+    fit = CameraFit(plan.scene, sight, axes[2], plan.size[0] / plan.size[1], bar=shown is not None)
     normals = np.concatenate([fit.normals, axes, -axes])
     mine = plan.motion[comm.rank :: comm.size]
-    reaches, values = on_each(comm, lambda: extent(plan.run, mine, normals, shown))
-    reaches, values = (np.concatenate(comm.allgather(part)) for part in (reaches, values))
-    n, whole = len(fit.normals), reaches.max(axis=0)
-    reach, bounds = fit.most(reaches[:, :n]), Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
+    supports, values = on_every_rank(comm, lambda: measure_states(plan.run, mine, normals, shown))
+    supports, values = (np.concatenate(comm.allgather(part)) for part in (supports, values))
+    n, whole = len(fit.normals), supports.max(axis=0)
+    support, bounds = fit.framed_support(supports[:, :n]), Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
     obstacles: list[ObstacleSurface] = []
     if plan.scene.obstacles:
-        obstacles = on_each(comm, lambda: _obstacles(plan, bounds))
-        near = near_points(obstacles, bounds, plan.run.times[plan.motion])
-        reach = np.maximum(reach, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
-        bounds = bounds.around(near)
+        obstacles = on_every_rank(comm, lambda: _obstacles(plan, bounds))
+        near = near_obstacle_points(obstacles, bounds, plan.run.times[plan.motion])
+        support = np.maximum(support, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
+        bounds = bounds.including(near)
     limits = (0.0, 1.0) if shown is None else shown.limits(values, plan.limits)
     wind = None
     if plan.options.wind and plan.scene.wind is not None:
         wind = np.array(plan.scene.wind.velocity)
         feet, arrow = wind_arrows(bounds, wind)
         ends = np.concatenate([feet, feet + arrow])
-        reach = np.maximum(reach, (ends @ fit.normals.T).max(axis=0))
-    view = fit.view(reach)
-    return on_each(comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles))
+        support = np.maximum(support, (ends @ fit.normals.T).max(axis=0))
+    view = fit.view(support)
+    return on_every_rank(comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles))
 
 
 def _obstacles(plan: RenderPlan, bounds: Bounds) -> list[ObstacleSurface]:
-    from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces  # of use for nothing else
+    from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces  # a slow import that few runs need
 
     return obstacle_surfaces(plan.run, bounds.middle, bounds.size)
 
 
-def _shown(plan: RenderPlan) -> ColourQuantity | None:
+def _colour_quantity(plan: RenderPlan) -> ColourQuantity | None:
     if plan.options.field is None:
         return None
-    found = quantity(plan.run, plan.options.field)
-    return found if plan.options.cells else found.on_vertices(plan.run)
+    field = quantity(plan.run, plan.options.field)
+    return field if plan.options.cells else field.on_vertices(plan.run)
 
 
-def extent(
+def measure_states(
     run: StoredRun, states: list[int], normals: Array, shown: ColourQuantity | None
 ) -> tuple[Array, Array]:
-    """How far states reach and which values they have.
+    """Support and percentiles of the values of states.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def extent(
 
     Returns
     -------
-    reaches : (len(states), n) float64
-        Largest product of a vertex with each normal [m].
+    supports : (len(states), n) float64
+        Largest product of a vertex with each normal (the support) [m].
     values : (len(states), 401) float64
         Percentiles of the quantity; NaN without one.
 
@@ -139,18 +139,18 @@ def extent(
     InputError
         If a state is damaged.
     """
-    reaches = np.empty((len(states), len(normals)))
+    supports = np.empty((len(states), len(normals)))
     values = np.full((len(states), len(PERCENTILES)), np.nan)
     for row, state in enumerate(states):
         x = run.positions[state]
-        reaches[row] = (x @ normals.T).max(axis=0)
+        supports[row] = (x @ normals.T).max(axis=0)
         if shown is not None:
             values[row] = shown.percentiles(state)
-    return reaches, values
+    return supports, values
 
 
 class PictureFiles:
-    """Writes all files of a plan from the images of its states, which come in ascending order.
+    """Writes all files of a plan from the images of its states, which are given in ascending order.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class PictureFiles:
             self._tiles.append(half_size(image))
 
     def finish(self) -> list[Path]:
-        """Write the contact sheet and end the film; all files written.
+        """Write the contact sheet and end the film; returns all files written.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The files of images: PNG pictures, contact sheets and films; the texture and the colours that are read."""
+"""Image files: PNG pictures, contact sheets and films are written, textures and colours are read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import reason, replace_bytes
+from lyra_petsc.output.file_operations import reason, replace_bytes
 
 Image = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
@@ -24,24 +24,24 @@ TILES = 6
 """Pictures on a contact sheet."""
 COLUMNS = 3
 GAP = 4
-"""Pixels between them."""
-LARGEST_TEXTURE = 4096
+"""Pixels between the pictures."""
+MAX_TEXTURE_PIXELS = 4096
 
 PALETTE = (
     "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=sierra2_4a:diff_mode=rectangle"
 )
-"""A GIF has 256 colours; ffmpeg chooses those that suit the film."""
+"""ffmpeg's filter that chooses the 256 colours of a GIF by the film's content."""
 
 FILM_FORMATS: dict[str, tuple[str, str, list[str]]] = {
     ".mp4": ("libx264", "yuv420p", ["-crf", "20", "-preset", "fast", "-movflags", "+faststart"]),
     ".webm": ("libvpx-vp9", "yuv420p", ["-crf", "33", "-b:v", "0", "-cpu-used", "5", "-row-mt", "1"]),
     ".gif": ("gif", "pal8", ["-filter_complex", PALETTE, "-loop", "0"]),
 }
-"""Codec, pixel format and further options of ffmpeg by ending."""
+"""Codec, pixel format and further options of ffmpeg by file name ending."""
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write a picture; a file of that name is replaced only when the new one is complete.
+    """Write a picture atomically.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def half_size(image: Image) -> Image:
-    """A picture at half its size, for a contact sheet."""
+    """A picture scaled to half its size, for a contact sheet."""
     from PIL import Image as Pictures
 
     height, width = image.shape[:2]
@@ -65,7 +65,7 @@ def half_size(image: Image) -> Image:
 
 
 def contact_sheet(tiles: Sequence[Image]) -> Image:
-    """Pictures of one size in rows on white."""
+    """Pictures of equal size, arranged in rows on a white background."""
     columns = min(COLUMNS, len(tiles))
     height, width = (size + GAP for size in tiles[0].shape[:2])
     rows = math.ceil(len(tiles) / columns)
@@ -82,7 +82,7 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
     Raises
     ------
     InputError
-        Unknown ending, a folder that is not there, odd sizes.
+        For an unknown ending, a missing folder, or odd sizes.
     """
     if path.suffix.lower() not in FILM_FORMATS:
         raise InputError(f"a film's name ends in {', '.join(FILM_FORMATS)}, not {path.name!r}", key="--film")
@@ -98,9 +98,9 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
 
 @contextmanager
 def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], None]]:
-    """Write a film by ffmpeg; gives a function that adds a frame.
+    """A context that writes a film by ffmpeg; yields a function that adds a frame.
 
-    The file gets its name at the end of the context; after an exception there is no file.
+    The file gets its final name at the end of the context; after an exception it is removed.
 
     Parameters
     ----------
@@ -108,16 +108,16 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
     size : (int, int)
         Width and height [pixels].
     fps : float
-        Frames a second.
+        Frames per second.
 
     Raises
     ------
     OutputError
-        If ffmpeg cannot be started or fails; also raised by the function.
+        If ffmpeg cannot be started or fails; the yielded function raises it, too.
     """
     import imageio_ffmpeg
 
-    # ffmpeg chooses the format by the ending
+    # the ending stays last, as ffmpeg chooses the format by it
     part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
     codec, pixels, options = FILM_FORMATS[path.suffix.lower()]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"]
@@ -142,7 +142,7 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
         def failure() -> OutputError:
             messages.seek(0)
             lines = messages.read().decode(errors="replace").splitlines()
-            # the cause stands behind the last colon of the first line
+            # the cause follows the last colon of the first line
             cause = lines[0].rpartition(": ")[2] if lines else "ffmpeg stopped without a message"
             return OutputError(f"{path}: cannot be written: {cause}")
 
@@ -165,7 +165,7 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
 
 
 def read_texture(path: Path) -> Image:
-    """(h, w, 3) picture from a file, reduced to at most 4096 pixels in each direction.
+    """(h, w, 3) picture from a file, scaled down to at most 4096 pixels in each direction.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def read_texture(path: Path) -> Image:
 
     try:
         with Pictures.open(path) as picture:
-            picture.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE))
+            picture.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS))
             return np.asarray(picture.convert("RGB"))
     except UnidentifiedImageError:
         raise InputError("is not a picture (PNG, JPEG, …)", file=path, key="--texture") from None
@@ -190,8 +190,8 @@ def read_texture(path: Path) -> Image:
         raise InputError(f"cannot be read: {why}", file=path, key="--texture") from None
 
 
-def colors_of(text: str) -> tuple[str, str]:
-    """Two colours as #rrggbb, from ``FRONT,BACK``.
+def parse_colors(text: str) -> tuple[str, str]:
+    """The two colours of a text ``FRONT,BACK`` as #rrggbb.
 
     Raises
     ------
@@ -202,8 +202,7 @@ def colors_of(text: str) -> tuple[str, str]:
 
     names = [name.strip() for name in text.split(",")]
     try:
-        found = ["#{:02x}{:02x}{:02x}".format(*ImageColor.getrgb(name)[:3]) for name in names]
-        front, back = found
+        front, back = ["#{:02x}{:02x}{:02x}".format(*ImageColor.getrgb(name)[:3]) for name in names]
     except ValueError:
         raise InputError(
             f"must be two colours, front and back, as in firebrick,ivory or #c8402f,#f0e2c8, not {text!r}",

@@ -1,4 +1,4 @@
-"""OpenGL without a display: whether it works here, and its share of the cores."""
+"""OpenGL without a display: checking whether it works, and dividing the cores among ranks."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def share_cores(comm: MPI.Comm) -> None:
 
 
 def import_pyvista() -> Any:
-    """PyVista, set to draw off-screen and to print no messages."""
-    # Mesa and VTK would print which devices and windows they try in vain
+    """The module pyvista, set up to draw off-screen and to print no messages."""
+    # Mesa and VTK would print each device and window that they fail to open
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")
     import pyvista
     from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
@@ -49,7 +49,7 @@ def check_opengl() -> None:
     Raises
     ------
     InputError
-        Saying which library to install.
+        If it cannot; the message names the library to install.
     """
     import_pyvista()
     import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the windows)
@@ -57,9 +57,9 @@ def check_opengl() -> None:
 
     window = vtkRenderWindow()
     window.SetOffScreenRendering(True)
-    # VTK uses OSMesa when nothing else is there, and crashes if that is missing
-    by_osmesa = window.GetClassName() == "vtkOSOpenGLRenderWindow"
-    if not (_has_osmesa() if by_osmesa else window.SupportsOpenGL()):
+    # VTK falls back to OSMesa, and crashes if OSMesa is missing
+    uses_osmesa = window.GetClassName() == "vtkOSOpenGLRenderWindow"
+    if not (_has_osmesa() if uses_osmesa else window.SupportsOpenGL()):
         raise InputError(REMEDY, key="render")
     window.Finalize()
 

@@ -1,13 +1,13 @@
-"""Writes a Python script that opens a run in ParaView, with colours, exaggeration, camera and time."""
+"""A Python script that opens a run in ParaView, with colours, exaggeration, camera and time."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from string import Template
 
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.show.render.camera import upwards
+from lyra_petsc.show.render.camera import up_direction
 from lyra_petsc.show.render.render_plan import run_line_of_sight
 
 SCRIPT = "open_in_paraview.py"
@@ -98,7 +98,7 @@ if len(sys.argv) > 1 and sys.argv[1].endswith((".png", ".avi", ".ogv")):
 
 
 def write_script(folder: Path) -> Path:
-    """Write the script beside a run's states; its path.
+    """Write the script into a run's folder; returns its path.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def write_script(folder: Path) -> Path:
         vectors=repr({name: True for name in names if len(run.field(name)[0].shape) > 1}),
         units=repr({name: f" [{unit}]" for name in names if (unit := run.field_units(name)) != "1"}),
         unit="" if scene.time.static else " s",
-        up=repr([float(v) + 0.0 for v in upwards(scene)]),
+        up=repr([float(v) + 0.0 for v in up_direction(scene)]),
         sight=repr([round(float(v), 6) + 0.0 for v in run_line_of_sight(run, scene)]),
     )
     replace_text(path, text)

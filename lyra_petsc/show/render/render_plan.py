@@ -1,4 +1,4 @@
-"""What ``render`` will draw: its options, checked before anything is drawn, and the state in each frame."""
+"""The plan of ``render``: its options, checked before anything is drawn, and the state of each frame."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.show.render.camera import line_of_sight, upwards
+from lyra_petsc.show.render.camera import line_of_sight, up_direction
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
-from lyra_petsc.show.render.image_files import TILES, check_film, colors_of, read_texture
+from lyra_petsc.show.render.image_files import TILES, check_film, parse_colors, read_texture
 from lyra_petsc.show.render.opengl import check_opengl
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
-"""What pictures need of the extra ``view``."""
+"""Packages of the extra ``view`` that pictures need."""
 
 SIZE = "1280x720"
-SMALLEST, LARGEST = 32, 8192
-"""Pixels."""
+MIN_PIXELS, MAX_PIXELS = 32, 8192
+"""Limits of a picture's width and height [pixels]."""
 COLORS = "#c8402f,#f0e2c8"
 FILM, SHEET = "film.mp4", "sheet.png"
-MOST_PICTURES = 1000
+MAX_PICTURES = 1000
 MOTION_STATES = 500
-"""States that camera and colours are fitted to, beside those that are drawn."""
+"""Number of states, besides those drawn, to which camera and colours are fitted."""
 SIGHT_STATES = 9
-"""States from which the direction of the camera is chosen."""
+"""Number of states from which the direction of the camera is chosen."""
 
-HIGHEST_FPS = 240.0
-"""Frames a second that ``--fps`` may ask for."""
-SLOWEST, FASTEST = 10.0, 60.0
-"""Limits of a film's frames a second unless ``--fps`` says otherwise."""
-GIF_FASTEST = 25.0
+MAX_FPS = 240.0
+"""Upper bound of ``--fps`` (frames per second)."""
+DEFAULT_MIN_FPS, DEFAULT_MAX_FPS = 10.0, 60.0
+"""Limits of a film's frames per second without ``--fps``."""
+GIF_MAX_FPS = 25.0
 STATIC_SECONDS = 3.0
-"""Seconds in which a film of a static analysis shows the whole load."""
-MOST_FRAMES = 20_000
+"""Duration of a film of a static analysis [s]."""
+MAX_FRAMES = 20_000
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """The options of ``render``; None or empty where they were not given."""
+    """The options of ``render``; None or empty if not given."""
 
     run: Path
     at: str | None = None
@@ -78,9 +78,9 @@ class FilmTiming:
     Attributes
     ----------
     fps : float
-        Frames a second.
+        Frames per second.
     states : tuple of int
-        Number of the state that each frame shows, ascending.
+        Number of the state in each frame, ascending.
     """
 
     fps: float
@@ -89,26 +89,26 @@ class FilmTiming:
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """What is drawn and where it is written; the same on every rank.
+    """The states to draw and the files to write; the same on every rank.
 
     Attributes
     ----------
     options : RenderOptions
     run : StoredRun
     scene : Scene
-        The run's, with the camera as changed by ``--set``.
+        The run's scene, with the camera changed by ``--set``.
     size : (int, int)
         Width and height [pixels].
     colors : (str, str)
         Front and back of the sheet, as #rrggbb.
     pictures : list of (Path, int)
-        Files of single pictures and the states they show.
+        Files of single pictures and the number of each picture's state.
     film : (Path, FilmTiming) or None
     sheet : (Path, tuple of int) or None
-        File of the contact sheet and the states it shows.
+        File of the contact sheet and the numbers of its states.
     texture : (h, w, 3) uint8 or None
     limits : ColourRange or None
-        Range of the colours that ``--range`` gives.
+        Range of the colours given by ``--range``.
     """
 
     options: RenderOptions
@@ -124,27 +124,27 @@ class RenderPlan:
 
     @property
     def states(self) -> list[int]:
-        """Numbers of the states that are drawn, ascending."""
+        """Numbers of the states to draw, ascending."""
         shown = {state for _, state in self.pictures}
         shown |= set(self.film[1].states) if self.film else set()
         return sorted(shown | set(self.sheet[1] if self.sheet else ()))
 
     @property
     def motion(self) -> list[int]:
-        """States of the whole run, to which camera and colours are fitted, so that all its pictures agree."""
+        """States to which camera and colours are fitted: of the whole run, so that all its pictures agree."""
         return sorted({*self.states, *spread_states(self.run.times, MOTION_STATES)})
 
 
 def make_plan(options: RenderOptions) -> RenderPlan:
-    """Check the options and decide what is drawn. Call on one rank.
+    """Check the options and plan the drawing. Call on one rank.
 
     Raises
     ------
     InputError
-        For whatever cannot be drawn; only the folder of ``--out`` may have been created.
+        For options that cannot be drawn; only the folder of ``--out`` may have been created.
     """
     run = StoredRun(options.run)
-    scene = scene_shown(run, options.settings)
+    scene = scene_with_settings(run, options.settings)
     size = _size(options.size)
     limits = _range(options)
     _check_speeds(options)
@@ -163,11 +163,11 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     nothing_named = not (times or options.film or options.sheet)
     folder = options.out or run.folder
     film_file = options.film or (folder / FILM if nothing_named else None)
-    colors = colors_of(options.colors)
+    colors = parse_colors(options.colors)
     texture = None if options.texture is None else read_texture(options.texture)
     film = None
     if film_file is not None:
-        check_film(options.film or Path(FILM), size)  # the folder of --out may not be there yet
+        check_film(options.film or Path(FILM), size)  # the folder of --out may not exist yet
         gif = film_file.suffix.lower() == ".gif"
         static = scene.time.static
         film = film_file, film_timing(run.times, options.fps, options.speed, static=static, gif=gif)
@@ -182,13 +182,13 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     return RenderPlan(options, run, scene, size, colors, pictures, film, sheet, texture, limits)
 
 
-def scene_shown(run: StoredRun, settings: Sequence[str]) -> Scene:
+def scene_with_settings(run: StoredRun, settings: Sequence[str]) -> Scene:
     """The scene of a run, with its camera changed by ``--set``.
 
     Raises
     ------
     InputError
-        For settings of anything else, or that cannot be.
+        For settings of other keys, or invalid ones.
     """
     for text in settings:
         if not re.match(r"\s*render\b", text):
@@ -201,16 +201,16 @@ def scene_shown(run: StoredRun, settings: Sequence[str]) -> Scene:
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text.strip().lower())
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
+    if not (MIN_PIXELS <= width <= MAX_PIXELS and MIN_PIXELS <= height <= MAX_PIXELS):
         raise InputError(
-            f"must be WIDTHxHEIGHT in pixels, {SMALLEST} to {LARGEST} each, as in {SIZE}, not {text!r}",
+            f"must be WIDTHxHEIGHT in pixels, {MIN_PIXELS} to {MAX_PIXELS} each, as in {SIZE}, not {text!r}",
             key="--size",
         )
     return width, height
 
 
-def numbers(text: str, key: str, example: str) -> list[float]:
-    """The numbers of an option, with commas between them.
+def parse_numbers(text: str, key: str, example: str) -> list[float]:
+    """The comma-separated numbers of an option.
 
     Raises
     ------
@@ -226,10 +226,10 @@ def numbers(text: str, key: str, example: str) -> list[float]:
 
 
 def _times(text: str | None) -> list[float]:
-    times = list(dict.fromkeys(numbers(text, "--at", "0.25,1,2"))) if text is not None else []
-    if len(times) > MOST_PICTURES:
+    times = list(dict.fromkeys(parse_numbers(text, "--at", "0.25,1,2"))) if text is not None else []
+    if len(times) > MAX_PICTURES:
         raise InputError(
-            f"names {len(times)} times, at most {MOST_PICTURES} are drawn; see --film", key="--at"
+            f"names {len(times)} times, at most {MAX_PICTURES} are drawn; see --film", key="--at"
         )
     return times
 
@@ -243,18 +243,16 @@ def _range(options: RenderOptions) -> ColourRange | None:
 
 
 def _check_speeds(options: RenderOptions) -> None:
-    if options.fps is not None and not 0.1 <= options.fps <= HIGHEST_FPS:
-        raise InputError(
-            f"must be from 0.1 to {HIGHEST_FPS:g} frames a second, not {options.fps:g}", key="--fps"
-        )
+    if options.fps is not None and not 0.1 <= options.fps <= MAX_FPS:
+        raise InputError(f"must be from 0.1 to {MAX_FPS:g} frames a second, not {options.fps:g}", key="--fps")
     if options.speed is not None and not (options.speed > 0.0 and math.isfinite(options.speed)):
         raise InputError(f"must be > 0, not {options.speed:g}", key="--speed")
 
 
 def run_line_of_sight(run: StoredRun, scene: Scene) -> Array:
-    """Unit vector from the sheet to the camera, chosen from a few states of the whole run."""
+    """Unit vector from the sheet to the camera, chosen by a few states of the whole run."""
     shapes = (run.positions[state] for state in spread_states(run.times, SIGHT_STATES))
-    return line_of_sight(scene, upwards(scene), shapes, run.triangles)
+    return line_of_sight(scene, up_direction(scene), shapes, run.triangles)
 
 
 def film_timing(
@@ -265,54 +263,54 @@ def film_timing(
     static: bool = False,
     gif: bool = False,
 ) -> FilmTiming:
-    """Frames at equal intervals, each showing the state nearest to its time.
+    """Frames at equal intervals, each with the state nearest to its time.
 
     Parameters
     ----------
     times : (n,) float64
-        Of the states, ascending [s] (static: load factors).
+        Times of the states, ascending [s] (static: load factors).
     fps : float, optional
-        Frames a second; by default one for each state, as far as that makes 10 to 60 (GIF: 25).
+        Frames per second; by default one per state, within 10 and 60 (GIF: 25).
     speed : float, optional
-        Simulated seconds that a second of the film shows; 1 by default (static: a third of the load).
+        Simulated seconds per second of the film; 1 by default (static: a third of the load).
     static, gif : bool
 
     Raises
     ------
     InputError
-        If the film would be far too long.
+        If the film would have more than `MAX_FRAMES` frames.
     """
     speed = speed if speed is not None else 1.0 / STATIC_SECONDS if static else 1.0
-    rate = fps if fps is not None else _natural_rate(times, speed, GIF_FASTEST if gif else FASTEST)
-    if gif:  # its delays are whole hundredths of a second, and viewers ignore those below two
+    rate = fps if fps is not None else _default_fps(times, speed, GIF_MAX_FPS if gif else DEFAULT_MAX_FPS)
+    if gif:  # GIF's delays are multiples of 0.01 s, and viewers ignore delays below 0.02 s
         rate = 100.0 / max(2, round(100.0 / rate))
     span = float(times[-1] - times[0])
     count = span * rate / speed + 1.0
-    if not count <= MOST_FRAMES:
+    if not count <= MAX_FRAMES:
         raise InputError(
             f"a film of {span:g} s at {rate:g} frames a second and speed {speed:g} would have {count:.3g} "
-            f"frames, more than {MOST_FRAMES}; give a larger --speed",
+            f"frames, more than {MAX_FRAMES}; give a larger --speed",
             key="--film",
         )
     at = times[0] + np.arange(math.floor(count + 1e-6)) * (speed / rate)
     return FilmTiming(rate, tuple(int(i) for i in nearest_states(times, at)))
 
 
-def _natural_rate(times: Array, speed: float, fastest: float) -> float:
-    """Frame rate at which every state, or every nth, is shown in one or several whole frames."""
+def _default_fps(times: Array, speed: float, fastest: float) -> float:
+    """Frame rate at which every state, or every n-th state, has a whole number of frames."""
     intervals = np.diff(times)
     if len(intervals) == 0:
-        return SLOWEST
+        return DEFAULT_MIN_FPS
     rate = speed / float(np.median(intervals))
     if rate > fastest:
         rate /= math.ceil(rate / fastest * (1.0 - 1e-6))
-    elif rate < SLOWEST:
-        rate *= math.ceil(min(SLOWEST / rate, 1e6) * (1.0 - 1e-6))
+    elif rate < DEFAULT_MIN_FPS:
+        rate *= math.ceil(min(DEFAULT_MIN_FPS / rate, 1e6) * (1.0 - 1e-6))
     return float(f"{rate:.6g}")
 
 
 def nearest_states(times: Array, at: Array) -> Ints:
-    """Numbers of the states nearest to times ``at`` [s]; of two as near, the earlier."""
+    """Numbers of the states nearest to times ``at`` [s]; of two equally near ones, the earlier."""
     if len(times) == 1:
         return np.zeros(len(at), dtype=np.int64)
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
@@ -321,7 +319,7 @@ def nearest_states(times: Array, at: Array) -> Ints:
 
 
 def pick_state(run: StoredRun, time: float, key: str) -> int:
-    """The state nearest to a time that the option ``key`` names.
+    """Number of the state nearest to a time that the option ``key`` gives.
 
     Raises
     ------
@@ -330,8 +328,8 @@ def pick_state(run: StoredRun, time: float, key: str) -> int:
     """
     times, unit = run.times, "" if run.scene.time.static else " s"
     first, last = float(times[0]), float(times[-1])
-    slack = 1e-6 * max(last - first, abs(last)) + 0.5 * float(np.diff(times).max(initial=0.0))
-    if not first - slack <= time <= last + slack:
+    tolerance = 1e-6 * max(last - first, abs(last)) + 0.5 * float(np.diff(times).max(initial=0.0))
+    if not first - tolerance <= time <= last + tolerance:
         raise InputError(
             f"{time:g}{unit} is outside the run, whose states go from {first:g} to {last:g}{unit}", key=key
         )
@@ -339,16 +337,16 @@ def pick_state(run: StoredRun, time: float, key: str) -> int:
 
 
 def spread_states(times: Array, count: int) -> tuple[int, ...]:
-    """Up to ``count`` different states, at equal intervals from the first to the last."""
+    """Numbers of up to ``count`` different states, evenly spaced from the first to the last."""
     wanted = np.linspace(times[0], times[-1], count)
     return tuple(int(i) for i in np.unique(nearest_states(times, wanted)))
 
 
 def decimals(times: Array) -> int:
-    """Decimals with which the times of the states differ; all those of their interval if it has few."""
+    """Number of decimals with which the states' times differ, or which show a short interval exactly."""
     if len(times) == 1:
         return 2
     interval = float(np.median(np.diff(times)))
-    least = max(0, math.ceil(-math.log10(interval) - 1e-9))
-    short = abs(round(interval, least) - interval) < 1e-3 * interval
-    return least if short else least + 1
+    minimum = max(0, math.ceil(-math.log10(interval) - 1e-9))
+    exact = abs(round(interval, minimum) - interval) < 1e-3 * interval
+    return minimum if exact else minimum + 1

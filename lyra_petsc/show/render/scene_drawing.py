@@ -1,4 +1,4 @@
-"""What PyVista draws: sheet, lights, floor with shadow, handles, wind, bar of colours and time."""
+"""Drawing a state with PyVista: sheet, lights, floor with shadow, handles, wind, colour bar and time."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ INK = "#2b2f36"
 HANDLE_COLOR, WIND_COLOR, OBSTACLE_COLOR = "#30343b", "#6d8fae", "#9aa0a8"
 MAP, SIGNED_MAP = "viridis", "coolwarm"
 
-NEAR = 0.25
-"""How far around the sheets' motion obstacles are in the picture, over its size."""
+OBSTACLE_MARGIN = 0.25
+"""Distance from the motion within which obstacles are in the picture, relative to the motion's size."""
 
 FLOOR_PIXELS = 512
-"""Of the picture on the floor, in each direction."""
+"""Pixels of the floor's texture in each direction."""
 BLUR = 0.012
-"""Radius of the shadow's soft edge over the side of the floor."""
+"""Radius of the shadow's soft edge, relative to the side of the floor."""
 DARKNESS = 0.42
 FLOOR_COLOR = (225, 224, 221)
 FLOOR_GAP = 0.02
-"""Height of the lowest point over the floor, over the size of the motion."""
+"""Height of the lowest point above the floor, relative to the size of the motion."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """A box around the whole motion, along the axes to the right, towards the front and up.
+    """Bounding box of the whole motion, along axes to the right, towards the front and up.
 
     Attributes
     ----------
     axes : (3, 3) float64
         Unit vectors as rows.
     low, high : (3,) float64
-        Coordinates along them [m].
+        Smallest and largest coordinates along the axes [m].
     """
 
     axes: Array
@@ -58,40 +58,40 @@ class Bounds:
 
     @classmethod
     def axes_of(cls, up: Array) -> Array:
-        """(3, 3) the axes that belong to ``up``."""
+        """(3, 3) axes for the upward direction ``up`` (3,)."""
         return np.array([*horizon(up), up])
 
     @property
     def size(self) -> float:
-        """Diagonal [m]."""
+        """Length of the diagonal [m]."""
         return float(np.linalg.norm(self.high - self.low))
 
     @property
     def middle(self) -> Array:
-        """(3,) its centre [m], along x, y and z."""
+        """(3,) centre [m] in x, y, z."""
         return (self.low + self.high) / 2.0 @ self.axes
 
-    def around(self, points: Array) -> Bounds:
-        """A box that holds points (n, 3) along its axes [m], too."""
+    def including(self, points: Array) -> Bounds:
+        """The smallest box that includes this one and points (n, 3), given along the axes [m]."""
         whole = np.concatenate([points, [self.low, self.high]])
         return Bounds(self.axes, whole.min(axis=0), whole.max(axis=0))
 
 
-def near_points(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array) -> Array:
-    """(n, 3) where obstacles reach at some times [s], as far as that is near the sheets' motion.
+def near_obstacle_points(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array) -> Array:
+    """(n, 3) corners of the obstacles' bounding boxes at some times [s], along the axes of ``bounds`` [m].
 
-    Coordinates [m] along the axes of the ``bounds`` around it; what is farther away is moved to its limits.
+    Corners farther from the ``bounds`` than `OBSTACLE_MARGIN` are moved to that distance.
     """
-    reach = NEAR * bounds.size
-    found = [np.empty((0, 3))]
+    margin = OBSTACLE_MARGIN * bounds.size
+    boxes = [np.empty((0, 3))]
     for obstacle in obstacles:
-        for time in times[:1] if obstacle.still else times:
-            if not obstacle.endless:
+        for time in times[:1] if obstacle.fixed else times:
+            if not obstacle.infinite:
                 x = obstacle.positions(float(time)) @ bounds.axes.T
-                found.append(np.array([x.min(axis=0), x.max(axis=0)]))
-    corners = np.clip(np.concatenate(found), bounds.low - reach, bounds.high + reach).reshape(-1, 2, 3)
-    which = np.array(list(np.ndindex(2, 2, 2)))
-    return corners[:, which, np.arange(3)].reshape(-1, 3)
+                boxes.append(np.array([x.min(axis=0), x.max(axis=0)]))
+    limits = np.clip(np.concatenate(boxes), bounds.low - margin, bounds.high + margin).reshape(-1, 2, 3)
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    return limits[:, corners, np.arange(3)].reshape(-1, 3)
 
 
 class SceneDrawing:
@@ -102,13 +102,13 @@ class SceneDrawing:
     plan : RenderPlan
     view : PerspectiveCamera
     bounds : Bounds
-        Around the whole motion.
+        Bounding box of the whole motion.
     quantity : ColourQuantity or None
-        What the sheet is coloured by.
+        The quantity that colours the sheet.
     limits : (float, float)
         Range of the colours.
     wind : (3,) float64 or None
-        Velocity of the wind [m/s], if it is to be drawn.
+        Velocity of the wind [m/s], if it is drawn.
     obstacles : list of ObstacleSurface
     """
 
@@ -127,7 +127,7 @@ class SceneDrawing:
         self._pyvista = pyvista = import_pyvista()
         self._plotter = plotter = pyvista.Plotter(off_screen=True, window_size=plan.size, lighting="none")
         plotter.set_background(HORIZON, top=SKY)
-        # as smooth as several samples a pixel, which take a software renderer half as long again
+        # FXAA is as smooth as multisampling, with which a software renderer takes 1.5 times as long
         plotter.disable_anti_aliasing()
         plotter.renderer.SetUseFXAA(True)
         plotter.camera.position, plotter.camera.focal_point = tuple(view.position), tuple(view.target)
@@ -138,7 +138,7 @@ class SceneDrawing:
         self._add_sheet(limits)
         self._obstacles = [(each, self._add_obstacle(each)) for each in obstacles]
         self._ground = None
-        floor = plan.options.ground and not any(obstacle.endless for obstacle in obstacles)
+        floor = plan.options.ground and not any(obstacle.infinite for obstacle in obstacles)
         if floor and plan.scene.gravity is not None:
             self._ground = Ground(bounds, self._triangles, len(plan.run.rest), key_light)
             self._floor = plotter.add_mesh(self._ground.mesh(), color="white", lighting=False)
@@ -155,7 +155,7 @@ class SceneDrawing:
         self._first = True
 
     def image(self, state: int) -> Image:
-        """(height, width, 3) picture of the state with a number."""
+        """(height, width, 3) picture of a state, given by its number."""
         run = self._plan.run
         time, x = float(run.times[state]), run.positions[state]
         self._sheet.points = x[self._source]
@@ -168,9 +168,9 @@ class SceneDrawing:
             else:
                 self._sheet.point_data["colour"] = values[self._source]
         for obstacle, mesh in self._obstacles:
-            if self._first or not obstacle.still:
+            if self._first or not obstacle.fixed:
                 mesh.points = obstacle.positions(time)
-                if obstacle.round:
+                if obstacle.smooth:
                     normals = vertex_normals(np.asarray(mesh.points), obstacle.triangles)
                     mesh.point_data.active_normals = normals.astype(np.float32)
         if self._ground is not None:
@@ -202,7 +202,7 @@ class SceneDrawing:
         self._source, corners, uv = np.arange(len(plan.run.rest)), triangles, None
         if plan.texture is not None:
             uv = plan.run.corner_uv
-            corner_uv = _over_whole_sheet(material_coordinates(plan.run)) if uv is None else uv
+            corner_uv = _to_unit_square(material_coordinates(plan.run)) if uv is None else uv
             self._source, corners, uv = split_at_seams(triangles, corner_uv)
         points = np.zeros((len(self._source), 3))
         self._sheet = sheet = self._pyvista.PolyData.from_regular_faces(points, corners)
@@ -210,7 +210,7 @@ class SceneDrawing:
         light |= {"ambient": 0.24, "diffuse": 0.8, "specular": 0.08}
         look: dict[str, Any]
         if quantity is not None:
-            # brighter, so that colours can be told apart in the shade
+            # brighter, so that colours can be distinguished in the shade
             light |= {"ambient": 0.45, "diffuse": 0.6, "specular": 0.05}
             if quantity.on_triangles:
                 sheet.cell_data["colour"] = np.zeros(sheet.n_cells)
@@ -222,7 +222,7 @@ class SceneDrawing:
             sheet.active_texture_coordinates = uv
             texture = self._pyvista.Texture(plan.texture)
             texture.interpolate = True
-            # a texture that repeats would show its left edge at the right one
+            # a repeated texture would show its left edge at the right edge
             texture.repeat = bool(uv.min() < 0.0 or uv.max() > 1.0)
             look = {"texture": texture, "color": "white"}
         else:
@@ -233,10 +233,10 @@ class SceneDrawing:
             self._add_bar(quantity)
 
     def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
-        """Its mesh, which is moved into place when a state is drawn."""
+        """Add an obstacle and return its mesh, whose points `image` moves."""
         points = obstacle.positions(0.0)
         mesh = self._pyvista.PolyData.from_regular_faces(points, obstacle.triangles)
-        look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.round else "flat"}
+        look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.smooth else "flat"}
         self._plotter.add_mesh(
             mesh, color=OBSTACLE_COLOR, opacity=obstacle.opacity, reset_camera=False, **look
         )
@@ -255,7 +255,7 @@ class SceneDrawing:
         return added
 
     def _add_lights(self, view: PerspectiveCamera) -> Array:
-        """Four lights placed relative to the camera; the direction of the main one."""
+        """Add four lights, placed relative to the camera; returns the direction of the main light."""
         sight = view.position - view.target
         up = self._bounds.axes[2]
         level = sight - (sight @ up) * up
@@ -271,7 +271,7 @@ class SceneDrawing:
         return directions[0]
 
     def _add_handles(self) -> None:
-        """Held vertices as spheres, and held edges as rods."""
+        """Add the held vertices as spheres and the held edges as rods."""
         self._handles = self._pyvista.PolyData(np.zeros((1, 3)))
         self._rods = self._pyvista.PolyData(np.zeros((1, 3)))
         self._rods.verts = np.zeros(0, dtype=np.int64)
@@ -299,10 +299,10 @@ class Ground:
         self._height = bounds.low[2] - FLOOR_GAP * bounds.size
         towards = bounds.axes @ light
         self._slope = towards[:2] / towards[2]
-        # how far to the side a shadow falls, at most
-        reach = (bounds.high[2] - self._height) * np.abs(self._slope).max()
+        # largest sideways displacement of the shadow
+        shift = (bounds.high[2] - self._height) * np.abs(self._slope).max()
         self._centre = (bounds.low + bounds.high)[:2] / 2.0
-        self._half = 0.75 * float(np.linalg.norm((bounds.high - bounds.low)[:2])) + 1.1 * reach
+        self._half = 0.75 * float(np.linalg.norm((bounds.high - bounds.low)[:2])) + 1.1 * shift
         self._pyvista = pyvista = import_pyvista()
         # the sheet projected onto the floor, seen from above: white on black
         self._shadow = pyvista.PolyData.from_regular_faces(np.zeros((n_vertices, 3)), triangles)
@@ -316,7 +316,7 @@ class Ground:
         above.camera.up, above.camera.parallel_scale = (0.0, 1.0, 0.0), 1.0
         above.camera.clipping_range = (0.1, 2.0)
         above.show(auto_close=False)
-        # opacity: full in the middle, none at the rim
+        # opacity: 1 in the middle, 0 at the rim
         line = np.linspace(-1.0, 1.0, FLOOR_PIXELS)
         ramp = np.clip((1.0 - np.hypot(line[:, None], line[None, :])) / 0.45, 0.0, 1.0)
         self._opacity = (255.0 * ramp * ramp * (3.0 - 2.0 * ramp)).astype(np.uint8)
@@ -353,7 +353,7 @@ class Ground:
 
 
 def wind_arrows(bounds: Bounds, wind: Array) -> tuple[Array, Array]:
-    """Feet (n, 3) of arrows upwind of the motion, and the arrow (3,), all [m]."""
+    """Starting points (n, 3) of arrows upwind of the motion, and the vector (3,) of all arrows [m]."""
     length = 0.16 * bounds.size
     towards = wind / np.linalg.norm(wind)
     middle = bounds.middle
@@ -375,7 +375,7 @@ def _arrow_mesh(pyvista: Any, feet: Array, arrow: Array) -> Any:
     return cloud.glyph(orient="along", scale=False, factor=float(np.linalg.norm(arrow)), geom=shape)
 
 
-def _over_whole_sheet(corner_uv: Array) -> Array:
-    """Texture coordinates scaled so that a picture covers the sheet once."""
+def _to_unit_square(corner_uv: Array) -> Array:
+    """Texture coordinates scaled to the unit square, so that a picture covers the sheet once."""
     low, high = corner_uv.min(axis=(0, 1)), corner_uv.max(axis=(0, 1))
     return (corner_uv - low) / np.where(high > low, high - low, 1.0)

@@ -1,4 +1,4 @@
-"""The geometry that pictures show: smooth normals, vertices doubled along texture seams, held vertices."""
+"""Geometry of the sheet in pictures: vertex normals, vertices split along texture seams, held vertices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lyra_petsc.terms.motion import Window
 
 
 def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array]:
-    """Give each vertex one copy for every texture coordinate that it has.
+    """Split each vertex into one copy for each of its texture coordinates.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array
     Returns
     -------
     source : (n,) int64
-        Vertex of the mesh that each copy stands for.
+        The vertex of the mesh that each copy belongs to.
     corners : (F, 3) int64
         The triangles in the numbering of the copies.
     uv : (n, 2) float64
@@ -37,9 +37,9 @@ def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array
 
 
 def vertex_normals(x: Array, triangles: Ints) -> Array:
-    """(V, 3) unit normals of vertices at ``x`` (V, 3): the mean of their triangles', weighted by area.
+    """(V, 3) unit normals at vertices ``x`` (V, 3): the area-weighted mean of the triangles' normals.
 
-    Zero where the triangles have no area.
+    Zero if a vertex's triangles have no area.
     """
     corners = x[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -55,7 +55,7 @@ class HeldVertices:
     Raises
     ------
     InputError
-        If the run's mesh.h5 does not hold what a handle names.
+        If the run's mesh.h5 lacks a group that a handle names.
     """
 
     def __init__(self, run: StoredRun) -> None:
@@ -77,7 +77,7 @@ class HeldVertices:
 
 
 def _stored_mesh(run: StoredRun) -> Mesh:
-    """Start positions and groups, from which the handles are selected."""
+    """The run's mesh with the start positions and groups by which handles select vertices."""
     start = run.rest if run.mesh.start is None else run.mesh.start
     no_uv, no_rest = np.empty((0, 3, 2)), np.empty(0, dtype=bool)
     return Mesh(start, start, run.triangles, triangle_uv=no_uv, flat_rest=no_rest, groups=run.mesh.groups)

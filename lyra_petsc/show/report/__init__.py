@@ -1,1 +1,1 @@
-"""Reports of several results: self-contained HTML, Markdown, figures as PNG and SVG."""
+"""Reports on runs and experiments: self-contained HTML, Markdown, and figures as PNG and SVG."""

@@ -23,12 +23,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lyra_petsc.extras import missing, remedy
-from lyra_petsc.output.agreement import replace_bytes, replace_text
+from lyra_petsc.extras import install_hint, missing_packages
+from lyra_petsc.output.file_operations import replace_bytes, replace_text
 
 
 def short(value: float, digits: int = 3) -> str:
-    """A number with this many significant digits and no trailing zeros; ``–`` if it is not finite."""
+    """A number with ``digits`` significant digits and no trailing zeros; ``–`` if it is not finite."""
     if not math.isfinite(value):
         return "–"
     if value == 0.0:
@@ -52,7 +52,7 @@ def seconds(value: float, digits: int = 3) -> str:
 
 
 def percent(fraction: float) -> str:
-    """A fraction as per cent with two significant digits."""
+    """A fraction in per cent with two significant digits."""
     if not math.isfinite(fraction):
         return "–"
     return f"{float(f'{100.0 * fraction:.2g}'):g} %"
@@ -69,7 +69,7 @@ def cell(value: Any) -> str:
 
 _NUMBER = r"-?\d[\d.]*(e[+-]?\d+)?( ?(s|ms|µs|%))?"
 NUMBER = re.compile(rf"(|–|[<≤] {_NUMBER}|{_NUMBER}( – {_NUMBER})?)")
-"""Cells that are set to the right: nothing, numbers, times and their ranges."""
+"""Right-aligned cells: empty ones, numbers, times and their ranges."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ class Drawing:
     Attributes
     ----------
     name : str
-        Its file name without ending.
+        File name without ending.
     caption : str
     as_png : callable
-        Makes ``png``, which a page with ``svg`` in it does without.
+        Returns the PNG; not called for a page that contains the SVG.
     svg : bytes
-        Empty for a picture that is no line drawing.
+        Empty for a picture that is not a line drawing.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Drawing:
 
 @dataclass
 class ReportBlock:
-    """One piece of a report; ``kind`` says which fields it uses."""
+    """One block of a report; ``kind`` determines the fields that it uses."""
 
     kind: str
     text: str = ""
@@ -112,7 +112,7 @@ class ReportBlock:
 
 
 class Report:
-    """A title and blocks in order.
+    """A report: a title and a sequence of blocks.
 
     Parameters
     ----------
@@ -124,20 +124,20 @@ class Report:
         self.blocks: list[ReportBlock] = []
 
     def heading(self, text: str) -> None:
-        """A section's title."""
+        """Add the title of a section."""
         self.blocks.append(ReportBlock("heading", text))
 
     def paragraph(self, text: str) -> None:
-        """Plain text."""
+        """Add plain text."""
         self.blocks.append(ReportBlock("paragraph", text))
 
     def bullets(self, items: Sequence[str]) -> None:
-        """A list of plain sentences; nothing if there are none."""
+        """Add a list of plain sentences, unless it is empty."""
         if items:
             self.blocks.append(ReportBlock("bullets", items=list(items)))
 
     def code(self, text: str) -> None:
-        """A command, to be copied."""
+        """Add code, such as a command."""
         self.blocks.append(ReportBlock("code", text))
 
     def table(
@@ -148,7 +148,7 @@ class Report:
         caption: str = "",
         marked: Sequence[bool] | None = None,
     ) -> None:
-        """A table; numbers are written with few digits and stand to the right.
+        """Add a table; numbers are written with few digits and right-aligned.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Report:
             Text, numbers, or None for an empty cell.
         caption : str
         marked : sequence of bool, optional
-            Rows to be set in bold.
+            Rows to be printed in bold.
         """
         texts = [[cell(value) for value in row] for row in rows]
         numeric = [
@@ -169,7 +169,7 @@ class Report:
         self.blocks.append(block)
 
     def figure(self, drawing: Drawing) -> None:
-        """A figure with its caption."""
+        """Add a figure with its caption."""
         self.blocks.append(ReportBlock("figure", drawing.caption, drawing=drawing))
 
     @property
@@ -180,7 +180,7 @@ class Report:
     # -- writing ---------------------------------------------------------------------------------------
 
     def html(self) -> str:
-        """One page that needs no other file: figures are inside, nothing is fetched."""
+        """The report as one HTML page, which contains its figures and needs no other file."""
         from jinja2 import Environment
 
         source = files("lyra_petsc.show.report").joinpath("page.html.j2").read_text(encoding="utf-8")
@@ -188,7 +188,7 @@ class Report:
         return str(page.render(title=self.title, blocks=self.blocks, inline=_inline))
 
     def markdown(self) -> str:
-        """Markdown that refers to the figures' PNG files beside it."""
+        """The report in Markdown, which refers to the figures' PNG files in the same folder."""
         parts = [f"# {self.title}"]
         for block in self.blocks:
             parts.append(_MARKDOWN[block.kind](block))
@@ -200,7 +200,7 @@ class Report:
         Returns
         -------
         list of Path
-            What was written.
+            The files written.
 
         Raises
         ------
@@ -219,13 +219,13 @@ class Report:
 
 
 def _inline(drawing: Drawing) -> str:
-    # as an image and not as tags: the ids of several SVGs in one page would clash
+    # as an image, not as SVG elements: the ids of several SVGs in one page would clash
     kind, content = ("svg+xml", drawing.svg) if drawing.svg else ("png", drawing.png)
     return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 def _plain(text: str) -> str:
-    """Text that Markdown must not take for markup."""
+    """``text`` with the characters escaped that Markdown would interpret as markup."""
     for sign in ("\\", "`", "*", "_", "<", "|"):
         text = text.replace(sign, "\\" + sign)
     return text
@@ -262,12 +262,12 @@ PLOTS = "plots"
 PACKAGES = ("matplotlib", "jinja2")
 
 
-def lacking() -> list[str]:
+def missing_report_packages() -> list[str]:
     """The packages for pictures and ``report.html`` that are not installed."""
-    return missing(PACKAGES)
+    return missing_packages(PACKAGES)
 
 
-def close(
+def write_report(
     report: Report, folder: Path, versions: Mapping[str, str], command: Sequence[str], *, pictures: str
 ) -> str:
     """Add versions and command, and write ``report.md``; if no package is missing, also HTML and figures.
@@ -277,16 +277,16 @@ def close(
     Returns
     -------
     str
-        What is missing (``pictures`` is their name) and how to get it; empty if nothing is.
+        A note on ``pictures`` that were not drawn and the missing packages; empty if none is missing.
     """
     report.heading("Versions")
     report.table(["package", "version"], [list(pair) for pair in versions.items()])
     report.paragraph("To repeat it:")
     report.code(shlex.join(command))
-    packages = lacking()
+    packages = missing_report_packages()
     if packages:
         replace_text(folder / "report.md", report.markdown())
-        return f"no {pictures} and no report.html: {remedy(packages)}"
+        return f"no {pictures} and no report.html: {install_hint(packages)}"
     (folder / PLOTS).mkdir(exist_ok=True)
     report.write(folder)
     return ""

@@ -1,6 +1,6 @@
 """Figures of errors against resolution and run time, of surfaces, and of quantities over time.
 
-Drawn with matplotlib's Agg and SVG backends alone: no display, no global state.
+Only matplotlib's Agg and SVG backends are used, which need no display and no global state.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Series:
     ----------
     name : str
     x, y : sequences of float
-        Points, joined in this order; those that are not finite and positive are left out.
+        Points, joined in this order; points that are not finite and positive are omitted.
     low, high : sequences of float
-        Spread of x, optional.
+        Smallest and largest x of each point, optional.
     labels : sequence of str
-        Beside each point, optional.
+        Label of each point, optional.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Series:
 
     @property
     def shown(self) -> Series:
-        """Its points that a logarithmic figure can show."""
+        """The series of the points that a logarithmic figure can show."""
         at = [i for i, point in enumerate(zip(self.x, self.y, strict=True)) if all(map(_visible, point))]
 
         def kept(values: Sequence[Any]) -> list[Any]:
@@ -70,22 +70,22 @@ def convergence(
     ----------
     series : sequence of Series
     name, caption : str
-        Of the drawing.
+        Name and caption of the drawing.
     x_label, y_label : str
     floor : float, optional
-        Below it no error can be told; shaded.
+        Errors below this value cannot be resolved; the range is shaded.
     floor_label : str
     """
     figure, axes = _axes(x_label, y_label)
     lines = [line.shown for line in series]
-    for line, look in _looks(lines):
+    for line, look in _with_styles(lines):
         slope = fitted_slope(line.x, line.y)
-        words = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
-        axes.plot(line.x, line.y, label=words, lw=1.6, **look)
-    _triangles(axes, [point for line in lines for point in zip(line.x, line.y, strict=True)])
-    _floor(axes, floor, floor_label)
-    _finish(axes)
-    return drawn(figure, name, caption)
+        label = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
+        axes.plot(line.x, line.y, label=label, lw=1.6, **look)
+    _reference_slopes(axes, [point for line in lines for point in zip(line.x, line.y, strict=True)])
+    _shade_floor(axes, floor, floor_label)
+    _finish_axes(axes)
+    return make_drawing(figure, name, caption)
 
 
 def work_precision(
@@ -108,15 +108,15 @@ def work_precision(
     ----------
     series : sequence of Series
     front : sequence of (time, error)
-        Points that no other beats in both; drawn as a staircase.
+        The Pareto front: points for which no other point is better in both; drawn as a staircase.
     bounds : sequence of (time, error)
-        Points of which is known only that their error is at most so large.
+        Points whose error is only known to be at most this large.
     recommended : (time, error), optional
     recommendation : str
-        Its name.
+        Name of the recommended setting.
     """
     figure, axes = _axes(x_label, y_label)
-    for line, look in _looks([line.shown for line in series]):
+    for line, look in _with_styles([line.shown for line in series]):
         spread = None
         if line.low and line.high:
             spread = np.maximum(0.0, [np.subtract(line.x, line.low), np.subtract(line.high, line.x)])
@@ -141,9 +141,9 @@ def work_precision(
             *recommended, "*", ms=17, mfc="#f6c344", mec="#1b1f24", mew=0.9, zorder=5,
             label=f"recommended: {recommendation}",
         )  # fmt: skip
-    _floor(axes, floor, floor_label)
-    _finish(axes)
-    return drawn(figure, name, caption)
+    _shade_floor(axes, floor, floor_label)
+    _finish_axes(axes)
+    return make_drawing(figure, name, caption)
 
 
 def fitted_slope(x: Sequence[float], y: Sequence[float]) -> float:
@@ -159,19 +159,19 @@ def _visible(value: float) -> bool:
 
 
 def colour(number: int) -> str:
-    """Of a figure's line of that number."""
+    """Colour of a figure's line by its number."""
     return COLOURS[number % len(COLOURS)]
 
 
-def _looks(lines: Sequence[Series]) -> Iterator[tuple[Series, dict[str, Any]]]:
-    """The lines that have points, and how each is drawn."""
+def _with_styles(lines: Sequence[Series]) -> Iterator[tuple[Series, dict[str, Any]]]:
+    """The lines that have points, each with its marker and colour."""
     for number, line in enumerate(lines):
         if line.x:
             yield line, {"marker": MARKERS[number % len(MARKERS)], "color": colour(number), "ms": 5}
 
 
 def empty_figure(height: float) -> Any:
-    """A figure of the usual width and a height [inches], without axes."""
+    """A figure without axes, of the standard width and the given height [inches]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -191,8 +191,8 @@ def _axes(x_label: str, y_label: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _triangles(axes: Any, points: Sequence[tuple[float, float]]) -> None:
-    """Dashed lines of slope 1 and 2 through the largest point, to compare by eye."""
+def _reference_slopes(axes: Any, points: Sequence[tuple[float, float]]) -> None:
+    """Dashed lines of slope 1 and 2 through the largest point, for comparison by eye."""
     if len({x for x, _ in points}) < 2:
         return
     (low, high), (bottom, top) = ((min(values), max(values)) for values in zip(*points, strict=True))
@@ -204,8 +204,8 @@ def _triangles(axes: Any, points: Sequence[tuple[float, float]]) -> None:
         )  # fmt: skip
 
 
-def _floor(axes: Any, floor: float | None, label: str) -> None:
-    """Shade what is below ``floor``, without letting a far one stretch the figure."""
+def _shade_floor(axes: Any, floor: float | None, label: str) -> None:
+    """Shade the range below ``floor``, unless that would stretch the figure."""
     if floor is None or not _visible(floor):
         return
     low, high = axes.get_ylim()
@@ -215,8 +215,8 @@ def _floor(axes: Any, floor: float | None, label: str) -> None:
     axes.set_ylim(min(low, floor / 3.0), high)
 
 
-def _finish(axes: Any) -> None:
-    """Legend, and labelled ticks also where an axis spans less than a decade."""
+def _finish_axes(axes: Any) -> None:
+    """Add a legend, and label ticks even if an axis spans less than a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
@@ -229,8 +229,8 @@ def _finish(axes: Any) -> None:
         axes.legend(fontsize=8, framealpha=0.9, edgecolor="#d5d9de")
 
 
-def drawn(figure: Any, name: str, caption: str) -> Drawing:
-    """A matplotlib figure as SVG, and as PNG where that is asked for."""
+def make_drawing(figure: Any, name: str, caption: str) -> Drawing:
+    """A matplotlib figure as SVG, and as PNG when that is first used."""
     from matplotlib import rc_context
 
     def png() -> bytes:
@@ -239,14 +239,14 @@ def drawn(figure: Any, name: str, caption: str) -> Drawing:
         return content.getvalue()
 
     svg = io.BytesIO()
-    # without date and with a fixed salt the same data give the same file
+    # without date and with a fixed salt, the same data give the same file
     with rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     return Drawing(name, caption, png, svg.getvalue())
 
 
-MOST_TRIANGLES = 20_000
-"""Drawn of a surface; of a larger one every k-th is."""
+MAX_TRIANGLES = 20_000
+"""Maximum number of triangles drawn; of a larger surface, every k-th triangle is drawn."""
 
 
 def over_time(curves: Sequence[Series], *, name: str, caption: str, y_label: str) -> Drawing:
@@ -257,12 +257,12 @@ def over_time(curves: Sequence[Series], *, name: str, caption: str, y_label: str
         axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.6, marker=".", ms=4)
     axes.grid(True, color="#dfe3e8", lw=0.8)
     axes.legend(fontsize=8)
-    return drawn(figure, name, caption)
+    return make_drawing(figure, name, caption)
 
 
 def surface(x: Array, triangles: Ints, *, name: str, caption: str) -> Drawing:
     """A triangle surface (V, 3) [m] seen obliquely, lit from the side."""
-    every = -(-len(triangles) // MOST_TRIANGLES)
+    every = -(-len(triangles) // MAX_TRIANGLES)
     figure = empty_figure(HEIGHT)
     axes: Any = figure.add_subplot(projection="3d")
     axes.plot_trisurf(
@@ -277,4 +277,4 @@ def surface(x: Array, triangles: Ints, *, name: str, caption: str) -> Drawing:
         axes.locator_params(axis=axis, nbins=4)
     axes.set_box_aspect((1, 1, 1))
     axes.view_init(elev=18, azim=-65)
-    return drawn(figure, name, caption)
+    return make_drawing(figure, name, caption)

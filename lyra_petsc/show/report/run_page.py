@@ -1,5 +1,7 @@
-"""The page about one run, from the files of its folder: pictures, energies, steps, wall time, settings,
-notes, and what to change where it was slow or inaccurate.
+"""The report page on one run, from the files of its folder.
+
+It shows pictures, energies, steps, wall time, settings and notes, and advises how to make the run faster or
+more accurate.
 """
 
 from __future__ import annotations
@@ -15,23 +17,23 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.extras import missing
+from lyra_petsc.extras import missing_packages
 from lyra_petsc.output import read_run
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_folder import in_use
+from lyra_petsc.output.run_folder import is_locked
 from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
-from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure, surface
+from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing, surface
 
 ENERGIES = {column: column.removesuffix("_energy") for column in read_run.ENERGIES}
-"""Names of the columns of energies [J] in words."""
+"""Columns of energies [J] and their names on the page."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """A run in numbers.
+    """The numbers on a run: its history, its summary, and quantities computed from them.
 
     Attributes
     ----------
@@ -39,7 +41,7 @@ class Facts:
     columns : dict of str to (n,) array
         The history; row 0 is the initial state.
     summary : dict
-        summary.json; empty where it is missing.
+        summary.json; empty if it is missing.
     """
 
     run: StoredRun
@@ -58,18 +60,18 @@ class Facts:
 
     @property
     def static(self) -> bool:
-        """Whether it seeks an equilibrium: time is the load factor then."""
+        """Whether the run is a static analysis, whose time is the load factor."""
         return self.run.scene.time.static
 
     @cached_property
     def outcome(self) -> str:
-        """``done``, ``running``, ``killed``, ``unknown``, or the words with which it stopped."""
-        words = str(self.summary.get("outcome", "unknown"))
-        return "killed" if words == "running" and not in_use(self.run.folder) else words
+        """``done``, ``running``, ``killed``, ``unknown``, or the message with which the run stopped."""
+        outcome = str(self.summary.get("outcome", "unknown"))
+        return "killed" if outcome == "running" and not is_locked(self.run.folder) else outcome
 
     @property
     def failed(self) -> bool:
-        """Whether the solver gave up."""
+        """Whether the solver failed."""
         return "failure" in self.summary
 
     # -- energy --------------------------------------------------------------------------------------
@@ -81,7 +83,7 @@ class Facts:
 
     @cached_property
     def scheme_loss(self) -> Array:
-        """(n,) numerical dissipation [J] so far: what neither loads nor damping account for."""
+        """(n,) cumulative numerical dissipation [J]: the energy change due to neither loads nor damping."""
         gain = self.columns["external_work"] - self.columns["dissipation"]
         return np.asarray(self.total_energy[0] + gain - self.total_energy)
 
@@ -95,47 +97,47 @@ class Facts:
 
     @property
     def n_steps(self) -> int:
-        """Accepted steps."""
+        """Number of accepted steps."""
         return len(self.columns["step"]) - 1
 
     @property
     def step_seconds(self) -> float:
-        """Wall time [s] of all steps, those before a resumption included."""
+        """Wall time [s] of all steps, including those before a resumption."""
         return float(self.steps("wall_seconds").sum())
 
     @property
     def newton_per_step(self) -> float:
-        """Mean Newton iterations of a step, attempts that were rejected included."""
+        """Mean Newton iterations per accepted step, including rejected attempts."""
         return float(self.steps("newton_iterations").mean()) if self.n_steps else 0.0
 
     @property
     def linear_per_newton(self) -> float:
-        """Mean linear iterations of a Newton iteration."""
+        """Mean linear iterations per Newton iteration."""
         newton = float(self.steps("newton_iterations").sum())
         return float(self.steps("linear_iterations").sum()) / newton if newton else 0.0
 
     @property
     def rejected(self) -> int:
-        """Attempts at a step that were repeated."""
+        """Number of rejected attempts at steps."""
         return int(self.steps("rejected").sum())
 
     @property
     def phases(self) -> dict[str, float]:
-        """Wall time [s] by phase, of the last start of the run; empty while it goes on."""
+        """Wall time [s] by phase since the last start or resumption; empty if the run is not finished."""
         return {} if self.outcome in ("running", "killed") else dict(self.summary.get("wall_seconds", {}))
 
     def share(self, phase: str) -> float:
-        """Part of the wall time that a phase took."""
+        """Fraction of the wall time that a phase took."""
         total = sum(self.phases.values())
         return self.phases.get(phase, 0.0) / total if total else 0.0
 
 
 MANY_POINTS = 3000
-"""Points of a line from which it is drawn as pixels."""
+"""Number of points from which a line is drawn as pixels."""
 
 
 def energies(facts: Facts) -> Drawing:
-    """Energies over time, the potential one from its start."""
+    """Energies over time; the potential energy is relative to its start."""
     figure, (axes,) = _axes(facts, ["energy [J]"], 0.75 * HEIGHT)
     for number, (column, name) in enumerate(ENERGIES.items()):
         values = facts.columns[column]
@@ -145,11 +147,11 @@ def energies(facts: Facts) -> Drawing:
             _line(axes, facts.columns["time"], values, number, name)
     if axes.lines:
         axes.legend(fontsize=8)
-    return drawn(figure, "energies", f"Energies over {'load factor' if facts.static else 'time'}")
+    return make_drawing(figure, "energies", f"Energies over {'load factor' if facts.static else 'time'}")
 
 
 def balance(facts: Facts) -> Drawing:
-    """Where the energy came from and where it went."""
+    """Energy balance over time: change of energy, work, damping and numerical dissipation."""
     figure, (axes,) = _axes(facts, ["energy [J]"], 0.75 * HEIGHT)
     time = facts.columns["time"]
     _line(axes, time, facts.total_energy - facts.total_energy[0], 0, "change of the total energy")
@@ -158,7 +160,7 @@ def balance(facts: Facts) -> Drawing:
     _line(axes, time, -facts.scheme_loss, 4, "taken by the time scheme")
     axes.legend(fontsize=8)
     caption = "Energy balance: the first line is the sum of the other three"
-    return drawn(figure, "balance", caption)
+    return make_drawing(figure, "balance", caption)
 
 
 def effort(facts: Facts) -> Drawing:
@@ -180,11 +182,11 @@ def effort(facts: Facts) -> Drawing:
         axes[0].plot(at, dt, "x", color=colour(1), ms=5, label="after rejected attempts")
         axes[0].legend(fontsize=8)
     caption = "Each step: its length, Newton iterations, linear iterations of a Newton iteration, wall time"
-    return drawn(figure, "steps", caption)
+    return make_drawing(figure, "steps", caption)
 
 
 def phases(wall: Mapping[str, float]) -> Drawing:
-    """Wall time by phase, as one bar."""
+    """Wall time by phase as one stacked bar."""
     figure = empty_figure(1.4)
     axes = figure.add_subplot()
     left = 0.0
@@ -194,7 +196,7 @@ def phases(wall: Mapping[str, float]) -> Drawing:
     axes.set_yticks([])
     axes.set_xlabel("wall time [s]")
     axes.legend(fontsize=8, ncols=len(wall), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
-    return drawn(figure, "phases", "Wall time by phase")
+    return make_drawing(figure, "phases", "Wall time by phase")
 
 
 def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]:
@@ -218,23 +220,23 @@ MANY_REJECTED = 0.05
 """Rejected attempts over accepted steps."""
 
 MANY_NEWTON = 8.0
-"""Newton iterations of a step, on average."""
+"""Mean Newton iterations per step."""
 
 MANY_LINEAR = 100.0
-"""Linear iterations of a Newton iteration, on average."""
+"""Mean linear iterations per Newton iteration."""
 
 MUCH_OUTPUT = 0.2
 MUCH_MESHING = 0.25
-"""Shares of the wall time."""
+"""Fractions of the wall time."""
 
 FEW_VERTICES = 300
-"""Of a rank."""
+"""Vertices per rank."""
 
-LOSSY = 0.05
-"""Energy lost by the time scheme over what moved."""
+MUCH_LOSS = 0.05
+"""Numerical dissipation relative to the largest change of an energy."""
 
 SLOW_FIRST_STEP = 5.0
-"""Seconds that the first step takes longer than the median."""
+"""Wall time [s] by which the first step exceeds the median."""
 
 OPTIONS = {
     "block-jacobi": "-pc_type pbjacobi",
@@ -246,17 +248,17 @@ OPTIONS = {
     "direct": "-pc_type cholesky",
     "cholesky": "-pc_type cholesky",
 }
-"""What to write on the command line for each linear solver; the program adds what goes with it."""
+"""Command line options for each linear solver; the program adds the options that these need."""
 
 Rule = Callable[[Facts], Iterator[str]]
 
 
 def advice(facts: Facts) -> list[str]:
-    """Sentences on what was slow or inaccurate and what to change; empty if nothing stands out."""
-    return [words for rule in RULES for words in rule(facts)]
+    """Sentences on reasons for slowness or inaccuracy and their remedies; empty if there are none."""
+    return [sentence for rule in RULES for sentence in rule(facts)]
 
 
-def _how_it_ended(facts: Facts) -> Iterator[str]:
+def _how_to_continue(facts: Facts) -> Iterator[str]:
     folder = facts.run.folder
     again = f"mpirun -n {facts.summary.get('ranks', 1)} lyra-petsc run --resume --out {folder}"
     if facts.failed:
@@ -283,7 +285,7 @@ def _rejected_steps(facts: Facts) -> Iterator[str]:
         yield f"{seen}, a few hard moments of the motion. time.step: auto takes small steps only there."
 
 
-def _taken_over(facts: Facts) -> Iterator[str]:
+def _solver_changed(facts: Facts) -> Iterator[str]:
     changed = [note for note in facts.summary.get("notes", []) if "going on with" in note]
     name = facts.summary.get("linear_solver", "")
     if changed and name in OPTIONS:
@@ -368,7 +370,7 @@ def _accuracy(facts: Facts) -> Iterator[str]:
     if facts.static or facts.turnover == 0.0 or time.scheme not in ("beuler", "semi-implicit"):
         return
     lost = float(facts.scheme_loss[-1])
-    if lost > LOSSY * facts.turnover:
+    if lost > MUCH_LOSS * facts.turnover:
         yield (
             f"The time scheme ({time.scheme}) took away {short(lost)} J, {percent(lost / facts.turnover)} of "
             "the largest change of an energy. A smaller time.step loses less, and so do bdf2, midpoint and "
@@ -377,9 +379,9 @@ def _accuracy(facts: Facts) -> Iterator[str]:
 
 
 RULES: tuple[Rule, ...] = (
-    _how_it_ended,
+    _how_to_continue,
     _rejected_steps,
-    _taken_over,
+    _solver_changed,
     _newton,
     _linear,
     _output,
@@ -391,19 +393,19 @@ RULES: tuple[Rule, ...] = (
 
 
 SLOWEST = 5
-"""Steps that are listed."""
+"""Number of the slowest steps that are listed."""
 
 PICTURES = 3
 
 
 def run_page(run: StoredRun, pictures: Sequence[Drawing]) -> Report:
-    """The page of a run that goes on, has ended, failed, or was killed.
+    """The page of a run that is running, has ended, failed, or was killed.
 
     Parameters
     ----------
     run : StoredRun
     pictures : sequence of Drawing
-        Of the sheet.
+        Pictures of the sheet.
     """
     facts = Facts.of(run)
     page = Report(run.scene.title or run.name)
@@ -419,19 +421,19 @@ def run_page(run: StoredRun, pictures: Sequence[Drawing]) -> Report:
     _energy(page, facts)
     _steps(page, facts)
     _wall_time(page, facts)
-    _words(page, facts)
+    _notes(page, facts)
     _settings(page, facts)
     return page
 
 
 def chosen_states(run: StoredRun) -> list[int]:
-    """Numbers of the states that are shown: the first, the last, and one half-way in time."""
+    """Numbers of the states shown on the page: the first, the last, and one half-way in time."""
     half = run.at(0.5 * float(run.times[0] + run.times[-1]))
     return sorted({0, half, len(run) - 1})
 
 
 def plain_pictures(run: StoredRun) -> list[Drawing]:
-    """The sheet at a few times, drawn by matplotlib."""
+    """Pictures of the sheet at a few times, drawn by matplotlib."""
     return [
         surface(run.positions[i], run.triangles, name=f"state-{i}", caption=state_caption(run, i))
         for i in chosen_states(run)
@@ -439,7 +441,7 @@ def plain_pictures(run: StoredRun) -> list[Drawing]:
 
 
 def state_caption(run: StoredRun, i: int) -> str:
-    """What a picture of state ``i`` shows."""
+    """Caption of a picture of state ``i``."""
     return f"Load factor {run.times[i]:g}" if run.scene.time.static else f"t = {run.times[i]:g} s"
 
 
@@ -468,14 +470,14 @@ def _outcome(facts: Facts, done: float) -> str:
     if facts.static:
         now = f"load factor {facts.columns['time'][-1]:g}"
     part = percent(done)
-    words = {
+    texts = {
         "done": f"The run came to its end, {now}.",
         "running": f"The run goes on: {now}, {part}. Made again, this page shows more.",
         "killed": f"The run was killed, or its machine went down, after {now}, {part}.",
         "unknown": f"How the run ended is not known (no summary.json); its last step is at {now}.",
         "stopped": f"The run was to stop at {now}, {part}, by -ts_max_steps.",
     }
-    return words.get(facts.outcome, f"The run stopped at {now}, {part}: {facts.outcome}")
+    return texts.get(facts.outcome, f"The run stopped at {now}, {part}: {facts.outcome}")
 
 
 def _energy(page: Report, facts: Facts) -> None:
@@ -494,10 +496,10 @@ def _energy(page: Report, facts: Facts) -> None:
     work, heat = (float(facts.columns[name][-1]) for name in ("external_work", "dissipation"))
     lost = float(facts.scheme_loss[-1])
     part = f", {percent(lost / facts.turnover)} of the largest change of an energy" if facts.turnover else ""
-    words = "taken away" if lost >= 0 else "added"
+    verb = "taken away" if lost >= 0 else "added"
     page.paragraph(
         f"Work of loads and handles {short(work)} J, taken by damping {short(heat)} J, "
-        f"{words} by the time scheme {short(abs(lost))} J{part}."
+        f"{verb} by the time scheme {short(abs(lost))} J{part}."
     )
 
 
@@ -546,7 +548,7 @@ def _wall_time(page: Report, facts: Facts) -> None:
         page.paragraph("Since the last resumption; the steps before are in the tables above.")
 
 
-def _words(page: Report, facts: Facts) -> None:
+def _notes(page: Report, facts: Facts) -> None:
     page.heading("Warnings and notes")
     notes = list(facts.summary.get("notes", []))
     unused = facts.summary.get("unused_petsc_options", [])
@@ -555,8 +557,8 @@ def _words(page: Report, facts: Facts) -> None:
     for resumed in facts.summary.get("resumed", []):
         listed = resumed.get("changes", [])
         changes = "; ".join(f"{c.get('key')}: {c.get('old')} → {c.get('new')}" for c in listed)
-        words = f"resumed after step {resumed.get('step')} on {resumed.get('ranks')} ranks"
-        notes.append(f"{words}, with {changes}" if changes else words)
+        note = f"resumed after step {resumed.get('step')} on {resumed.get('ranks')} ranks"
+        notes.append(f"{note}, with {changes}" if changes else note)
     page.bullets(notes)
     if not notes:
         page.paragraph(
@@ -585,28 +587,28 @@ PICTURE_SIZE = "960x540"
 
 
 def write_page(folder: Path, out: Path | None) -> Path:
-    """Write the page of a run; the file's path. On one rank.
+    """Write the page of a run; returns the file's path. Call on one rank.
 
     Raises
     ------
     InputError
-        If the folder is none of a run.
+        If the folder is not one of a run.
     OutputError
         If the page cannot be written.
     """
     run = StoredRun(folder)
     path = folder / PAGE if out is None else out
     if path.is_dir() or not path.absolute().parent.is_dir():
-        what = "is a folder; name a file" if path.is_dir() else "cannot be written: there is no such folder"
-        raise InputError(what, file=path, key="--out")
+        error = "is a folder; name a file" if path.is_dir() else "cannot be written: there is no such folder"
+        raise InputError(error, file=path, key="--out")
     pictures = _rendered(run) or plain_pictures(run)
     replace_text(path, run_page(run, pictures).html())
     return path
 
 
 def _rendered(run: StoredRun) -> list[Drawing]:
-    """Pictures of a few states as ``render`` draws them; none where that cannot be."""
-    if missing(PACKAGES):
+    """Pictures of a few states as ``render`` draws them; empty without its packages or OpenGL."""
+    if missing_packages(PACKAGES):
         return []
     from mpi4py import MPI
 

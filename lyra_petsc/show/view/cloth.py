@@ -1,4 +1,4 @@
-"""The cloth as VTK objects, which trame sends to the page; the browser draws them."""
+"""The cloth as VTK objects, which trame sends to the page and the browser draws."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OBSTACLE = (0.6, 0.63, 0.66)
 
 
 class Cloth:
-    """The triangles with their camera; positions and colours change from state to state.
+    """The scene of the page: cloth, obstacles, handles, wind and camera.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ class Cloth:
     """
 
     def __init__(self, triangles: Ints) -> None:
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it would complain of a missing display
+        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # VTK would warn of a missing display
         self._data = vtkPolyData()
         self.set_mesh(triangles)
         self._renderer = vtkRenderer()
         self._renderer.SetBackground(*BACKGROUND)
-        actor, self._mapper = self._actor(self._data, PLAIN)
+        actor, self._mapper = self._add_actor(self._data, PLAIN)
         self._mapper.SetColorModeToDirectScalars()
         self._look = actor.GetProperty()
         self._look.SetEdgeColor(*EDGES)
@@ -54,25 +54,25 @@ class Cloth:
         self._look.SetDiffuse(0.65)
         self._look.SetSpecular(0.08)
         self._look.SetSpecularPower(20.0)
-        self._held, self._wind, self._mark = (self._add(color) for color in (HELD, WIND, MARK))
+        self._held, self._wind, self._mark = (self._add_points(color) for color in (HELD, WIND, MARK))
         self._obstacles: list[tuple[ObstacleSurface, vtkPolyData, vtkActor]] = []
         self.window = vtkRenderWindow()
         self.window.AddRenderer(self._renderer)
 
-    def _add(self, color: tuple[float, float, float]) -> vtkPolyData:
-        """Points and lines of one colour; empty."""
+    def _add_points(self, color: tuple[float, float, float]) -> vtkPolyData:
+        """Add an empty set of points and lines of one colour."""
         data = vtkPolyData()
         data.SetPoints(vtkPoints())
-        look = self._actor(data, color)[0].GetProperty()
+        look = self._add_actor(data, color)[0].GetProperty()
         look.SetLighting(False)
         look.SetPointSize(9.0)
         look.SetLineWidth(4.0)
         return data
 
-    def _actor(
+    def _add_actor(
         self, data: vtkPolyData, color: tuple[float, float, float]
     ) -> tuple[vtkActor, vtkPolyDataMapper]:
-        """What draws data in one colour."""
+        """Add an actor that draws ``data`` in one colour; returns the actor and its mapper."""
         mapper, actor = vtkPolyDataMapper(), vtkActor()
         mapper.SetInputData(data)
         actor.SetMapper(mapper)
@@ -89,49 +89,49 @@ class Cloth:
             data = vtkPolyData()
             data.SetPoints(vtkPoints())
             data.SetPolys(_triangles(obstacle.triangles))
-            actor, _ = self._actor(data, OBSTACLE)
+            actor, _ = self._add_actor(data, OBSTACLE)
             look = actor.GetProperty()
             look.SetOpacity(obstacle.opacity)
-            if not obstacle.round:
+            if not obstacle.smooth:
                 look.SetInterpolationToFlat()
             self._obstacles.append((obstacle, data, actor))
 
     def show_obstacles(self, time: float) -> None:
-        """Show the obstacles where they are at a time [s]."""
+        """Move the obstacles to their positions at a time [s]."""
         for obstacle, data, _ in self._obstacles:
-            if obstacle.still and data.GetNumberOfPoints():
+            if obstacle.fixed and data.GetNumberOfPoints():
                 continue
             x = obstacle.positions(time)
-            _move(data, x, vertex_normals(x, obstacle.triangles) if obstacle.round else None)
+            _set_points(data, x, vertex_normals(x, obstacle.triangles) if obstacle.smooth else None)
             data.Modified()
 
     def show_held(self, positions: Array, edges: Ints) -> None:
-        """Show held vertices (n, 3) [m] and the edges (k, 2) between them; none to hide them."""
-        _put(self._held, positions, edges)
+        """Show held vertices (n, 3) [m] and the edges (k, 2) between them; empty arrays hide them."""
+        _set_geometry(self._held, positions, edges)
 
     def show_wind(self, feet: Array, arrow: Array) -> None:
-        """Show arrows (3,) from feet (n, 3), both [m]; none to hide them."""
+        """Show equal arrows (3,) that start at ``feet`` (n, 3), both [m]; an empty array hides them."""
         across = np.cross(arrow, [0.3, 0.5, 0.8])
         across *= 0.1 * np.linalg.norm(arrow) / max(float(np.linalg.norm(across)), 1e-300)
         heads = feet + arrow
         barbs = [heads - 0.25 * arrow + side for side in (across, -across)]
         n = np.arange(len(feet))
         ends = [np.column_stack([i * len(feet) + n, len(feet) + n]) for i in (0, 2, 3)]
-        _put(self._wind, np.concatenate([feet, heads, *barbs]), np.concatenate(ends), points=False)
+        _set_geometry(self._wind, np.concatenate([feet, heads, *barbs]), np.concatenate(ends), points=False)
 
     def mark(self, vertex: int | None) -> None:
-        """Mark a vertex of the state shown by a pin through it, which is seen from both sides; or none."""
+        """Mark a vertex of the present state by a pin, visible from both sides; ``None`` removes the mark."""
         if vertex is None:
-            # pages would never learn the look of what is empty at first: a line without length instead
-            _put(self._mark, self._positions[[0, 0]], np.array([[0, 1]]), points=False)
+            # a line of zero length: pages would never receive the colour of an object that is empty at first
+            _set_geometry(self._mark, self._positions[[0, 0]], np.array([[0, 1]]), points=False)
             return
         size = np.linalg.norm(self._positions.max(axis=0) - self._positions.min(axis=0))
         pin = 0.02 * size * self._normals[vertex]
         ends = self._positions[vertex] + np.array([pin, -pin])
-        _put(self._mark, ends, np.array([[0, 1]]))
+        _set_geometry(self._mark, ends, np.array([[0, 1]]))
 
     def set_mesh(self, triangles: Ints) -> None:
-        """Replace the triangles; the vertices have no positions until the next `show`."""
+        """Replace the triangles (F, 3); the vertices have no positions until the next `show`."""
         self._triangles = triangles
         self._data.Initialize()
         self._data.SetPoints(vtkPoints())
@@ -145,13 +145,14 @@ class Cloth:
         positions : (V, 3) array
             [m]
         colours : (V, 3) or (F, 3) uint8 array, optional
-            Of the vertices or of the triangles; else the cloth has one colour.
+            Colours of the vertices or triangles; without them, the cloth has one colour.
         on_triangles : bool
+            Whether the colours belong to triangles.
         """
-        # new arrays each time: a page may still fetch those of the previous state
+        # new arrays each time, as a page may still fetch those of the previous state
         data, vertices, cells = self._data, self._data.GetPointData(), self._data.GetCellData()
         self._positions, self._normals = positions, vertex_normals(positions, self._triangles)
-        _move(data, positions, self._normals)
+        _set_points(data, positions, self._normals)
         vertices.SetScalars(None)
         cells.SetScalars(None)
         self._mapper.SetScalarVisibility(colours is not None)
@@ -185,8 +186,8 @@ def _triangles(corners: Ints) -> vtkCellArray:
     return cells
 
 
-def _move(data: vtkPolyData, x: Array, normals: Array | None = None) -> None:
-    """Replace the points (n, 3) [m] of a mesh, and the normals at them."""
+def _set_points(data: vtkPolyData, x: Array, normals: Array | None = None) -> None:
+    """Replace the points (n, 3) [m] of a mesh and, if given, their normals."""
     data.GetPoints().SetData(_as_vtk(x.astype(np.float32)))
     data.GetPoints().Modified()
     if normals is not None:
@@ -195,19 +196,19 @@ def _move(data: vtkPolyData, x: Array, normals: Array | None = None) -> None:
         data.GetPointData().SetNormals(array)
 
 
-def _put(data: vtkPolyData, places: Array, edges: Ints, *, points: bool = True) -> None:
-    """Replace the points and lines of a mesh."""
-    _move(data, places.reshape(-1, 3))
-    single = np.arange(len(places) if points else 0, dtype=np.int64)
-    for size, cells, put in ((1, single, data.SetVerts), (2, edges.astype(np.int64), data.SetLines)):
-        made = vtkCellArray()
+def _set_geometry(data: vtkPolyData, x: Array, edges: Ints, *, points: bool = True) -> None:
+    """Replace the points ``x`` (n, 3) [m] and lines of a mesh; ``points``: also draw the points."""
+    _set_points(data, x.reshape(-1, 3))
+    vertices = np.arange(len(x) if points else 0, dtype=np.int64)
+    for size, cells, assign in ((1, vertices, data.SetVerts), (2, edges.astype(np.int64), data.SetLines)):
+        array = vtkCellArray()
         if len(cells):
-            made.SetData(size, _as_vtk(cells.ravel()))
-        put(made)
+            array.SetData(size, _as_vtk(cells.ravel()))
+        assign(array)
     data.Modified()
 
 
 def _as_vtk(values: NDArray[Any]) -> Any:
-    """A copy as VTK array."""
+    """A copy of an array as VTK array."""
     convert: Any = numpy_to_vtkIdTypeArray if values.dtype == np.int64 else numpy_to_vtk
     return convert(np.ascontiguousarray(values), deep=True)

@@ -1,8 +1,8 @@
-"""The page of ``run --live``: a process of its own, which reads the run's folder.
+"""The page of ``run --live``: a separate process, which reads the run's folder.
 
 ``python -m lyra_petsc.show.view.live HOST PORT`` reads the folder from its standard input and writes one line
-to its standard output: the address of the page, or why there is none. When its standard input ends, the run
-has ended, in whatever way; the process ends when no page is open any more.
+to its standard output: the address of the page, or the reason for its failure. The end of the standard input
+means that the run has ended; the process then ends when no page is open any more.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from lyra_petsc.api.mpirun import environment
 from lyra_petsc.errors import LyraError
 
 READY, FAILED = "ready ", "failed "
-"""Beginnings of that line."""
+"""Prefixes of the line on standard output."""
 
 NICENESS = 10
-"""On Linux 110 / (1024 + 110) = 10 % of a processor's time beside a busy rank, all of it on an idle one.
+"""With a busy rank on the same processor, Linux gives the process 110 / (1024 + 110) = 10 % of its time.
 
-It takes that only while a page is loaded; of less, the megabytes of the page take minutes.
+The process needs it only while a page is loaded; with less, loading the page's megabytes takes minutes.
 """
 
 
 class LivePage:
-    """Starts the page's process before the set-up of a run, which never waits for it; for one rank.
+    """The page's process, started before the set-up of a run, which never waits for it; for one rank.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class LivePage:
     ready : callable
         Called in a thread with the page's address.
     failed : callable
-        Called in a thread with the reason, if there will be no page.
+        Called in a thread with the reason, if the page cannot be served.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class LivePage:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                env=environment(),  # it is no rank of the run
-                start_new_session=True,  # Ctrl-C is for the run
+                env=environment(),  # the process is not a rank of the run
+                start_new_session=True,  # Ctrl-C must reach the run only
                 text=True,
             )
         except OSError as error:
@@ -67,7 +67,7 @@ class LivePage:
         line = process.stdout.readline().strip()
         if line.startswith(READY):
             self._ready(line.removeprefix(READY))
-        elif process.stdin is not None and not process.stdin.closed:  # else the run was over before
+        elif process.stdin is not None and not process.stdin.closed:  # closed: the run has ended already
             self._failed(line.removeprefix(FAILED) or "its process ended")
 
     def show(self, folder: Path) -> None:
@@ -78,7 +78,7 @@ class LivePage:
                 self._process.stdin.flush()
 
     def end(self) -> None:
-        """Tell the process that the run has ended; it shows the last state until no page is open."""
+        """Notify the process that the run has ended; it shows the last state until no page is open."""
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
@@ -87,40 +87,40 @@ class LivePage:
 def main(host: str, port: int) -> None:
     """Serve the page of the run whose folder is the first line of the standard input."""
     _lower_priority(NICENESS)
-    # the imports take a second, in which the run sets itself up
-    from lyra_petsc.show.view.server import LONGEST_STAY, find_run, serve
+    # the imports take a second, during the run's set-up
+    from lyra_petsc.show.view.server import MAX_STAY, find_run, serve
 
     line = sys.stdin.readline()
     if not line:
         return
     folder = Path(line.removesuffix("\n"))
 
-    def tell(line: str) -> None:
-        with suppress(OSError):  # the run is gone already
+    def report(line: str) -> None:
+        with suppress(OSError):  # the run's process has ended
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 
     def ended() -> str:
         sys.stdin.read()
         return (
-            f"The run has ended. This page stays for as long as it is open, at most {LONGEST_STAY / 60:.0f} "
+            f"The run has ended. This page stays for as long as it is open, at most {MAX_STAY / 60:.0f} "
             f"minutes; later: lyra-petsc view {folder}"
         )
 
     def ready(url: str) -> None:
-        tell(READY + url)
+        report(READY + url)
 
     try:
         asyncio.run(serve(find_run(folder), host, port, ready, ended))
     except LyraError as error:
-        tell(FAILED + str(error))
+        report(FAILED + str(error))
 
 
 def _lower_priority(niceness: int) -> None:
-    """Lower this process's priority, and undo a binding to processors that it has inherited from rank 0."""
+    """Lower this process's priority, and remove the binding to processors inherited from rank 0."""
     os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     if os.getsid(0) == os.getpid():
-        # Linux may divide the time among sessions first, and this process has its own
+        # Linux may divide processor time among sessions first, and this process has a session of its own
         with suppress(OSError):
             Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
     if hasattr(os, "sched_setaffinity"):

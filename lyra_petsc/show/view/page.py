@@ -1,4 +1,4 @@
-"""The page: its layout, the state that it shows, and what the controls do."""
+"""The page: its layout, the state that it shows, and the actions of its controls."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from trame_vtk.modules.vtk.serializers import SynchronizationContext
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import StoredRun, read_history
-from lyra_petsc.output.run_folder import in_use
-from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
+from lyra_petsc.output.run_folder import is_locked
+from lyra_petsc.show.render.camera import CameraFit, line_of_sight, up_direction
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
-from lyra_petsc.show.render.render_plan import scene_shown
-from lyra_petsc.show.render.scene_drawing import Bounds, near_points, wind_arrows
+from lyra_petsc.show.render.render_plan import scene_with_settings
+from lyra_petsc.show.render.scene_drawing import Bounds, near_obstacle_points, wind_arrows
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
 from lyra_petsc.show.view.cloth import Cloth
@@ -35,57 +35,57 @@ if TYPE_CHECKING:
 
 
 STYLE, SCRIPT = (Path(__file__).with_name(name) for name in ("style.css", "keys.js"))
-MOVED = 5.0
-"""Pixels from which on the mouse was drawn, not clicked."""
+DRAG_PIXELS = 5.0
+"""Mouse movement [pixels] from which on a click counts as dragging."""
 
 SLOW_DRAWING = 2.0
-"""Seconds without a report that the last state was drawn after which the page says that it waits."""
-LONGEST_DRAWING = 30.0
-"""Seconds after which the next state is sent all the same: who waits shows the last one that is whole."""
+"""Time [s] after which the page says that it waits for the browser to draw a state."""
+MAX_DRAWING = 30.0
+"""Time [s] after which the next state is sent even if the last one has not been drawn."""
 
 ARRAY_BYTES = 256 * 2**20
-"""Of arrays that were sent and are kept for pages that are late to fetch them."""
+"""Size of the sent arrays that are kept for pages that fetch them late."""
 ARRAY_SECONDS = 20.0
-"""Age below which they are kept in any case."""
+"""Age below which sent arrays are always kept."""
 
 POLLING_SHARE = 0.02
-"""Share of a processor's time that looking for new states takes."""
-POLL_SECONDS, LONGEST_POLL = 0.5, 5.0
-"""Least and longest time between two such looks."""
-LATE = 5.0
-"""Seconds without a new state after which the page says that it waits for the run."""
+"""Fraction of a processor's time that polling for new states may take."""
+MIN_POLL_SECONDS, MAX_POLL_SECONDS = 0.5, 5.0
+"""Bounds of the polling interval."""
+LATE_SECONDS = 5.0
+"""Time [s] without a new state after which the page says that it waits for the run."""
 
 MARK_SECONDS = 0.25
-"""Seconds between two moves of the plots' time marks while it plays."""
+"""Time [s] between two moves of the plots' time marks when playing."""
 
 COMPACT: dict[str, Any] = {"density": "compact", "hide_details": True}
-"""Looks of a control."""
+"""Style of a control."""
 
 PLAIN = "none"
-"""Choice of a quantity: the cloth in one colour."""
+"""Option of the quantities: the cloth has one colour."""
 AUTOMATIC = "automatic"
-"""Choice of a colour map: what suits the quantity."""
+"""Option of the colour maps: chosen by the quantity."""
 
 MOTION_STATES = 24
-"""States to which the camera is fitted."""
+"""Number of states to which the camera is fitted."""
 SIGHT_STATES = 6
-"""States from which its direction is chosen."""
+"""Number of states from which the camera's direction is chosen."""
 FIRST_ASPECT = 1.6
-"""Width of the picture over its height until the page reports its size."""
+"""Aspect ratio of the picture until the page reports its size."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a page is to show the run at first.
+    """Initial settings of the page.
 
     Attributes
     ----------
     field : str or None
-        The quantity of the colours.
+        The quantity that colours the cloth.
     range : str or None
-        Their range, as of ``render --range``.
+        Range of the colours, as in ``render --range``.
     settings : tuple of str
-        Changes of the scene's camera, as of ``render --set``.
+        Changes of the scene's camera, as in ``render --set``.
     """
 
     field: str | None = None
@@ -93,24 +93,24 @@ class Look:
     settings: tuple[str, ...] = ()
 
     def check(self, run: StoredRun) -> None:
-        """Check that the run can be shown so.
+        """Check that the run can be shown with these settings.
 
         Raises
         ------
         InputError
         """
-        scene_shown(run, self.settings)
+        scene_with_settings(run, self.settings)
         if self.field is not None:
             quantity(run, self.field)
         if self.range is not None:
             ColourRange.parse(self.range)
 
 
-AS_USUAL = Look()
+DEFAULT_LOOK = Look()
 
 
 class Page:
-    """The page; all browsers that have it open see the same.
+    """The page; all browsers that have it open show the same.
 
     Parameters
     ----------
@@ -125,9 +125,9 @@ class Page:
     cloth : Cloth
     """
 
-    def __init__(self, run: StoredRun, access: Access, look: Look = AS_USUAL) -> None:
-        self._run, self._access, self._asked = run, access, look
-        SynchronizationContext.check_for_arrays_to_release = release_oldest
+    def __init__(self, run: StoredRun, access: Access, look: Look = DEFAULT_LOOK) -> None:
+        self._run, self._access, self._look = run, access, look
+        SynchronizationContext.check_for_arrays_to_release = release_old_arrays
         self.server = get_server("lyra-petsc")
         self._state = state = self.server.state
         self._triangles = run.triangles
@@ -139,7 +139,7 @@ class Page:
         self._drawn = asyncio.Event()
         self._shown = -1
         self._marked = 0.0
-        self._news = clock.monotonic()
+        self._last_news = clock.monotonic()
         self._probe: content.Probe | None = None
         self._pressed: tuple[float, float] | None = None
         self._positions = run.positions[0]
@@ -148,9 +148,9 @@ class Page:
         self._find_handles()
         self._unit = "" if run.scene.time.static else "s"
         self._figures: dict[str, dict[str, Any]] = {}
-        self._fill()
-        self._look_at_all()
-        self._view = _lay_out(self)
+        self._initialise()
+        self._fit_camera()
+        self._view = _build_layout(self)
         state.change("frame")(self._frame_changed)
         state.change("speed")(self._speed_changed)
         state.change("edges")(self._edges_changed)
@@ -158,20 +158,20 @@ class Page:
         state.change("around")(self._around_changed)
         state.change("size")(self._size_changed)
 
-    def _fill(self) -> None:
-        """Set the page's variables for the first time."""
+    def _initialise(self) -> None:
+        """Initialise the page's variables."""
         run, state, player = self._run, self._state, self._player
         state.trame__title = f"{run.name} – lyra_petsc"
         state.title = run.scene.title or run.name
         state.status, state.notice, state.farewell = self._outcome(), "", ""
         state.waiting, state.picked = "", []
-        state.range, state.range_error = self._asked.range or "", ""
+        state.range, state.range_error = self._look.range or "", ""
         state.map, state.maps = AUTOMATIC, [AUTOMATIC, *content.MAPS]
         state.around = True
         state.frame, state.last = player.shown, player.last
         state.playing, state.edges = False, False
         state.clock, state.bar = "", None
-        state.quantity = self._asked.field or "speed"
+        state.quantity = self._look.field or "speed"
         unit = "×" if self._unit else "/s"
         state.speeds = [
             {"title": f"{factor * player.speed:g} {unit}", "value": factor * player.speed}
@@ -183,30 +183,30 @@ class Page:
         self._show()
 
     def _offer_quantities(self) -> None:
-        """List the quantities of this run; the chosen one stays chosen if it is among them."""
+        """List the quantities of this run, and keep the selected one if it is among them."""
         known, state = content.names(self._run), self._state
         state.quantities = [{"title": name.replace("_", " "), "value": name} for name in (PLAIN, *known)]
         if state.quantity not in known:
             state.quantity = PLAIN
-        self._choose(state.quantity)
+        self._set_palette(state.quantity)
 
     def _outcome(self) -> str:
         summary = self._run.summary
         outcome, ranks = str(summary.get("outcome", "")), summary.get("ranks", 0)
-        if outcome == "running" and not in_use(self._run.folder):
+        if outcome == "running" and not is_locked(self._run.folder):
             outcome = "broken off"
-        words = [f"{len(self._run.rest):,} vertices", f"{len(self._run)} states"]
-        late = clock.monotonic() - self._news
-        if outcome == "running" and late > LATE:
+        parts = [f"{len(self._run.rest):,} vertices", f"{len(self._run)} states"]
+        late = clock.monotonic() - self._last_news
+        if outcome == "running" and late > LATE_SECONDS:
             outcome = f"running, the next state awaited for {late:.0f} s"
         if ranks:
-            words.append(f"{ranks} rank{'s' * (ranks != 1)}")
-        return " · ".join([*words, outcome] if outcome else words)
+            parts.append(f"{ranks} rank{'s' * (ranks != 1)}")
+        return " · ".join([*parts, outcome] if outcome else parts)
 
     # -- controls ----------------------------------------------------------------------------------
 
     def play_or_pause(self) -> None:
-        """The play button."""
+        """Start or stop playing."""
         if self._player.playing:
             self._player.pause()
         else:
@@ -214,12 +214,12 @@ class Page:
         self._state.playing = self._player.playing
 
     def fit(self) -> None:
-        """Move the camera back to where it sees the whole motion."""
-        self._look_at_all()
+        """Move the camera so that it sees the whole motion."""
+        self._fit_camera()
         self._view.push_camera()
 
     def drawn(self) -> None:
-        """Called when a page has drawn the last state that it was sent."""
+        """Called when a page has drawn the last state sent to it."""
         self._drawn.set()
 
     def _frame_changed(self, frame: Any, **_: Any) -> None:
@@ -232,36 +232,36 @@ class Page:
 
     def _edges_changed(self, edges: Any, **_: Any) -> None:
         self.cloth.show_edges(bool(edges))
-        self._colours_changed()  # where triangles are seen, each has its own value
+        self._colours_changed()  # with visible edges, each triangle has the colour of its own value
 
     def _colours_changed(self, **_: Any) -> None:
-        self._choose(self._state.quantity)
-        self._again()
+        self._set_palette(self._state.quantity)
+        self._redraw()
 
     def _around_changed(self, **_: Any) -> None:
         self._show_wind()
-        self._again()
+        self._redraw()
 
     def press(self, event: Any) -> None:
         """Called when the left mouse button is pressed on the cloth."""
-        self._pressed = _place(event, "position")
+        self._pressed = _pixel(event, "position")
 
     def pick(self, event: Any) -> None:
-        """Show the values at the vertex nearest to a click; a click beside the cloth ends that."""
-        at = _place(event, "displayPosition")
-        moved = self._pressed is not None and at is not None and math.dist(at, self._pressed) > MOVED
-        place = event.get("worldPosition") if isinstance(event, dict) else None
-        if moved:  # the camera, not a click
+        """Show the values at the vertex nearest to a click; a click beside the cloth hides them."""
+        at = _pixel(event, "displayPosition")
+        moved = self._pressed is not None and at is not None and math.dist(at, self._pressed) > DRAG_PIXELS
+        point = event.get("worldPosition") if isinstance(event, dict) else None
+        if moved:  # the user has moved the camera
             return
         self._probe = None
-        if isinstance(place, list) and len(place) == 3 and all(isinstance(x, int | float) for x in place):
-            nearest = np.linalg.norm(self._positions - np.array(place), axis=1).argmin()
+        if isinstance(point, list) and len(point) == 3 and all(isinstance(x, int | float) for x in point):
+            nearest = np.linalg.norm(self._positions - np.array(point), axis=1).argmin()
             with suppress(LyraError):
                 self._probe = content.Probe(self._run, int(nearest))
-        self._again()
+        self._redraw()
 
-    def _again(self) -> None:
-        """Send the same state once more."""
+    def _redraw(self) -> None:
+        """Send the present state again."""
         self._shown = -1
         self._player.changed.set()
 
@@ -277,12 +277,13 @@ class Page:
                 self._fitted = True
                 self.fit()
 
-    def _choose(self, name: Any) -> None:
+    def _set_palette(self, name: Any) -> None:
+        """Set the colours of the quantity ``name`` by the page's range and colour map."""
         state = self._state
-        asked = None
+        chosen = None
         try:
             text = str(state.range or "").strip()
-            asked = ColourRange.parse(text) if text else None
+            chosen = ColourRange.parse(text) if text else None
             state.range_error = ""
         except InputError as error:
             state.range_error = error.message
@@ -291,7 +292,7 @@ class Page:
             self._palette = None
             if name in content.names(self._run):
                 cells = bool(state.edges)
-                self._palette = content.Palette(self._run, name, asked, colour_map, cells=cells)
+                self._palette = content.Palette(self._run, name, chosen, colour_map, cells=cells)
         except LyraError as error:
             self._palette = None
             self._state.notice = str(error)
@@ -299,12 +300,12 @@ class Page:
     # -- state shown -------------------------------------------------------------------------------
 
     def _show(self) -> None:
-        """Show the state that is due, in the scene and in the texts."""
+        """Show the state that is due in the scene and in the page's texts."""
         run, state = self._run, self._state
         index = self._shown = self._player.due()
         try:
             positions = run.positions[index]
-            if len(positions) != len(run.rest):  # `look` will notice
+            if len(positions) != len(run.rest):  # `refresh` will read the new run
                 raise InputError("was replaced by another run", file=run.folder)
             colours, on_triangles = self._palette.colours(index) if self._palette else (None, False)
             state.notice = ""
@@ -314,15 +315,15 @@ class Page:
             self.cloth.show(positions, colours, on_triangles=on_triangles)
             self._positions = positions
             self.cloth.show_obstacles(float(run.times[index]))
-            self._show_around(index)
+            self._show_points(index)
         state.bar = self._palette.bar() if self._palette else None
         state.frame, state.playing = index, self._player.playing
         name, end = ("t", f" of {run.times[-1]:.4g} {self._unit}") if self._unit else ("load", "")
         state.clock = f"{name} = {run.times[index]:.4g}{end}"
         if not self._player.playing or clock.monotonic() - self._marked > MARK_SECONDS:
-            self._mark()
+            self._mark_time()
 
-    def _show_around(self, index: int) -> None:
+    def _show_points(self, index: int) -> None:
         """Show the held vertices and the picked one."""
         x, probe = self._positions, self._probe
         held, edges = np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
@@ -339,53 +340,53 @@ class Page:
 
     def _find_handles(self) -> None:
         self._held = None
-        with suppress(LyraError):  # then without them
+        with suppress(LyraError):  # the page works without handles
             self._held = HeldVertices(self._run) if self._run.scene.handles else None
 
     def _find_obstacles(self) -> None:
-        """The obstacles, planes as squares where the motion now is."""
+        """Find the obstacles; planes become squares at the present motion."""
         self._obstacles = []
         if not self._run.scene.obstacles:
             self.cloth.set_obstacles([])
             return
         from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
 
-        with suppress(LyraError):  # then without them
+        with suppress(LyraError):  # the page works without obstacles
             self._obstacles = obstacle_surfaces(self._run, self._bounds.middle, self._bounds.size)
         self.cloth.set_obstacles(self._obstacles)
         self.cloth.show_obstacles(float(self._run.times[max(self._shown, 0)]))
 
     def _show_wind(self) -> Array:
-        """Show arrows along the wind, or hide them; (n, 3) where they begin and end [m]."""
+        """Show or hide arrows along the wind; returns their end points (n, 3) [m]."""
         wind, feet, arrow = self._run.scene.wind, np.empty((0, 3)), np.zeros(3)
         if wind is not None and any(wind.velocity) and self._state.around:
             feet, arrow = wind_arrows(self._bounds, np.array(wind.velocity))
         self.cloth.show_wind(feet, arrow)
         return np.concatenate([feet, feet + arrow])
 
-    def _look_at_all(self) -> None:
-        """Move the camera to where `render` would put it."""
+    def _fit_camera(self) -> None:
+        """Move the camera to the position that ``render`` would choose."""
         run = self._run
-        scene = scene_shown(run, self._asked.settings)
-        up = upwards(scene)
+        scene = scene_with_settings(run, self._look.settings)
+        up = up_direction(scene)
         shapes = (run.positions[i] for i in content.sample(len(run), SIGHT_STATES))
-        fit = Fit(scene, line_of_sight(scene, up, shapes, run.triangles), up, self._aspect)
+        fit = CameraFit(scene, line_of_sight(scene, up, shapes, run.triangles), up, self._aspect)
         axes = Bounds.axes_of(up)
         normals = np.concatenate([fit.normals, axes, -axes])
         motion = (run.positions[i] for i in content.sample(len(run), MOTION_STATES))
-        reaches = np.array([(x @ normals.T).max(axis=0) for x in motion])
-        n, whole = len(fit.normals), reaches.max(axis=0)
+        supports = np.array([(x @ normals.T).max(axis=0) for x in motion])
+        n, whole = len(fit.normals), supports.max(axis=0)
         self._bounds = Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
-        reach = fit.most(reaches[:, :n])
+        support = fit.framed_support(supports[:, :n])
         if self._obstacles is None:
             self._find_obstacles()
         times = run.times[content.sample(len(run), MOTION_STATES)]
-        near = near_points(self._obstacles or (), self._bounds, times)
-        reach = np.maximum(reach, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
+        near = near_obstacle_points(self._obstacles or (), self._bounds, times)
+        support = np.maximum(support, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
         arrows = self._show_wind()
         if len(arrows):
-            reach = np.maximum(reach, (arrows @ fit.normals.T).max(axis=0))
-        self.cloth.look_from(fit.view(reach))
+            support = np.maximum(support, (arrows @ fit.normals.T).max(axis=0))
+        self.cloth.look_from(fit.view(support))
 
     def _draw_plots(self) -> None:
         history = read_history(self._run.folder)
@@ -394,7 +395,7 @@ class Page:
             "iterations": content.iterations(history, self._unit),
         }
 
-    def _mark(self) -> None:
+    def _mark_time(self) -> None:
         self._marked = clock.monotonic()
         time = float(self._run.times[self._player.shown])
         for name, figure in self._figures.items():
@@ -403,7 +404,7 @@ class Page:
     # -- tasks -------------------------------------------------------------------------------------
 
     async def animate(self) -> None:
-        """Show each state when it is due, never faster than the page draws; does not end."""
+        """Show each state when it is due, but not faster than the page draws; runs forever."""
         player = self._player
         while True:
             player.changed.clear()
@@ -417,39 +418,39 @@ class Page:
             await self._wait_for_pages()
 
     async def _wait_for_pages(self) -> None:
-        """Wait until a page has drawn the state, so that none falls behind; say so where that takes long."""
-        if not self._access.watching or await _wait(self._drawn, SLOW_DRAWING):
+        """Wait until a page has drawn the state; the page says so if that takes long."""
+        if not self._access.n_open or await _wait(self._drawn, SLOW_DRAWING):
             return
         with self._state as state:
             state.waiting = "waiting for the browser to draw the state"
-        await _wait(self._drawn, LONGEST_DRAWING)
+        await _wait(self._drawn, MAX_DRAWING)
         with self._state as state:
             state.waiting = ""
 
     async def follow(self) -> None:
-        """Look for new states of the run while a page is open; does not end."""
+        """Poll for new states of the run while a page is open; runs forever."""
         while True:
-            # of the processor: beside busy ranks much more time passes
+            # processor time: on a machine with busy ranks, the wall time is much longer
             began = clock.process_time()
-            if self._access.watching:
-                self.look()
+            if self._access.n_open:
+                self.refresh()
             pause = (clock.process_time() - began) / POLLING_SHARE
-            await asyncio.sleep(min(max(POLL_SECONDS, pause), LONGEST_POLL))
+            await asyncio.sleep(min(max(MIN_POLL_SECONDS, pause), MAX_POLL_SECONDS))
 
-    def look(self) -> None:
-        """Show what the run has written meanwhile."""
+    def refresh(self) -> None:
+        """Show new states of the run."""
         with self._state as state:
             try:
                 if self._player.follow():
-                    self._news = clock.monotonic()
-                    self._renew()
+                    self._last_news = clock.monotonic()
+                    self._show_new_states()
                     state.last, state.notice = self._player.last, ""
                 state.status = self._outcome()
             except LyraError as error:
                 state.notice = str(error)
 
-    def _renew(self) -> None:
-        """Take in new states, or another run that has replaced this one."""
+    def _show_new_states(self) -> None:
+        """Use new states, or another run that has replaced this one."""
         if self._run.triangles is not self._triangles:
             self._triangles = self._run.triangles
             self.cloth.set_mesh(self._triangles)
@@ -458,16 +459,16 @@ class Page:
             self._obstacles = None
             self._offer_quantities()
             self.fit()
-            self._again()
+            self._redraw()
         elif self._palette:
-            self._palette.renew()
+            self._palette.update()
         self._draw_plots()
-        self._mark()
+        self._mark_time()
 
-    def say_goodbye(self, words: str) -> None:
-        """Show that the run has ended."""
+    def show_end(self, text: str) -> None:
+        """Show the text that the run has ended."""
         with self._state as state:
-            state.farewell = words
+            state.farewell = text
 
 
 async def _wait(event: asyncio.Event, seconds: float) -> bool:
@@ -477,8 +478,8 @@ async def _wait(event: asyncio.Event, seconds: float) -> bool:
     return False
 
 
-def _place(event: Any, name: str) -> tuple[float, float] | None:
-    """Pixels of an event of the page, if it has them."""
+def _pixel(event: Any, name: str) -> tuple[float, float] | None:
+    """Pixel coordinates of an event of the page, or None if it has none."""
     try:
         at = event[name]
         x, y = (at["x"], at["y"]) if isinstance(at, dict) else at[:2]
@@ -487,10 +488,10 @@ def _place(event: Any, name: str) -> tuple[float, float] | None:
         return None
 
 
-def release_oldest(context: Any, *_: Any) -> None:
-    """Forget the oldest arrays that were sent, beyond what may be kept.
+def release_old_arrays(context: Any, *_: Any) -> None:
+    """Release the oldest sent arrays beyond `ARRAY_BYTES`.
 
-    trame forgets them after 20 s. On a busy machine pages fetch them later, and would show nothing then.
+    trame would release all arrays after 20 s. On a busy machine, pages fetch them later and would stay empty.
     """
     kept, now = 0, clock.time()
     for name, record in sorted(context.data_array_cache.items(), key=lambda item: -item[1]["ts"]):
@@ -500,7 +501,7 @@ def release_oldest(context: Any, *_: Any) -> None:
             del context.data_array_cache[name]
 
 
-def _lay_out(page: Page) -> Any:
+def _build_layout(page: Page) -> Any:
     """Create the page's elements and bind them to its variables; returns trame's view of the cloth."""
     with VAppLayout(page.server):
         client.Style(STYLE.read_text(encoding="utf-8"))
@@ -583,8 +584,8 @@ def _choice(name: str, items: str, label: str, classes: str) -> None:
     )
 
 
-def _button(icon: Any, name: str, says: str, *, click: Any) -> None:
-    v.VBtn(icon=icon, id=name, title=says, click=click, variant="text", density="comfortable", size="default")
+def _button(icon: Any, name: str, hint: str, *, click: Any) -> None:
+    v.VBtn(icon=icon, id=name, title=hint, click=click, variant="text", density="comfortable", size="default")
 
 
 def _colours() -> None:

@@ -1,6 +1,6 @@
-"""What the page shows of a run: which state when, the colours of a quantity, plots of the history.
+"""Content of the page: the state to show at a time, the colours of a quantity, plots of the history.
 
-Plain data; no package of the page itself is needed.
+The content is plain data and needs none of the page's packages.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from lyra_petsc.show.render.colour_quantities import DERIVED, ColourQuantity, Co
 Colours = NDArray[np.uint8]
 Columns = Mapping[str, NDArray[Any]]
 
-SHORTEST, LONGEST = 0.5, 60.0
-"""Motions of such lengths [s] are played in real time at first; all others in about `USUAL`."""
-USUAL = 10.0
-"""[s]"""
+REAL_TIME_MIN, REAL_TIME_MAX = 0.5, 60.0
+"""Motions of a duration [s] between these bounds are initially played in real time."""
+PLAY_SECONDS = 10.0
+"""Approximate time [s] in which other motions are initially played."""
 SPEED_FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
-"""Speeds to choose from, relative to the first one."""
+"""Selectable speeds, relative to the initial one."""
 
 RANGE_STATES = 12
-"""States from which the range of the colours is taken at first."""
+"""Number of states from which the range of the colours is initially computed."""
 
 MAPS = ("viridis", "cividis", "plasma", "turbo", "coolwarm", "gray")
-"""Colour maps of matplotlib to choose from."""
+"""Selectable colour maps of matplotlib."""
 
-MOST_POINTS = 600
-"""Points of a plotted line; of a longer history evenly spaced rows are drawn."""
+MAX_POINTS = 600
+"""Maximum number of points of a plotted line; of a longer history, evenly spaced rows are drawn."""
 LINE_COLOURS = {
     "kinetic": "#0072b2",
     "membrane": "#d55e00",
@@ -46,7 +46,7 @@ LINE_COLOURS = {
 
 
 class Player:
-    """Decides which state is shown: playing, moving the slider, following a run that goes on.
+    """Determines the state to show: when playing, moving the slider, or following a running simulation.
 
     Parameters
     ----------
@@ -57,10 +57,10 @@ class Player:
     shown : int
         Number of the state that the page should show.
     speed : float
-        Simulated seconds in a second.
+        Simulated seconds per second.
     playing : bool
     changed : asyncio.Event
-        Set when another state is wanted.
+        Set when another state should be shown.
     """
 
     def __init__(self, run: StoredRun) -> None:
@@ -77,18 +77,18 @@ class Player:
         return len(self._run) - 1
 
     def play(self) -> None:
-        """Play from the state shown, or from the first one if that is the last."""
+        """Play from the present state or, if it is the last, from the first one."""
         if self.shown >= self.last:
             self.shown = 0
         self.playing = self.shown < self.last  # a single state does not play
         self._restart()
 
     def pause(self) -> None:
-        """Stay at the state shown."""
+        """Stop playing at the present state."""
         self.playing = False
 
     def go(self, state: int) -> None:
-        """Show a state; playing continues from there."""
+        """Show a state by its number; playing continues from there."""
         self.shown = min(max(state, 0), self.last)
         self._restart()
 
@@ -111,7 +111,7 @@ class Player:
         return self.shown
 
     def next_due(self) -> float:
-        """Seconds until another state is due; infinite while it does not play."""
+        """Seconds until another state is due; infinite when not playing."""
         if not self.playing or self.shown >= self.last:
             return math.inf
         return max(0.0, (float(self._run.times[self.shown + 1]) - self._now()) / self.speed)
@@ -121,14 +121,14 @@ class Player:
         return self._from + self.speed * (clock.monotonic() - self._begun)
 
     def follow(self) -> bool:
-        """Look for new states of the run; whether there are any.
+        """Read new states of the run; returns whether there are any.
 
-        If the newest state was shown, the new newest one is shown next.
+        If the present state is the newest, the new newest state is shown next.
 
         Raises
         ------
         InputError
-            If the results are gone.
+            If the results have been removed.
         """
         newest = self.shown >= self.last and not self.playing
         if not self._run.refresh():
@@ -139,11 +139,11 @@ class Player:
 
 
 def first_speed(run: StoredRun) -> float:
-    """Real time for motions that are neither short nor long, else the power of ten that takes about 10 s."""
+    """Initial speed: real time, or for short or long motions the power of ten that takes about 10 s."""
     span = float(run.times[-1] - run.times[0])
-    if span <= 0 or SHORTEST <= span <= LONGEST:
+    if span <= 0 or REAL_TIME_MIN <= span <= REAL_TIME_MAX:
         return 1.0
-    return float(10.0 ** round(math.log10(span / USUAL)))
+    return float(10.0 ** round(math.log10(span / PLAY_SECONDS)))
 
 
 def names(run: StoredRun) -> list[str]:
@@ -166,30 +166,39 @@ class Probe:
         self._run, self.vertex = run, vertex
         self._quantities = {name: quantity(run, name).on_vertices(run) for name in names(run)}
 
-    def values(self, state: int, place: Array, only: str = "") -> list[dict[str, str]]:
-        """Names and values with units in a state; ``place`` (3,) [m]; of one quantity alone if ``only``."""
-        numbers = ", ".join(f"{x:.5g}" for x in place)
-        found = [{"name": f"vertex {self.vertex}", "value": f"({numbers}) m"}]
+    def values(self, state: int, position: Array, only: str = "") -> list[dict[str, str]]:
+        """Names and values, with units, of the vertex in a state.
+
+        Parameters
+        ----------
+        state : int
+        position : (3,)
+            Position of the vertex [m].
+        only : str
+            Name of a single quantity; empty: all quantities.
+        """
+        numbers = ", ".join(f"{x:.5g}" for x in position)
+        lines = [{"name": f"vertex {self.vertex}", "value": f"({numbers}) m"}]
         for name, shown in self._quantities.items():
             if only in ("", name) and not shown.on_triangles:
-                found.append({"name": shown.label, "value": f"{float(shown.values(state)[self.vertex]):.5g}"})
-        return found
+                lines.append({"name": shown.label, "value": f"{float(shown.values(state)[self.vertex]):.5g}"})
+        return lines
 
 
 class Palette:
-    """Colours of a quantity's values and the bar that explains them; zero is in the middle of signed values.
+    """Colours of a quantity's values, and the colour bar; zero is in the middle of signed values' range.
 
     Parameters
     ----------
     run : StoredRun
     name : str
         One of `names`.
-    asked : ColourRange, optional
-        The range of the colours.
+    chosen : ColourRange, optional
+        The range of the colours; by default computed from the values.
     colour_map : str
-        One of ``MAPS``; empty: what suits the quantity.
+        One of ``MAPS``; empty: chosen by the quantity.
     cells : bool
-        Each triangle has the colour of its own value; else vertices have means.
+        Whether each triangle has the colour of its own value; else vertices have the colours of means.
 
     Raises
     ------
@@ -201,45 +210,45 @@ class Palette:
         self,
         run: StoredRun,
         name: str,
-        asked: ColourRange | None = None,
+        chosen: ColourRange | None = None,
         colour_map: str = "",
         *,
         cells: bool = False,
     ) -> None:
         from matplotlib import colormaps
 
-        self._run, self._name, self._asked, self._cells = run, name, asked, cells
-        self._quantity = self._found()
+        self._run, self._name, self._chosen, self._cells = run, name, chosen, cells
+        self._quantity = self._find_quantity()
         table = colormaps[colour_map or ("coolwarm" if self._quantity.signed else MAPS[0])]
         self._table: Colours = table(np.linspace(0, 1, 256), bytes=True)[:, :3]
         self._percentiles = [self._quantity.percentiles(i) for i in sample(len(run), RANGE_STATES)]
         self._low, self._high = self._limits()
 
-    def _found(self) -> ColourQuantity:
-        found = quantity(self._run, self._name)
-        return found if self._cells else found.on_vertices(self._run)
+    def _find_quantity(self) -> ColourQuantity:
+        named = quantity(self._run, self._name)
+        return named if self._cells else named.on_vertices(self._run)
 
     def _limits(self) -> tuple[float, float]:
-        return self._quantity.limits(np.array(self._percentiles), self._asked)
+        return self._quantity.limits(np.array(self._percentiles), self._chosen)
 
-    def renew(self) -> None:
-        """Take in the states that the run has written meanwhile; the newest takes part in the range."""
-        self._quantity = self._found()
+    def update(self) -> None:
+        """Use new states of the run, and include the newest one in the range."""
+        self._quantity = self._find_quantity()
         self._percentiles.append(self._quantity.percentiles(len(self._run) - 1))
-        if len(self._percentiles) > 4 * RANGE_STATES:  # every second one but the newest
+        if len(self._percentiles) > 4 * RANGE_STATES:  # keep every second one, and the newest
             self._percentiles = [*self._percentiles[:-1:2], self._percentiles[-1]]
         self._low, self._high = self._limits()
 
     def colours(self, state: int) -> tuple[Colours, bool]:
-        """(V, 3) or (F, 3) red, green, blue, 0-255; whether they belong to triangles."""
+        """(V, 3) or (F, 3) red, green, blue from 0 to 255, and whether they belong to triangles."""
         values, span = self._quantity.values(state), self._high - self._low
-        share = np.zeros(len(values))
+        fraction = np.zeros(len(values))
         if 0 < span < np.inf:
-            share = np.nan_to_num(((values - self._low) / span).clip(0, 1))
-        return self._table[(255 * share).astype(np.uint8)], self._quantity.on_triangles
+            fraction = np.nan_to_num(((values - self._low) / span).clip(0, 1))
+        return self._table[(255 * fraction).astype(np.uint8)], self._quantity.on_triangles
 
     def bar(self) -> dict[str, Any]:
-        """The bar beside the cloth: title with unit, ticks from the top, shades from the bottom."""
+        """The colour bar: title with unit, ticks from top to bottom, shades from bottom to top."""
         shades = ", ".join(f"rgb({r} {g} {b})" for r, g, b in self._table[::17])
         ends = (self._high, self._low) if self._low <= self._high else (0.0, 0.0)
         return {
@@ -250,17 +259,17 @@ class Palette:
 
 
 def _number(value: float, span: float) -> str:
-    """Three digits; zero if negligible beside the span."""
+    """A number with three digits; zero if it is negligible compared with ``span``."""
     return f"{float(f'{value:.3g}'):g}" if abs(value) > 1e-6 * span else "0"
 
 
-def sample(count: int, most: int) -> list[int]:
-    """At most ``most`` of the numbers below ``count``, evenly spread, with the first and the last."""
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
+def sample(count: int, maximum: int) -> list[int]:
+    """At most ``maximum`` of the numbers below ``count``, evenly spaced, with the first and the last."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, maximum))})
 
 
 def energies(history: Columns, unit: str) -> dict[str, Any]:
-    """Figure (for plotly) of the energies [J] over time; the potential energy counts from the start."""
+    """Figure (for plotly) of the energies [J] over time; the potential energy is relative to its start."""
     rows = _rows(len(history["time"]))
     parts = {name: history[f"{name}_energy"] for name in ("kinetic", "membrane", "bending", "potential")}
     parts["potential"] = parts["potential"] - parts["potential"][:1]
@@ -272,13 +281,13 @@ def energies(history: Columns, unit: str) -> dict[str, Any]:
 
 
 def iterations(history: Columns, unit: str) -> dict[str, Any]:
-    """Figure of the Newton and linear iterations of each step; the maximum where steps share a point."""
+    """Figure of the Newton and linear iterations per step; the maximum if several steps share a point."""
     starts = _rows(len(history["time"]))
     lines = []
     for name, axis, colour in (("Newton", "y", "#0072b2"), ("linear", "y2", "#d55e00")):
         column = history[f"{name.lower()}_iterations"]
-        most = np.maximum.reduceat(column, starts) if len(column) else column
-        lines.append(_line(name, history["time"][starts], most, colour, shape="hv") | {"yaxis": axis})
+        maximum = np.maximum.reduceat(column, starts) if len(column) else column
+        lines.append(_line(name, history["time"][starts], maximum, colour, shape="hv") | {"yaxis": axis})
     layout = _layout("iterations a step", unit)
     layout["yaxis"] |= {"rangemode": "tozero", "tickfont": {"color": "#0072b2"}}
     layout["yaxis2"] = {"overlaying": "y", "side": "right", "showgrid": False, "zeroline": False}
@@ -288,15 +297,15 @@ def iterations(history: Columns, unit: str) -> dict[str, Any]:
 
 
 def at_time(figure: Mapping[str, Any], time: float) -> dict[str, Any]:
-    """The same figure with a vertical line at a time."""
+    """The figure with a vertical line at a time."""
     mark = {"type": "line", "xref": "x", "yref": "paper", "x0": time, "x1": time, "y0": 0, "y1": 1}
     mark["line"] = {"color": "#666", "width": 1, "dash": "dot"}
     return {"data": figure["data"], "layout": {**figure["layout"], "shapes": [mark]}}
 
 
 def _rows(count: int) -> Ints:
-    """Numbers of the rows to draw, ascending, with the last one."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64))
+    """Indices of the rows to draw, ascending, including the last row."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).astype(np.int64))
 
 
 def _line(name: str, x: NDArray[Any], y: NDArray[Any], colour: str, **style: Any) -> dict[str, Any]:
@@ -305,7 +314,7 @@ def _line(name: str, x: NDArray[Any], y: NDArray[Any], colour: str, **style: Any
 
 
 def _numbers(values: NDArray[Any]) -> list[float | None]:
-    """Six digits of each number, None where it is not finite: what JSON can hold."""
+    """The numbers with six digits, and None instead of numbers that are not finite, for JSON."""
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values]
 
 

@@ -1,6 +1,6 @@
-"""The page's server: one process that listens on one address until a signal or the end of its run.
+"""The page's server: a process that listens on one address until a signal or the end of its run.
 
-Requests need the token, and must name this machine as the host.
+Requests must contain the token and name this machine as the host.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.read_run import StoredRun, read_history
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -35,7 +35,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 WEB_SOCKET = "/ws"
 
 HEADERS = {
-    # nothing is loaded from other hosts; Vue compiles the page's template in the browser
+    # nothing may be loaded from other hosts; unsafe-eval: Vue compiles the page's template in the browser
     "Content-Security-Policy": (
         "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
         "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
@@ -48,7 +48,7 @@ HEADERS = {
 
 
 class Access:
-    """Checks every request, also those that open a web socket.
+    """Checks every request, including those that open a web socket.
 
     The first request has the token in its address (``?token=…``); the answer sets a cookie, which authorises
     all further requests of the page.
@@ -61,19 +61,19 @@ class Access:
 
     Attributes
     ----------
-    watching : int
+    n_open : int
         Number of open pages (web sockets).
     """
 
     def __init__(self, token: str, host: str) -> None:
         self._token = token.encode()
-        # browsers send cookies to all ports of a host, so each server needs a name of its own
+        # browsers send cookies to all ports of a host, so each server needs a cookie name of its own
         self._cookie = f"lyra-view-{hashlib.sha256(self._token).hexdigest()[:12]}"
         self._names = {"localhost", host.lower().strip("[]")}
         if not is_loopback(host):
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
         self._local = is_loopback(host)
-        self.watching = 0
+        self.n_open = 0
 
     def middleware(self) -> Any:
         """The check as aiohttp's middleware."""
@@ -87,11 +87,11 @@ class Access:
                 response = await self._answer(request, handler)
             except web.HTTPException as error:
                 error.headers.update(HEADERS)
-                self._give_cookie(request, error)
+                self._set_cookie(request, error)
                 raise
             if not response.prepared:
                 response.headers.update(HEADERS)
-                self._give_cookie(request, response)
+                self._set_cookie(request, response)
             return response
 
         return check
@@ -102,21 +102,21 @@ class Access:
         opens = request.headers.get("Upgrade", "").lower() == "websocket"
         if request.path != WEB_SOCKET and not opens:
             return await handler(request)
-        # wslink keeps what it could not open, and can then not end
+        # wslink would keep a web socket that it cannot open, and then could not stop
         if not web.WebSocketResponse().can_prepare(request).ok:
-            words = f"426: {WEB_SOCKET} is for the page's web socket\n"
-            return web.Response(status=426, text=words, headers={"Upgrade": "websocket"})
-        self.watching += 1
+            text = f"426: {WEB_SOCKET} is for the page's web socket\n"
+            return web.Response(status=426, text=text, headers={"Upgrade": "websocket"})
+        self.n_open += 1
         try:
             return await handler(request)
         except (ValueError, TypeError, KeyError, ConnectionError) as error:
-            raise web.HTTPBadRequest from error  # messages that are none of the page's
+            raise web.HTTPBadRequest from error  # a message that the page does not send
         finally:
-            self.watching -= 1
+            self.n_open -= 1
 
     def _problem(self, request: web.Request) -> str:
-        """Why a request is refused; empty if it is not."""
-        if not self._is_ours(_name_of(f"//{request.headers.get('Host', '')}")):
+        """The reason for refusing a request; empty if it is accepted."""
+        if not self._is_this_machine(_host_name(f"//{request.headers.get('Host', '')}")):
             return "this server does not go by that name"
         given = request.query.get("token") or request.cookies.get(self._cookie) or ""
         if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
@@ -126,39 +126,39 @@ class Access:
             return "a page from elsewhere may not ask"
         return ""
 
-    def _is_ours(self, name: str) -> bool:
-        """Whether a host name means this machine, whatever a name server answers."""
+    def _is_this_machine(self, name: str) -> bool:
+        """Whether a host name means this machine, without asking a name server."""
         if name in self._names:
             return True
         with suppress(ValueError):
             return ipaddress.ip_address(name).is_loopback or not self._local
         return False
 
-    def _give_cookie(self, request: web.Request, response: web.StreamResponse) -> None:
+    def _set_cookie(self, request: web.Request, response: web.StreamResponse) -> None:
         if "token" in request.query:
             response.set_cookie(
                 self._cookie, self._token.decode(), httponly=True, samesite="Strict", path="/"
             )
 
 
-def keep_quiet_about_bad_requests() -> None:
-    """Let aiohttp answer what is no HTTP with 400, and not also print a traceback for each."""
+def silence_bad_requests() -> None:
+    """Keep aiohttp from logging a traceback for each invalid HTTP request, which it answers with 400."""
 
-    def is_ours(record: logging.LogRecord) -> bool:
+    def is_logged(record: logging.LogRecord) -> bool:
         error = record.exc_info[1] if record.exc_info else None
         return not isinstance(error, HttpProcessingError)
 
-    logging.getLogger("aiohttp.server").addFilter(is_ours)
+    logging.getLogger("aiohttp.server").addFilter(is_logged)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
+    """Whether an address can only be reached from this machine."""
     with suppress(ValueError):
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     return host.lower() == "localhost"
 
 
-def _name_of(address: str) -> str:
+def _host_name(address: str) -> str:
     try:
         return (urlsplit(address).hostname or "").lower()
     except ValueError:
@@ -170,19 +170,19 @@ LOCAL = "127.0.0.1"
 CLOSING_SECONDS = 1.0
 
 RELOAD_SECONDS = 3.0
-"""Seconds that the server goes on after the last page was closed, which may only be reloading."""
+"""Time [s] for which the server runs after the last page is closed, as a page may only be reloading."""
 
-LONGEST_STAY = 1800.0
-"""Seconds after the end of the run that open pages are served."""
+MAX_STAY = 1800.0
+"""Time [s] after the end of the run for which open pages are served."""
 
 
 def check_address(host: str, port: int) -> None:
-    """Check that an address can be listened on, before anything else is done.
+    """Check that the server can listen on an address, before any other work.
 
     Raises
     ------
     InputError
-        For a port in use, a host that is not this machine, and the like.
+        For a port in use, a host that is not this machine, and similar errors.
     """
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -222,29 +222,29 @@ async def serve(
     ready : callable
         Called with the page's address once it can be opened.
     ended : callable, optional
-        Called in a thread; returns when the run has ended, with a text for the page.
+        Called in a thread; returns a text for the page when the run has ended.
     **look
-        Of `Look`: how the page shows the run at first.
+        Arguments of `Look`: the page's initial settings.
 
     Returns
     -------
     int
-        The signal that ended it, or 0.
+        The signal that ended the server, or 0.
 
     Raises
     ------
     InputError
-        If it cannot listen there, or the run cannot be shown so.
+        If the server cannot listen on the address, or the run cannot be shown with these settings.
     """
-    os.environ["WSLINK_READY_MSG"] = ""  # else it writes to our stdout
+    os.environ["WSLINK_READY_MSG"] = ""  # else wslink writes to standard output
     from lyra_petsc.show.view.page import Look, Page
 
-    asked = Look(**look)
-    asked.check(run)
+    settings = Look(**look)
+    settings.check(run)
     token = secrets.token_urlsafe(24)
     access = Access(token, host)
-    keep_quiet_about_bad_requests()
-    page = Page(run, access, asked)
+    silence_bad_requests()
+    page = Page(run, access, settings)
     server = page.server
     web: list[Any] = []
 
@@ -252,17 +252,17 @@ async def serve(
         web.append(web_server)
         web_server.app.middlewares.append(access.middleware())
 
-    def tell(**_: Any) -> None:
+    def announce(**_: Any) -> None:
         ready(f"http://{_in_address(host)}:{server.port}/?token={token}")
 
     server.controller.on_server_bind.add(bind)
-    server.controller.on_server_ready.add(tell)
+    server.controller.on_server_ready.add(announce)
     loop = asyncio.get_running_loop()
     over: asyncio.Future[int] = loop.create_future()
     nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     for number in (signal.SIGINT, signal.SIGTERM, *([] if nohup else [signal.SIGHUP])):
-        loop.add_signal_handler(number, _settle, over, int(number))
-    arguments, sys.argv[1:] = sys.argv[1:], []  # trame would read them
+        loop.add_signal_handler(number, _finish, over, int(number))
+    arguments, sys.argv[1:] = sys.argv[1:], []  # trame would parse them
     try:
         listening = asyncio.create_task(
             server.start(
@@ -280,7 +280,7 @@ async def serve(
         sys.argv[1:] = arguments
     tasks = [asyncio.create_task(page.animate()), asyncio.create_task(page.follow())]
     if ended is not None:
-        tasks.append(asyncio.create_task(_watch(ended, page, access, over)))
+        tasks.append(asyncio.create_task(_await_end(ended, page, access, over)))
     await asyncio.wait({listening, over, *tasks}, return_when=asyncio.FIRST_COMPLETED)
     failed = [task for task in tasks if task.done() and task.exception()]
     for task in tasks:
@@ -293,31 +293,32 @@ async def serve(
         except OSError as error:
             raise _refusal(host, port, error) from None
     else:
-        with suppress(RuntimeError, ConnectionError):  # of a page that was just opening, or has gone
+        with suppress(RuntimeError, ConnectionError):  # a page that is just opening, or has been closed
             await web[0].stop()
         with suppress(asyncio.CancelledError):
             await listening
     return over.result() if over.done() else 0
 
 
-async def _watch(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
+async def _await_end(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
+    """After the run has ended, show its end and wait until no page is open, then set ``over``."""
     loop = asyncio.get_running_loop()
-    told: asyncio.Future[str] = loop.create_future()
-    # a daemon, as it may wait for ever
-    wait = threading.Thread(target=lambda: loop.call_soon_threadsafe(told.set_result, ended()), daemon=True)
+    text: asyncio.Future[str] = loop.create_future()
+    # a daemon thread, as it may wait forever
+    wait = threading.Thread(target=lambda: loop.call_soon_threadsafe(text.set_result, ended()), daemon=True)
     wait.start()
-    words = await told
-    await asyncio.sleep(CLOSING_SECONDS)  # in which the run finishes its files
-    page.look()
-    page.say_goodbye(words)
-    deadline, unseen = time.monotonic() + LONGEST_STAY, 0.0
-    while unseen < RELOAD_SECONDS and time.monotonic() < deadline:
+    farewell = await text
+    await asyncio.sleep(CLOSING_SECONDS)  # the run is still completing its files
+    page.refresh()
+    page.show_end(farewell)
+    deadline, closed = time.monotonic() + MAX_STAY, 0.0
+    while closed < RELOAD_SECONDS and time.monotonic() < deadline:
         await asyncio.sleep(CLOSING_SECONDS)
-        unseen = 0.0 if access.watching else unseen + CLOSING_SECONDS
-    _settle(over, 0)
+        closed = 0.0 if access.n_open else closed + CLOSING_SECONDS
+    _finish(over, 0)
 
 
-def _settle(over: asyncio.Future[int], number: int) -> None:
+def _finish(over: asyncio.Future[int], number: int) -> None:
     if not over.done():
         over.set_result(number)
 
@@ -330,7 +331,7 @@ def _in_address(host: str) -> str:
 
 
 def open_browser(address: str) -> bool:
-    """Open the page if there is a desktop, or BROWSER is set; returns whether that was tried."""
+    """Try to open the page if there is a desktop or BROWSER is set; returns whether a browser was opened."""
     import webbrowser
 
     known = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
@@ -338,7 +339,7 @@ def open_browser(address: str) -> bool:
 
 
 def find_run(folder: Path) -> StoredRun:
-    """The run in a folder, after checking that all that the page needs can be read.
+    """The run in a folder, after checking that all data of the page can be read.
 
     Raises
     ------

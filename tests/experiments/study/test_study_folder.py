@@ -9,11 +9,11 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.study.jobs import STUDY
-from lyra_petsc.output.run_folder import FolderChoice, RunDirectory, choose
+from lyra_petsc.output.run_folder import FolderChoice, RunDirectory, choose_folder
 
 
 def chosen(stem: str, out: Path | None, *, force: bool = False, resume: bool = False) -> FolderChoice:
-    return choose(MPI.COMM_SELF, stem, out, force=force, resume=resume, kind=STUDY)
+    return choose_folder(MPI.COMM_SELF, stem, out, force=force, resume=resume, kind=STUDY)
 
 
 @pytest.fixture(autouse=True)

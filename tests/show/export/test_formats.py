@@ -9,10 +9,10 @@ from written_run import POST, REST, TRIANGLES, met, position, scene, stress, vel
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.obj_file import read_obj
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.show.export import export_run, turned_up
+from lyra_petsc.show.export import export_run, rotation_to_up
 
 pytestmark = pytest.mark.quick
 
@@ -292,7 +292,7 @@ def test_up_is_against_gravity(tmp_path, gravity, axis):
 @pytest.mark.parametrize("target", [0, 1, 2])
 @pytest.mark.parametrize("up", [(axis, sign) for axis in range(3) for sign in (-1, 1)])
 def test_the_turn_that_makes_an_axis_the_upper_one(up, target):
-    x, y, z, w = turned_up(up, target)
+    x, y, z, w = rotation_to_up(up, target)
     assert x * x + y * y + z * z + w * w == pytest.approx(1.0)
     vector, q = np.zeros(3), np.array([x, y, z])
     vector[up[0]] = up[1]

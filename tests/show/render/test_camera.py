@@ -7,7 +7,14 @@ import pytest
 from written_run import scene
 
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.show.render.camera import BAR, MARGIN, Fit, PerspectiveCamera, line_of_sight, upwards
+from lyra_petsc.show.render.camera import (
+    BAR_HEIGHT,
+    MARGIN,
+    CameraFit,
+    PerspectiveCamera,
+    line_of_sight,
+    up_direction,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -38,11 +45,11 @@ def in_picture(view: PerspectiveCamera, points: np.ndarray, aspect: float) -> np
 def test_all_points_are_seen_and_one_touches_the_margin(sight, bar, aspect):
     points = np.random.default_rng(1).normal(size=(200, 3)) * [3.0, 1.0, 0.2] + [5.0, -7.0, 100.0]
     chosen = with_camera({"direction": sight, "angle": 40.0})
-    fit = Fit(chosen, line_of_sight(chosen, UP, [], np.empty((0, 3), int)), UP, aspect, bar=bar)
+    fit = CameraFit(chosen, line_of_sight(chosen, UP, [], np.empty((0, 3), int)), UP, aspect, bar=bar)
     view = fit.view((points @ fit.normals.T).max(axis=0))
 
-    places = in_picture(view, points, aspect) - [0.0, BAR if bar else 0.0]
-    filled = np.abs(places).max(axis=0) / [MARGIN, MARGIN - (BAR if bar else 0.0)]
+    places = in_picture(view, points, aspect) - [0.0, BAR_HEIGHT if bar else 0.0]
+    filled = np.abs(places).max(axis=0) / [MARGIN, MARGIN - (BAR_HEIGHT if bar else 0.0)]
     assert filled.max() == pytest.approx(1.0)
     # as far to the left as to the right in the direction that fills the picture
     full = int(np.argmax(filled))
@@ -54,7 +61,7 @@ def test_zoom_comes_nearer():
     distances = []
     for zoom in (1.0, 2.0):
         chosen = with_camera({"direction": [0, -1, 0], "zoom": zoom})
-        fit = Fit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
+        fit = CameraFit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
         view = fit.view((points @ fit.normals.T).max(axis=0))
         distances.append(np.linalg.norm(view.position - view.target))
     assert distances[0] == pytest.approx(2.0 * distances[1])
@@ -62,8 +69,8 @@ def test_zoom_comes_nearer():
 
 def test_a_camera_given_by_its_place_stands_there():
     chosen = with_camera({"position": [1, 2, 3], "target": [0, 0, 1], "up": [0, 1, 0], "angle": 50})
-    up = upwards(chosen)
-    view = Fit(chosen, line_of_sight(chosen, up, [], np.empty((0, 3), int)), up, 1.5).view(np.zeros(6))
+    up = up_direction(chosen)
+    view = CameraFit(chosen, line_of_sight(chosen, up, [], np.empty((0, 3), int)), up, 1.5).view(np.zeros(6))
     np.testing.assert_array_equal(view.position, [1, 2, 3])
     np.testing.assert_array_equal(view.target, [0, 0, 1])
     np.testing.assert_array_equal(view.up, [0, 1, 0])
@@ -80,7 +87,7 @@ def test_a_camera_given_by_its_place_stands_there():
     ],
 )
 def test_up_is_against_gravity(camera, gravity, expected):
-    np.testing.assert_allclose(upwards(with_camera(camera, gravity)), expected, atol=1e-15)
+    np.testing.assert_allclose(up_direction(with_camera(camera, gravity)), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 70.0, 160.0, 250.0])
@@ -116,11 +123,11 @@ def test_a_sheet_that_lies_at_first_and_hangs_later_is_not_seen_from_its_edge():
 @pytest.mark.parametrize(("frame", "reach"), [(None, 1.0), (100.0, 50.0), (50.0, 1.0)])
 def test_a_short_excursion_does_not_set_the_frame(frame, reach):
     chosen = with_camera({"direction": [0, -1, 0]} | ({"frame": frame} if frame else {}))
-    fit = Fit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
-    reaches = np.ones((50, 6))
-    reaches[0] = 50.0
-    np.testing.assert_array_equal(fit.most(reaches), np.full(6, reach))
+    fit = CameraFit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
+    supports = np.ones((50, 6))
+    supports[0] = 50.0
+    np.testing.assert_array_equal(fit.framed_support(supports), np.full(6, reach))
     few = np.ones((6, 6))
     few[0] = 2.0
     if frame is None:  # of few states all are in the picture
-        np.testing.assert_array_equal(fit.most(few), np.full(6, 2.0))
+        np.testing.assert_array_equal(fit.framed_support(few), np.full(6, 2.0))

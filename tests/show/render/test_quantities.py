@@ -17,7 +17,7 @@ from lyra_petsc.show.render.colour_quantities import (
     colour_limits,
     quantity,
 )
-from lyra_petsc.show.render.draw import extent
+from lyra_petsc.show.render.draw import measure_states
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 
@@ -70,12 +70,12 @@ def test_what_is_not_there_is_said(run, tmp_path):
 def test_the_extent_is_that_of_each_state(run):
     normals = np.random.default_rng(0).normal(size=(5, 3))
     shown = quantity(run, "speed")
-    reaches, values = extent(run, [0, 2], normals, shown)
+    supports, values = measure_states(run, [0, 2], normals, shown)
     for row, state in enumerate((0, 2)):
-        np.testing.assert_array_equal(reaches[row], (position(state) @ normals.T).max(axis=0))
+        np.testing.assert_array_equal(supports[row], (position(state) @ normals.T).max(axis=0))
         speeds = np.linalg.norm(velocity(state), axis=1)
         np.testing.assert_allclose(values[row][[0, -1]], [speeds.min(), speeds.max()])
-    empty = extent(run, [], normals, None)
+    empty = measure_states(run, [], normals, None)
     assert [part.shape for part in empty] == [(0, 5), (0, len(PERCENTILES))]
 
 

@@ -125,7 +125,7 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         extras.importlib.util, "find_spec", lambda name: None if name == "jinja2" else real(name)
     )
     with pytest.raises(InputError, match=r"^study: jinja2 is not installed; .*lyra-petsc\[study\]"):
-        extras.require("study")
+        extras.require_packages("study")
 
 
 def test_plain_numbers_and_tables_need_no_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,7 +152,7 @@ def test_another_address_only_when_asked_for(serve, tmp_path):
 )
 def test_what_is_local(host, local):
     assert is_loopback(host) is local
-    assert Access("token", host).watching == 0
+    assert Access("token", host).n_open == 0
 
 
 def test_the_port_is_that_asked_for_and_only_once(serve, tmp_path):

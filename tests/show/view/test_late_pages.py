@@ -28,7 +28,7 @@ class Sent:
 
 
 def test_only_the_oldest_beyond_the_budget_are_forgotten() -> None:
-    from lyra_petsc.show.view.page import release_oldest
+    from lyra_petsc.show.view.page import release_old_arrays
 
     now = time.time()
     cache = {
@@ -37,10 +37,10 @@ def test_only_the_oldest_beyond_the_budget_are_forgotten() -> None:
         "late": {"array": Sent(100), "ts": now - 60},
         "newer": {"array": Sent(100), "ts": now - 1},
     }
-    release_oldest(SimpleNamespace(data_array_cache=cache))
+    release_old_arrays(SimpleNamespace(data_array_cache=cache))
     assert list(cache) == ["in use", "late", "newer"]
     young = {str(i): {"array": Sent(100), "ts": now} for i in range(9)}
-    release_oldest(SimpleNamespace(data_array_cache=young))
+    release_old_arrays(SimpleNamespace(data_array_cache=young))
     assert len(young) == 9
 
 
@@ -48,7 +48,7 @@ def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None
     from lyra_petsc.show.view import page as module
 
     monkeypatch.setattr(module, "SLOW_DRAWING", 0.05)
-    access = SimpleNamespace(watching=1)
+    access = SimpleNamespace(n_open=1)
     page = module.Page(StoredRun(written(tmp_path / "run", states=9)), access)
     state = page.server.state
 
@@ -75,11 +75,11 @@ def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None
 def test_a_run_that_is_late_is_said_to_be(tmp_path, monkeypatch) -> None:
     from lyra_petsc.show.view import page as module
 
-    monkeypatch.setattr(module, "in_use", lambda folder: True)
+    monkeypatch.setattr(module, "is_locked", lambda folder: True)
     run = StoredRun(written(tmp_path / "run", states=3))
-    page = module.Page(run, SimpleNamespace(watching=1))
+    page = module.Page(run, SimpleNamespace(n_open=1))
     monkeypatch.setattr(StoredRun, "summary", {"outcome": "running"})
     run.__dict__.pop("summary", None)
     assert page._outcome().endswith(" running")
-    page._news -= 7.0
+    page._last_news -= 7.0
     assert page._outcome().endswith("running, the next state awaited for 7 s")

@@ -101,7 +101,7 @@ def test_plots_have_units_and_few_points():
         "total",
     }
     for line in figure["data"]:
-        assert len(line["x"]) == len(line["y"]) <= plots.MOST_POINTS
+        assert len(line["x"]) == len(line["y"]) <= plots.MAX_POINTS
         assert line["x"][-1] == pytest.approx(499.9)
     potential = next(line for line in figure["data"] if line["name"] == "potential")
     assert potential["y"][0] == 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.experiments.case import Registry, module_by_name
 from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase
 
@@ -35,7 +35,7 @@ def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
     known = dict.fromkeys([*FAMILIES.modules, *(case.name for case in everything)])
     for name in only:
         if name not in known:
-            raise InputError(f"unknown case or family, {nearest(name, known)}; --list names all", key=name)
+            raise InputError(f"unknown case or family, {suggest(name, known)}; --list names all", key=name)
     found = [
         case for case in everything if case.name in only or (case.family in only and case.level <= level)
     ]

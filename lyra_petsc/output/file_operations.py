@@ -1,4 +1,4 @@
-"""File operations: small files replaced at once, and errors in words, raised alike on all ranks."""
+"""Atomic writes of small files, and file errors that all ranks raise together."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-# what h5py raises when the library reports a failure, depending on the call and its version
+# the exceptions by which h5py reports a failure of HDF5, depending on the call and the version
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
 
 
 def reason(error: BaseException) -> str:
-    """The cause of a failed file operation, in a few words on one line."""
+    """The cause of a failed file operation as a short text on one line."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def cannot_write(path: Path, error: BaseException) -> OutputError:
-    """The refusal of a file that could not be written; that its folder is gone HDF5 says in other words."""
+    """The error for a file that could not be written; HDF5's own message hides that a folder is missing."""
     why = reason(error) if path.parent.is_dir() else os.strerror(errno.ENOENT)
     return OutputError(f"{path}: cannot be written: {why}")
 
 
 @contextmanager
 def writing(path: Path, errors: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
-    """A context in which a file is written; what goes wrong is raised as `cannot_write` says."""
+    """A context for writing the file ``path`` that turns ``errors`` into the error of `cannot_write`."""
     try:
         yield
     except errors as error:
@@ -44,13 +44,13 @@ def writing(path: Path, errors: tuple[type[Exception], ...] = (OSError,)) -> Ite
 
 
 @contextmanager
-def replaced(path: Path) -> Iterator[BinaryIO]:
-    """A new file that takes the place of another in one instant, at the end of the context. Call on one rank.
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """A new file, open in the context, that replaces ``path`` atomically at its end. Call on one rank.
 
     Raises
     ------
     OutputError
-        If it could not be written; what stood there before stands.
+        If the file cannot be written; then the old file is kept.
     """
     part = path.with_name(path.name + ".part")
     with writing(path):
@@ -65,20 +65,19 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
             raise
 
 
-def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
-    """Raise on every rank the problem of the lowest rank that has one. Collective.
+def raise_on_all_ranks(comm: MPI.Comm, problem: LyraError | None) -> None:
+    """Raise on every rank the error of the lowest rank that has one. Collective.
 
     Parameters
     ----------
     comm : MPI.Comm
-        All ranks that took part.
     problem : LyraError or None
-        This rank's problem.
+        The error on this rank.
 
     Raises
     ------
     LyraError
-        The same on every rank, if any rank has one.
+        The same error on every rank, if any rank has one.
     """
     from mpi4py import MPI
 
@@ -89,13 +88,13 @@ def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
     raise shared
 
 
-def on_each(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
-    """This rank's result of ``work``; if it fails on any rank, all raise the same. Collective.
+def on_every_rank(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
+    """Run ``work`` on every rank and return this rank's result. Collective.
 
     Raises
     ------
     LyraError
-        What it raised on the lowest of those ranks.
+        If ``work`` fails on any rank: on every rank, the error of the lowest rank that failed.
     """
     problem: LyraError | None = None
     result: Result | None = None
@@ -103,22 +102,22 @@ def on_each(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
         result = work()
     except LyraError as error:
         problem = error
-    raise_together(comm, problem)
+    raise_on_all_ranks(comm, problem)
     return cast(Result, result)
 
 
 def replace_text(path: str | os.PathLike[str], text: str) -> None:
-    """Put ``text`` into a file in one instant. Call on one rank.
+    """Replace the content of a file by ``text`` atomically. Call on one rank.
 
     Raises
     ------
     OutputError
-        If it could not be written; what stood there before stands.
+        If the file cannot be written; then the old file is kept.
     """
     replace_bytes(path, text.encode("utf-8"))
 
 
 def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:
-    """As `replace_text`, for content that is no text."""
-    with replaced(Path(path)) as file:
+    """As `replace_text`, for binary content."""
+    with atomic_write(Path(path)) as file:
         file.write(content)
