@@ -342,7 +342,7 @@ class Accountant:
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
-        floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
+        floor = residual_roundoff(system, max(reach, simulation.problem.outline.largest_coordinate))
         n = len(free)
         way = system.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
@@ -453,7 +453,7 @@ class StageAccountant(Accountant):
         self._fit()
         x0, x1 = self._x, system.x
         # targets that move stand where the step ends by now; damping is right in the frames of the step
-        system.active.turn_targets(self._at(system.t0 + system.stage.offset))
+        system.active.move_targets(self._at(system.t0 + system.stage.offset))
         parts = dict(system.forces_at_stage())
         ended = self._at(system.t1)
         frozen = {term: term.freeze(ended) for term in system.active.elastic}
@@ -651,9 +651,9 @@ def resolved(record: Record) -> Verdict:
     """
     steps = zip(record.balances, record.reports, strict=True)
     by_force = [over(balance.residual, RESOLVED * balance.driving) for balance in record.balances]
-    by_way = [over(report.left, RESOLVED * balance.push) for balance, report in steps]
+    by_way = [over(report.remaining, RESOLVED * balance.push) for balance, report in steps]
     number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_way[i]))
-    worst, last = record.balances[number], record.reports[number].left
+    worst, last = record.balances[number], record.reports[number].remaining
     words = (
         f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
     )
