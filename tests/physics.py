@@ -164,7 +164,7 @@ class Simulation:
             self.system,
             self.problem.surface,
             outline.spacing,
-            residual_roundoff(self.system, outline.reach),
+            residual_roundoff(self.system, outline.largest_coordinate),
         )
         self.stepper.start(0.0, 0)
         self.time = 0.0

@@ -248,10 +248,10 @@ class Bench:
         return str(path)
 
     @contextmanager
-    def simulation(self, content: Mapping[str, Any], *, land: Sequence[float] = ()) -> Iterator[Trial]:
+    def simulation(self, content: Mapping[str, Any], *, stops: Sequence[float] = ()) -> Iterator[Trial]:
         """Set up the simulation of a scene; destroyed at the end of the block; collective.
 
-        ``content`` is a scene as in a file; steps end at the times ``land`` [s]. By default there are no
+        ``content`` is a scene as in a file; steps end at the times ``stops`` [s]. By default there are no
         output times and, if ``direct``, the linear solver is direct and tolerances are tight.
         """
         filled: dict[str, Any] = {"output": {"every": None}} | dict(content)
@@ -262,6 +262,6 @@ class Bench:
         if self._trust_mesh:
             scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps
-        with open_simulation(self.comm, scene, land=land) as simulation:
+        with open_simulation(self.comm, scene, stops=stops) as simulation:
             yield Trial(self, simulation)
         self.latest = (self.steps - steps, time.perf_counter() - began)

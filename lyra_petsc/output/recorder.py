@@ -157,7 +157,7 @@ class Recorder:
             for name, values in checkpoint.arrays.items()
         }
         for number, start in enumerate(memory["late_starts"]):
-            system.reference.resume(float(start), arrays[f"start_{number}"])
+            system.reference.restore(float(start), arrays[f"start_{number}"])
         system.state.set(arrays["position"], arrays["velocity"])
         terms = simulation.problem.terms
         elements = {
@@ -365,15 +365,15 @@ class Recorder:
         for number, start in enumerate(sorted(system.reference.late)):
             rows[f"start_{number}"] = system.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()}
-        arrays |= term_memory.of_vertices(system)
+        arrays |= term_memory.vertex_arrays(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= term_memory.of_edges(system)
+        edges |= term_memory.edge_arrays(system)
         scalars = simulation.memory() | {
             "last_state": last_state,
             "scheme": simulation.scene.time.scheme,
         }
         began = clock.monotonic()
-        elements = term_memory.of_elements(system)
+        elements = term_memory.element_arrays(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
@@ -384,8 +384,8 @@ class Recorder:
         simulation, failure = self._simulation, self._simulation.failure
         assert failure is not None
         system, n = simulation.problem.system, simulation.problem.points.n_vertices
-        stuck = failure.stuck.of_vertices(n)
-        before = {"velocity": system.v[:n]}  # the equations of the failed step do not store it
+        stuck = failure.failed_solve.of_vertices(n)
+        before = {"velocity": system.v[:n]}  # the equations of the failed step do not hold it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
         # positions that are not finite could not be drawn
         position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])

@@ -64,7 +64,7 @@ class ActiveTerms:
         }
         self.frozen = {**self.frozen, **found, **following}
 
-    def turn_targets(self, step: UpcomingStep) -> None:
+    def move_targets(self, step: UpcomingStep) -> None:
         """Let targets that move with handles stand where they do at ``step.target_time``."""
         self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
 
@@ -93,12 +93,12 @@ class ActiveTerms:
         """What terms know of what touches, to come back to by `restore_contacts`."""
         return {term: term.contact_state() for term in self.changing}
 
-    def restore_contacts(self, touched: Mapping[Elastic, Any]) -> None:
+    def restore_contacts(self, states: Mapping[Elastic, Any]) -> None:
         """Know just this of what touches."""
-        for term, what in touched.items():
+        for term, what in states.items():
             term.restore_contacts(what)
 
-    def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
+    def transport_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
         for term in self.with_edges:
             term.accept(x, (frozen or self.frozen)[term])

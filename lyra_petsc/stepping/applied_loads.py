@@ -1,4 +1,4 @@
-"""The forces that do not change within a step, and the factor on them while an equilibrium is sought."""
+"""Loads, which are constant within a step, and their factor in a static analysis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class AppliedLoads:
-    """The loads in force.
+    """The loads of the present step.
 
     Parameters
     ----------
@@ -27,12 +27,13 @@ class AppliedLoads:
     force : (n_owned, 3)
         Force [N] of the present step.
     factor : float
-        On all loads (1 in a motion).
-    unbalanced, override : (n_owned, 3) or None
-        Static: force [N] that holds the start shape, reduced as the factor grows; loads in place of the
-        present ones.
+        Load factor (1 in a motion).
+    unbalanced : (n_owned, 3) or None
+        Static: force [N] that holds the start shape in balance, reduced as the factor grows.
+    override : (n_owned, 3) or None
+        Static: force [N] in place of the loads of the next step.
     following : FollowingLoads or None
-        Static: how those that follow the shape change with it from there.
+        Static: change of loads that follow the shape within a solve.
     """
 
     def __init__(self, terms: Sequence[Load], layout: Layout) -> None:
@@ -44,7 +45,7 @@ class AppliedLoads:
         self.following: FollowingLoads | None = None
 
     def force_at(self, x: Array) -> Array:
-        """Force [N] in a solve, (n_owned, 3), at positions x (n_local, 3)."""
+        """Force (n_owned, 3) [N] at positions x (n_local, 3) within a solve."""
         if self.following is None:
             return self.force
         force = self.force.copy()
@@ -52,9 +53,9 @@ class AppliedLoads:
         return force
 
     def freeze(self, t0: float, t1: float, x: Array, wind: Array | None) -> None:
-        """Take the loads of a step from t0 to t1 [s] at positions x (n_local, 3).
+        """Compute the loads of a step from t0 to t1 [s] at positions x (n_local, 3).
 
-        ``wind`` (n_owned, 3) is the gradient of velocity potentials where these are loads, too.
+        ``wind`` (n_owned, 3) [N] is the gradient of velocity potentials, if these count as loads.
         """
         force = np.zeros_like(x)
         for load in self._terms:

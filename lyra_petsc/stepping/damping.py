@@ -16,7 +16,7 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term
 
 
-class Multiple:
+class ScaledDamping:
     """Block rows that are factor · D + diagonal · I, but for values of which it keeps what they were.
 
     Parameters
@@ -82,8 +82,8 @@ class Damping:
         self.active = bool(discretisation.layout.comm.allreduce(len(self._terms), MPI.MAX))
         self._values: Array | None = None
         self._stored = False
-        self._multiple: Multiple | None = None
-        self._at: Array | None = None
+        self._multiple: ScaledDamping | None = None
+        self._x: Array | None = None
         self.frozen: Mapping[Term, Any] = {}
         # residual, objective and works ask at the same velocities
         self.product = Remembered(self._product)
@@ -100,10 +100,10 @@ class Damping:
     def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
         """Take the geometry of positions x (n_local, 3), left as they are, and what terms froze for it."""
         self.release_values()
-        self._at, self._stored, self.frozen = x, False, frozen
+        self._x, self._stored, self.frozen = x, False, frozen
         self.product.forget()
         if not self._single_assembly:
-            self._own()
+            self._stored_values()
 
     def release_values(self) -> None:
         """Work no longer with the rows that ``assemble_with_stiffness`` was given."""
@@ -113,13 +113,13 @@ class Damping:
         for term in self._terms:
             self._blocks.add_stiffness(term, x, self.frozen[term], 1.0, weight(term), values)
 
-    def _own(self) -> Array:
+    def _stored_values(self) -> Array:
         """D, stored from here on until the geometry is another."""
         if self._values is None:
             self._values = self._blocks.zeros()
-        if not self._stored and self._at is not None:
+        if not self._stored and self._x is not None:
             self._values[:] = 0.0
-            self._add(self._at, lambda term: term.elements.data["damping"], self._values)
+            self._add(self._x, lambda term: term.elements.data["damping"], self._values)
             self._stored = True
         return self._values
 
@@ -128,13 +128,13 @@ class Damping:
             return np.zeros((self._discretisation.layout.n_owned, 3))
         if self._multiple is not None:
             return self._multiple.product(self._blocks, v)
-        return self._blocks.product(self._own(), v)
+        return self._blocks.product(self._stored_values(), v)
 
     def product_at(self, x: Array, v: Array) -> Array:
         """D v with the geometry of positions x (n_local, 3); that of the step is there again afterwards."""
-        kept, self._at, self._stored = self._at, x, False
-        out = self._blocks.product(self._own(), v)
-        self._at, self._stored = kept, False
+        kept, self._x, self._stored = self._x, x, False
+        out = self._blocks.product(self._stored_values(), v)
+        self._x, self._stored = kept, False
         self.product.forget()
         return out
 
@@ -143,11 +143,11 @@ class Damping:
         self.release_values()
         rows, place = self._discretisation.rows, self._discretisation.fixed_positions
         if self.active and place is None:
-            rows.scale(self._own(), 1.0, diagonal, values)
+            rows.scale(self._stored_values(), 1.0, diagonal, values)
         else:
             rows.set_diagonal(diagonal, values)
             if self.active and place is not None:
-                rows.add_blocks(self._own(), place, values)
+                rows.add_blocks(self._stored_values(), place, values)
 
     def assemble_with_stiffness(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
@@ -164,13 +164,13 @@ class Damping:
         )
         if not self._gamma or other:
             return False
-        if self._at is None or not np.array_equal(x, self._at):
+        if self._x is None or not np.array_equal(x, self._x):
             return False
         factor = 1.0 + weight / self._gamma
         if self._single_assembly and not self._stored:
             self._blocks.set_diagonal(diagonal, values)
             self._add(x, lambda term: self._gamma + weight, values)
-            self._multiple = Multiple(values, factor, diagonal, changing)
+            self._multiple = ScaledDamping(values, factor, diagonal, changing)
         else:
-            self._blocks.scale(self._own(), factor, diagonal, values)
+            self._blocks.scale(self._stored_values(), factor, diagonal, values)
         return True

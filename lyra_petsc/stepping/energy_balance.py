@@ -1,4 +1,4 @@
-"""Energies of the state and the work done in a step, as in the energy identity of backward Euler::
+"""Energies of the state and works of the steps, as in the energy identity of backward Euler::
 
 Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
 bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
@@ -24,16 +24,16 @@ ROWS = 1 << 13
 """Rows whose works are computed together."""
 
 ENERGIES = ("membrane_energy", "bending_energy", "potential_energy")
-"""Columns of history.csv that energies of registered terms are added to; others come after these."""
+"""Columns of history.csv to which several terms add their energies; columns of single terms follow these."""
 
 
 @dataclass
 class Budget:
     """Energies [J] at a state, and cumulative works [J] up to it.
 
-    ``external_work`` is that of handles, springs and loads other than gravity, ``dissipation`` that of
-    material damping, of friction within the fabric and of impacts; ``more`` are the energies of terms with a
-    column of their own.
+    ``external_work`` is the work of handles, springs and loads other than gravity, ``dissipation`` the heat
+    of material damping, of friction within the fabric and of impacts; ``more`` holds the energies of terms
+    with their own column.
     """
 
     kinetic: float = 0.0
@@ -57,41 +57,41 @@ class Budget:
 
 @dataclass(frozen=True)
 class Works:
-    """What a step did, by the forces at its stage.
+    """Works and heat of a step, by the forces at its stage.
 
     Attributes
     ----------
     external, heat : float
-        Work [J] of handles, springs and loads without a potential, and of what damps.
-    moving : float
-        By how much the energy [J] of this rank's terms with moving targets is more than before the step.
+        Work [J] of handles, springs and loads without a potential, and heat of all dampers.
+    target_energy : float
+        Increase [J] of the energy of this rank's terms with moving targets.
     damping : (m,)
         Force [N] of material damping at the prescribed unknowns.
-    damped : float
+    damping_heat : float
         Heat [J] of material damping on this rank.
     """
 
     external: float
     heat: float
-    moving: float
+    target_energy: float
     damping: Array
-    damped: float
+    damping_heat: float
 
 
-def _work(force: Array, x_before: Array, x: Array) -> float:
-    """Of forces (n, 3) [N] on the way to x; there is no room for all of the ways."""
+def _work_of(force: Array, x_before: Array, x: Array) -> float:
+    """Work [J] of forces (n, 3) [N] over x - x_before, in parts to save memory."""
     x, parts = x[: len(force)], (slice(lo, lo + ROWS) for lo in range(0, len(force), ROWS))
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
 class Ledger:
-    """Keeps the budget over the steps; collective.
+    """Accumulates the budget over the steps; collective.
 
     Attributes
     ----------
     budget : Budget
     works : Works
-        Of the last step.
+        Works of the last step.
     """
 
     works: Works
@@ -99,14 +99,14 @@ class Ledger:
     def __init__(self, system: StageEquations) -> None:
         self._system = system
         named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
-        self._more = [name for name in named if name not in (*ENERGIES, "")]
+        self._columns = [name for name in named if name not in (*ENERGIES, "")]
         self.budget = Budget()
         self._at, self._reactions = system.prescribed.indices, np.zeros(len(system.prescribed.indices))
-        self._moving = 0.0
+        self._target_energy = 0.0
         self._pull: Array | None = None
         self._targets: list[tuple[Array, Array]] = []
         if not system.integrator.dynamic:
-            self._pull, self._targets = self._external(system.forces_now())[0], self._turning()
+            self._pull, self._targets = self._external_forces(system.forces_now())[0], self._moving_targets()
         self.measure()
 
     @property
@@ -117,73 +117,73 @@ class Ledger:
         return out
 
     def measure(self) -> Budget:
-        """Energies of the present state into the budget."""
+        """Write the energies of the present state into the budget."""
         system = self._system
         n = system.points.n_owned
-        columns = [*ENERGIES, *self._more]
+        columns = [*ENERGIES, *self._columns]
         local = np.zeros(len(columns) + 1)
         local[-1] = kinetic_energy(system.mass, system.v[:n])
-        self._moving = 0.0
+        self._target_energy = 0.0
         for term in system.active.elastic:
             entry = term.registration
             if entry.energy:
                 frozen = system.active.frozen[term]
                 energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
                 local[columns.index(entry.energy)] += energy
-                self._moving += energy if term.moving and not term.pushes else 0.0
+                self._target_energy += energy if term.moving and not term.pushes else 0.0
         for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)
         budget, sums = self.budget, [float(value) for value in system.points.global_sum(*local)]
         budget.membrane, budget.bending, budget.potential = sums[:3]
-        budget.more, budget.kinetic = dict(zip(self._more, sums[3:-1], strict=True)), sums[-1]
+        budget.more, budget.kinetic = dict(zip(self._columns, sums[3:-1], strict=True)), sums[-1]
         system.forget_directors()  # the next step has other frames
         return budget
 
-    def kept(self) -> tuple[Budget, float]:
-        """What `take_back` needs to forget the steps from here on."""
-        return replace(self.budget, more=dict(self.budget.more)), self._moving
+    def snapshot(self) -> tuple[Budget, float]:
+        """Copy of the ledger's state, for `revert`."""
+        return replace(self.budget, more=dict(self.budget.more)), self._target_energy
 
-    def take_back(self, kept: tuple[Budget, float]) -> None:
-        """Forget what was recorded since; the step is repeated."""
-        self.budget, self._moving = kept
+    def revert(self, snapshot: tuple[Budget, float]) -> None:
+        """Return to a `snapshot`, as the step is repeated."""
+        self.budget, self._target_energy = snapshot
 
     def record(self, x_before: Array) -> Budget:
-        """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
+        """Add the works of the step just taken from x_before (n_owned, 3) by the forces at its stage."""
         system = self._system
         system.move_frames_to_end()
-        external, damping, damped = self._external(system.forces_at_stage())
-        # targets that move with a handle let it work on the sheet
+        external, damping, damped = self._external_forces(system.forces_at_stage())
+        # a handle does work on the sheet through targets that move with it
         if self._pull is None:
-            turned = system.moving_energy_before - self._moving
-        else:  # the way to an equilibrium has no stage in its middle
+            by_targets = system.moving_energy_before - self._target_energy
+        else:  # the stage of a load step is at its end: take the mean of the forces at both ends
             external, self._pull = 0.5 * (external + self._pull), external
-            before, self._targets = self._targets, self._turning()
-            turned = sum(
+            before, self._targets = self._targets, self._moving_targets()
+            by_targets = sum(
                 0.5 * float(np.vdot(pull + pull0, at - at0))
                 for (at0, pull0), (at, pull) in zip(before, self._targets, strict=True)
             )
-        turned += system.obstacle_work() + system.move_targets_to_end()
-        local = np.array([_work(external, x_before, system.x) + turned, damped])
+        by_targets += system.obstacle_work() + system.move_targets_to_end()
+        local = np.array([_work_of(external, x_before, system.x) + by_targets, damped])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         local[1] += system.contact_impulses.heat if system.contact_impulses else 0.0
-        del external  # energies need the room
+        del external  # to save memory
         work, heat = system.points.global_sum(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
-        moving = self._moving
+        moving = self._target_energy
         self.measure()
-        self.works = Works(float(work), float(heat), self._moving - moving, damping, damped)
+        self.works = Works(float(work), float(heat), self._target_energy - moving, damping, damped)
         return self.budget
 
-    def _turning(self) -> list[tuple[Array, Array]]:
-        """Targets that move with handles, and the pull on them, of each term that has some."""
+    def _moving_targets(self) -> list[tuple[Array, Array]]:
+        """Positions of the targets that move with handles, and the forces on them, by term."""
         active, x = self._system.active, self._system.x
         return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
 
-    def _external(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
-        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F; those
-        of damping at the prescribed unknowns (m,), and its heat [J].
+    def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
+        """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs and loads without a
+        potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
         """
         system = self._system
         self._at = at = system.prescribed.indices
@@ -192,7 +192,7 @@ class Ledger:
             self._reactions += system.contact_impulses.handle_force
         weight = np.zeros((system.points.n_local, 3))
         for load in system.active.loads:
-            if load.registration.energy:  # it has a potential, and does no work from outside
+            if load.registration.energy:  # loads with a potential do no external work
                 load.add_force(system.x, 0.0, 0.0, weight)
         external = weight[: system.points.n_owned]
         external *= -system.applied.factor
@@ -203,31 +203,31 @@ class Ledger:
             elif name == "damping":
                 damping = part.take(at)
                 heat = system.dt * float(np.vdot(system.stage_velocity, part))
-            del part  # the next needs the room
+            del part  # to save memory before the next part is computed
         system.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat
 
     def memory(self) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Arrays (n_owned, 3) and numbers to go on with after a restart."""
+        """Arrays (n_owned, 3) and numbers of a checkpoint."""
         return ({} if self._pull is None else {"pull": self._pull}), asdict(self.budget)
 
     def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
-        """Go on with a memory: works are its, energies those of the present state."""
+        """Restore works from a checkpoint's memory; energies are measured at the present state."""
         for name, value in budget.items():
             if name != "more":
                 setattr(self.budget, name, float(value))
-        if self._pull is not None:  # an older checkpoint holds none
-            self._pull, self._targets = arrays.get("pull", self._pull), self._turning()
+        if self._pull is not None:  # older checkpoints have no entry
+            self._pull, self._targets = arrays.get("pull", self._pull), self._moving_targets()
         self.measure()
 
     @property
     def column_names(self) -> list[str]:
-        """Columns of history.csv that terms add, in the order of the terms."""
+        """Names of the columns of history.csv that terms add, in the order of the terms."""
         of_terms = [name for term in self._system.active.elastic for name in term.registration.columns]
-        return list(dict.fromkeys([*self._more, *of_terms]))
+        return list(dict.fromkeys([*self._columns, *of_terms]))
 
     def columns(self) -> dict[str, float]:
-        """Further columns of history.csv that terms add, by name (the last term wins); collective."""
+        """Columns of history.csv that terms add, by name (the last term wins); collective."""
         system = self._system
         found: dict[str, float] = dict(self.budget.more)
         for term in system.active.elastic:
@@ -240,7 +240,7 @@ class Ledger:
         return found
 
     def handle_forces(self, count: int) -> list[Array]:
-        """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""
+        """Total force (3,) [N] of each of a scene's ``count`` handles in the last step; collective."""
         system = self._system
         local = np.zeros((count, 3))
         for number, forces, _ in system.held.shares(system.t0, system.t1, self.reaction):
@@ -253,8 +253,8 @@ class Ledger:
         return list(total)
 
     def obstacle_forces(self, count: int) -> Array:
-        """Force [N] of the sheets on each of a scene's ``count`` obstacles, and its torque [N m] about the
-        origin, (count, 6), at the end of the last step, and of dashpots in it; collective.
+        """Force [N] and torque [N m] about the origin, (count, 6), of the sheets on each of a scene's
+        ``count`` obstacles at the end of the last step, with the dashpots of the step; collective.
         """
         system, total = self._system, np.zeros((count, 6))
         for term in system.active.elastic:
@@ -268,7 +268,7 @@ class Ledger:
         return total
 
     def handle_moments(self) -> dict[int, Array]:
-        """Moment [N·m] in the last step of each handle that holds slopes, about its mean; collective."""
+        """Moment [N·m] about its mean of each handle that holds slopes, in the last step; collective."""
         system, x = self._system, self._system.stage_positions
         edges, numbers = system.held.edges, system.held.with_slopes
         if edges is None:

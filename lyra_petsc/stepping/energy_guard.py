@@ -1,29 +1,31 @@
-"""Spurious energy gain of a step: no integrator may create energy unnoticed.
+"""Energy guard: rejects steps in which the integrator creates energy.
 
-The gain of a step, with the kinetic energy T of the free coordinates, all elastic energies U (springs and
-clamps too), the potential V of gravity, the heat D of the material damping and the work W of handles, loads
-and wind::
+The gain of a step is ::
 
     G = Δ(T + U + V) + D − W
 
-W is by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure with the
-geometry there, times the way. (The integrator's own forces, at its stage, balance a blow-up as well.) A
-target that moves works by the mean over both ends of what its motion does to the energy, which for springs is
-the same rule. D of integrators whose stage's velocity is not Δx/Δt is that of uniform motion, the least that
-leads from end to end, by the geometry in its middle: at the start from rest, the stage's is several times
-what any motion makes. G is judged against the scale ::
+with the kinetic energy T of the free coordinates, all elastic energies U (springs and clamps too), the
+potential V of gravity, the heat D of material damping and the work W of handles, loads and wind.
 
-    S = largest so far of T + U + |V − V₀| + Σ|W| + ΣD
+W is computed by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure
+with the geometry there, times the displacement. (With the integrator's own forces, at its stage, a run that
+blows up balances, too.) The work of a moving target is the change of stored energy by its motion, averaged
+over both ends, which for springs is the same rule. If the velocity of the integrator's stage is not Δx/Δt, D
+is the heat of uniform motion between the ends, with the geometry at its middle. It is the smallest heat that
+any motion makes; after a start from rest, the heat at the stage is several times as large. G is compared with
+the scale ::
 
-in which T is also that of what handles drive: where they start gently, hardly anything else moves yet.
-G < 0 is numerical dissipation: allowed, and summed up.
+    S = largest value so far of T + U + |V − V₀| + Σ|W| + ΣD
+
+whose T includes the coordinates that handles drive: if these start gently, little else moves at first.
+G < 0 is numerical dissipation, which is allowed and summed up.
 
 Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
 
     Δ(T + U + V) + D − W = −½ ‖Δv‖²_M + bracket        bracket = U(x_{n+1}) − U(x_n) − ∇U(x_{n+1})·Δx
 
-so that it makes energy only where U is not convex. The lesser of the two is judged: where air brakes a sheet
-within a step, the force at its start times the way is many times the work of any real brake.
+so that it gains energy only where U is not convex. Its steps are judged by the smaller of the two gains: if
+air brakes a sheet within a step, the force at its start times the displacement exceeds the work by far.
 """
 
 from __future__ import annotations
@@ -43,19 +45,19 @@ from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 LARGEST_GAIN = 0.01
-"""Gain of a step, over S, above which it is repeated."""
+"""Gain of a step over S above which the step is repeated."""
 
 LARGEST_SUM = 0.05
-"""Sum of the gains since the start, or over the last steps, over S, above which the step is repeated."""
+"""Sum of the gains since the start, or of the last `RECENT` steps, over S, above which a step is repeated."""
 
 IMPACT_GAIN, IMPACT_SUM = 1e-3, 0.01
-"""The same of integrators of second order while something touches, for which there is a remedy."""
+"""The same bounds for integrators of second order during contact, where backward Euler can take over."""
 
 RECENT = 20
-"""How many steps the last ones are."""
+"""Number of last steps whose gains are summed."""
 
-INSTEAD = {"midpoint": "bdf2", "alpha2": "bdf2", "bdf2": "beuler", "semi-implicit": "beuler"}
-"""The integrator to take where another one makes energy."""
+ALTERNATIVES = {"midpoint": "bdf2", "alpha2": "bdf2", "bdf2": "beuler", "semi-implicit": "beuler"}
+"""The integrator to recommend in place of one that creates energy."""
 
 ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum of energies."""
@@ -63,7 +65,7 @@ ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
 
 @dataclass
 class GuardState:
-    """What the guard remembers between steps; energies in J.
+    """State of the guard between steps; energies in J.
 
     Attributes
     ----------
@@ -74,15 +76,15 @@ class GuardState:
     total : float
         Sum of the gains since the start.
     lost, won : float
-        Sums of the negative ones, as a positive number, and of the others.
+        Sums of the negative gains, as a positive number, and of the positive ones.
     work, heat : float
         Σ|W|, ΣD.
     inertia, bracket : float
-        Of backward Euler's identity: Σ ½ ‖Δv‖²_M, and the sum of its brackets.
+        Sums Σ ½ ‖Δv‖²_M and of the brackets in backward Euler's identity.
     recent : list of float
-        Gains of the last steps, the newest last, less what schemes of several steps gave back (`_with_gain`).
+        Gains of the last steps, the newest last, after `_append_gain`.
     repeated : int
-        Attempts that were rejected.
+        Number of rejected attempts.
     """
 
     start: float | None = None
@@ -100,7 +102,7 @@ class GuardState:
 
 @dataclass(frozen=True)
 class Balance:
-    """What a step did; J, the same on every rank.
+    """Energy balance of a step [J], the same on every rank.
 
     Attributes
     ----------
@@ -109,13 +111,13 @@ class Balance:
     work, heat : float
         W, D.
     potential_before, potential : float
-        V at its ends.
+        V at both ends of the step.
     stored_before, stored : float
-        T + U at its ends, with what handles drive.
+        T + U at both ends, with the coordinates that handles drive.
     inertia, bracket : float
-        ½ ‖Δv‖²_M, and what the work of the stage's forces leaves unexplained but for it.
+        ½ ‖Δv‖²_M, and this plus the change of energy that the work of the stage's forces does not explain.
     noise : float
-        Round-off of all that.
+        Round-off of the gain.
     """
 
     gain: float
@@ -153,31 +155,34 @@ class EnergyGuard:
     # -- a step ------------------------------------------------------------------------------------
 
     def balance(self, x0: Array, v0: Array, before: Budget, after: Budget, works: Works) -> Balance:
-        """Of the step just taken from x0, v0 (n_local, 3), from what the ledger says of it; collective."""
+        """Balance of the step just taken from x0, v0 (n_local, 3), by the ledger's energies before and after
+        it and its works; collective.
+        """
         system = self._system
         layout, n = system.points, system.points.n_owned
-        if system.discretisation.stencils_change:  # there may be other ghosts by now
+        if system.discretisation.stencils_change:  # ghosts may have changed in the step
             x0, v0 = resized(x0, n, layout.n_local), resized(v0, n, layout.n_local)
             for values in (x0, v0):
                 layout.update_ghosts(values)
         x1, v1, at = system.x, system.v, system.prescribed.indices
         change = kinetic_energy(system.mass, v1[:n] - v0[:n])
         moved = x1[:n] - x0[:n]
-        works, heat_beside = self._with_least_heat(x0, x1, works)
-        # what the ledger's kinetic energies hold beyond the free coordinates
+        works, extra_heat = self._with_least_heat(x0, x1, works)
+        # kinetic energies of prescribed coordinates, which the ledger's include
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
-        work = self._outer_work(x0, v0, x1, v1, moved)
+        work = self._load_work(x0, v0, x1, v1, moved)
         work += self._handle_work(x0, x1, moved, works)
-        pulled = self._of_targets(x0, x1)
-        reach = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2, heat_beside)
+        targets = self._target_energies(x0, x1)
+        largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
+        stiff = self._stiffness_sum * largest**2
+        local = (*driven, change, work, *targets, works.target_energy, stiff, extra_heat)
         sums = [float(value) for value in layout.global_sum(*local)]
-        slower, faster, change, work, rise, from_targets, *springs, moving, stiff, heat_beside = sums
-        slower, faster = before.kinetic - slower, after.kinetic - faster
-        work += from_targets
-        plain = after.elastic - before.elastic - moving
-        heat, fall = works.heat + heat_beside, after.potential - before.potential
-        gain = faster - slower + plain + rise + fall + heat - work
+        driven0, driven1, change, work, elastic, by_targets, *springs, moving, stiff, extra_heat = sums
+        work += by_targets
+        kinetic = (after.kinetic - driven1) - (before.kinetic - driven0)
+        elastic += after.elastic - before.elastic - moving
+        heat = works.heat + extra_heat
+        gain = kinetic + elastic + after.potential - before.potential + heat - work
         energy = after.kinetic + after.elastic + springs[1]
         energy_before = before.kinetic + before.elastic + springs[0]
         sizes = energy + energy_before + before.kinetic + after.kinetic
@@ -198,27 +203,28 @@ class EnergyGuard:
         )
 
     def _with_least_heat(self, x0: Array, x1: Array, works: Works) -> tuple[Works, float]:
-        """The works with the damping forces of uniform motion from x0 to x1 (n_local, 3), and what this
-        rank must add to their heat [J] for it to be that of this motion.
+        """Works with the damping forces of uniform motion from x0 to x1 (n_local, 3), and the heat [J] of
+        that motion on this rank, less the heat in ``works``.
         """
         system = self._system
         if not system.damping.active or system.integrator.order == 1 or system.integrator.exact_work:
             return works, 0.0
         moved = x1 - x0
-        # about the middle, chords of what turns stretch nothing
+        # at the middle, the displacements of a rotation cause no strain
         force = system.damping.product_at(0.5 * (x0 + x1), moved / system.dt)
         heat = float(np.vdot(force, moved[: len(force)]))
-        return replace(works, damping=force.take(system.prescribed.indices)), heat - works.damped
+        return replace(works, damping=force.take(system.prescribed.indices)), heat - works.damping_heat
 
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
-        """What terms freeze with their targets where they are at time ``at`` [s] of the step."""
+        """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
         system = self._system
         step = UpcomingStep(system.t0, system.t1, at, x, system.reference.at)
         return {term: term.freeze(step) for term in terms}
 
-    def _of_targets(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
-        """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
-        the energy of springs at both ends."""
+    def _target_energies(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
+        """Of this rank's terms with targets [J]: the change of energy, the work of the targets' motion, and
+        the energy of springs at both ends.
+        """
         system, rise, springs = self._system, 0.0, [0.0, 0.0]
         work = system.contact_impulses.work if system.contact_impulses else 0.0
         for term in system.active.pushing:
@@ -236,9 +242,10 @@ class EnergyGuard:
                 springs = [springs[0] + before, springs[1] + after]
         return rise, work, springs[0], springs[1]
 
-    def _outer_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
-        """Work [J] of loads without a potential and of wind on this rank's free coordinates, by the mean of
-        their forces over both ends of the step."""
+    def _load_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
+        """Work [J] of wind and of loads without a potential on this rank's free coordinates, by the mean of
+        the forces at both ends of the step.
+        """
         system = self._system
         if not (self._forces or system.active.viscous):
             return 0.0
@@ -258,12 +265,13 @@ class EnergyGuard:
         return 0.5 * float(np.vdot(force[: len(free)], free))
 
     def _handle_work(self, x0: Array, x1: Array, moved: Array, works: Works) -> float:
-        """Work [J] of exact handles on this rank, by the mean over both ends of what the sheet and its weight
-        pull them with."""
+        """Work [J] of exact handles on this rank, by the mean of the reactions to the sheet's forces and
+        weight at both ends of the step.
+        """
         system, self._next_pull = self._system, None
         at = system.prescribed.indices
-        way = moved.take(at)
-        if not way.any():  # most handles stand still
+        displacement = moved.take(at)
+        if not displacement.any():  # most handles stand still
             return 0.0
         n = system.points.n_owned
         if self._pull is None or self._pull[0] != system.t0:
@@ -280,51 +288,51 @@ class EnergyGuard:
         force += 0.5 * targets[:n].take(at) - weight[:n].take(at) + works.damping
         if system.contact_impulses:
             force += system.contact_impulses.handle_force
-        return float(np.vdot(force, way))
+        return float(np.vdot(force, displacement))
 
     @property
-    def _stiff(self) -> float:
-        """Sum [N/m] of what this rank's elastic forces are proportional to."""
+    def _stiffness_sum(self) -> float:
+        """Sum [N/m] of the stiffnesses of this rank's elements."""
         if self._stiffness is None:
             self._stiffness = sum(float(each.sum()) for each in self._system.objective.stiffnesses.values())
         return self._stiffness
 
     # -- the verdict -------------------------------------------------------------------------------
 
-    def stands(self, step: Balance, *, strict: bool) -> bool:
-        """Whether a step may stand; then it is remembered. The same on all ranks; collective.
+    def accept(self, step: Balance, *, strict: bool) -> bool:
+        """Whether the step is accepted; if so, it is recorded. The same on all ranks; collective.
 
-        ``strict``: where something touches, it may make but little under an integrator of second order.
+        ``strict``: apply `IMPACT_GAIN` and `IMPACT_SUM` during contact under an integrator of second order.
         """
-        new = self._with(step)
+        new = self._updated(step)
         over = self._system.integrator.gain_window
-        # a step that makes none of it would make none either if it were shorter
+        # a step without a gain of its own would not improve the mean if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
-        self.gain = of_step, of_steps, new.scale
-        meets = strict and self._system.has_active_pairs and self._system.integrator.order > 1
-        most, most_in_all = (IMPACT_GAIN, IMPACT_SUM) if meets else (LARGEST_GAIN, LARGEST_SUM)
-        good = of_step <= max(most * new.scale, step.noise)
-        # one that makes nothing cannot mend what others made
-        good = good and (of_steps <= max(most_in_all * new.scale, step.noise) or new.recent[-1] <= 0.0)
-        good = bool(self._system.points.comm.bcast(good, root=0))
-        if good:
+        self._judged = of_step, of_steps, new.scale
+        impact = strict and self._system.has_active_pairs and self._system.integrator.order > 1
+        most, most_in_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
+        accepted = of_step <= max(most * new.scale, step.noise)
+        # repeating a step without a gain would not reduce the sum
+        accepted &= of_steps <= max(most_in_sum * new.scale, step.noise) or new.recent[-1] <= 0.0
+        accepted = bool(self._system.points.comm.bcast(accepted, root=0))
+        if accepted:
             self.gains, self._pull = new, self._next_pull
         else:
             self.gains.repeated += 1
-        return good
+        return accepted
 
     @property
-    def _by_identity(self) -> bool:
-        """Whether it is backward Euler."""
+    def _is_backward_euler(self) -> bool:
+        """Whether the integrator is backward Euler, which has the identity."""
         return self._system.integrator.name == "beuler"
 
-    def _with(self, step: Balance) -> GuardState:
-        """What would be remembered with a step."""
+    def _updated(self, step: Balance) -> GuardState:
+        """State of the guard after accepting a step."""
         old = self.gains
         start = step.potential_before if old.start is None else old.start
         judged = step.gain
-        if self._by_identity:
+        if self._is_backward_euler:
             judged = min(judged, step.bracket - step.inertia)
         work, heat = old.work + abs(step.work), old.heat + step.heat
         return GuardState(
@@ -341,16 +349,16 @@ class EnergyGuard:
             heat=heat,
             inertia=old.inertia + step.inertia,
             bracket=old.bracket + step.bracket,
-            recent=_with_gain(old.recent, judged, self._system.integrator.gain_window)[-RECENT:],
+            recent=_append_gain(old.recent, judged, self._system.integrator.gain_window)[-RECENT:],
             repeated=old.repeated,
         )
 
-    # -- in words ----------------------------------------------------------------------------------
+    # -- messages ----------------------------------------------------------------------------------
 
     @property
-    def words(self) -> str:
-        """What the step judged last made of nothing."""
-        of_step, of_steps, scale = self.gain
+    def message(self) -> str:
+        """The gain of the step judged last."""
+        of_step, of_steps, scale = self._judged
         if not (math.isfinite(scale) and math.isfinite(of_step)):
             return "makes energy without bounds"
         share, what = of_step / scale, ""
@@ -359,16 +367,16 @@ class EnergyGuard:
         return f"makes {100.0 * share:.2g} % of the energy at work out of nothing{what}"
 
     @property
-    def instead(self) -> str:
-        """What to take instead of the integrator."""
+    def remedy(self) -> str:
+        """What to use instead of the integrator."""
         name = self._system.integrator.name
-        other = INSTEAD.get(name)
+        other = ALTERNATIVES.get(name)
         if other:
             return f"time.integrator: {other}"
         return "a smaller time.step, more material.damping, or a finer mesh where the sheet buckles"
 
     def content(self) -> dict[str, Any]:
-        """For the summary: energies as shares of the scale, which is in J."""
+        """Entry of summary.json: energies as fractions of the scale, which is in J."""
         gains, scale = self.gains, self.gains.scale or 1.0
         found: dict[str, Any] = {
             "scale": gains.scale,
@@ -376,7 +384,7 @@ class EnergyGuard:
             "numerical_gain": gains.won / scale,
             "repeated": gains.repeated,
         }
-        if self._by_identity:
+        if self._is_backward_euler:
             found["identity"] = {
                 "velocity_changes": gains.inertia / scale,
                 "bracket": gains.bracket / scale,
@@ -386,22 +394,24 @@ class EnergyGuard:
     # -- checkpoints -------------------------------------------------------------------------------
 
     def memory(self) -> dict[str, Any]:
-        """What a checkpoint must hold."""
+        """Entry of a checkpoint."""
         return asdict(self.gains)
 
     def restore(self, memory: Mapping[str, Any], *, same: bool) -> None:
-        """Go on with a memory; with another integrator (not ``same``) its gains are counted anew."""
+        """Restore a checkpoint's memory; without its gains if the integrator is another (not ``same``)."""
         self.gains = GuardState(**memory)
         if not same:
             self.gains.total, self.gains.recent = 0.0, []
 
 
-def _with_gain(recent: list[float], gain: float, over: int) -> list[float]:
-    """Gains of the last steps and a new one, of which no more is left than the ``over`` last steps made in
-    all: a loss must not pass out of sight before what is given back of it.
+def _append_gain(recent: list[float], gain: float, window: int) -> list[float]:
+    """Gains of the last steps and a new one, balanced against the losses of the last ``window`` steps.
+
+    Schemes of several steps give back in one step what they have taken in others; both must leave the list of
+    recent gains together.
     """
-    found = list(recent)
-    for i in range(len(found) - 1, max(len(found) - over, -1), -1):
-        back = min(max(gain, 0.0), max(-found[i], 0.0))
-        found[i], gain = found[i] + back, gain - back
-    return [*found, gain]
+    gains = list(recent)
+    for i in range(len(gains) - 1, max(len(gains) - window, -1), -1):
+        returned = min(max(gain, 0.0), max(-gains[i], 0.0))
+        gains[i], gain = gains[i] + returned, gain - returned
+    return [*gains, gain]

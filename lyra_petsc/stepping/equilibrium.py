@@ -259,7 +259,7 @@ class Equilibrium:
             linear += attempt.linear_iterations
             if attempt.converged:
                 solved_once = True
-                system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
+                system.active.transport_frames(system.x)  # edges may turn far until they are in equilibrium
                 used = self._integrator.pseudo_dt
                 grown = min(used * growth(attempt.newton_iterations), BELOW_CEILING * ceiling)
                 self._safe_pseudo_dt = longest = max(grown, used)
@@ -282,18 +282,18 @@ class Equilibrium:
             message = f"{message}; {slides}"
         self._last_pseudo_dt = 0.0
         self._in_vain += solves - last_progress if solved_once else 0
-        stuck = attempt.stuck or self._failed_solve(before, factor, history, x)
+        stuck = attempt.failed_solve or self._failed_solve(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        system.active.carry_frames(system.x, frozen)
+        system.active.transport_frames(system.x, frozen)
         system.active.restore_contacts(contacts)
         return dataclasses.replace(
             attempt,
             converged=False,
             newton_iterations=newton,
             linear_iterations=linear,
-            words=message if slides else attempt.words or message,
-            stuck=stuck,
+            message=message if slides else attempt.message or message,
+            failed_solve=stuck,
         )
 
     def _predict_by_tangent(self, before: float, factor: float) -> None:
@@ -380,11 +380,11 @@ class Equilibrium:
         ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
         if not ran_out or self._follows or system.discretisation.limits_motion:
             return False
-        lowest = self._stepper.lowest()
+        lowest = self._stepper.lowest_energy_positions()
         if lowest is None:
             return False
         system.state.set(lowest, np.zeros_like(lowest))
-        system.active.carry_frames(system.x)
+        system.active.transport_frames(system.x)
         return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:

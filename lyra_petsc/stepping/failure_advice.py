@@ -82,38 +82,38 @@ class Circumstances:
     ranks: int
 
 
-def trouble(diagnosis: Diagnosis, stuck: FailedSolve) -> str:
+def failure_kind(diagnosis: Diagnosis, solve: FailedSolve) -> str:
     """``overflow``, ``linear trouble`` or ``nonlinear trouble``."""
     if diagnosis.not_finite or not math.isfinite(diagnosis.norm):
         return "overflow"
-    if stuck.snes_reason == SNES.DIVERGED_LINEAR_SOLVE:
+    if solve.snes_reason == SNES.DIVERGED_LINEAR_SOLVE:
         return "linear trouble"
-    if stuck.ksp_reason >= 0:
+    if solve.ksp_reason >= 0:
         return "nonlinear trouble"
     # what stopped the solve is the direction that this linear solve failed to give; where the iterations
     # ran out it may be one failure of many solves
-    solved = stuck.iterations[1:]
+    solved = solve.iterations[1:]
     failed = sum(each.linear_reason < 0 for each in solved)
-    ran_out = stuck.snes_reason == SNES.DIVERGED_MAX_IT and 2 * failed < len(solved)
+    ran_out = solve.snes_reason == SNES.DIVERGED_MAX_IT and 2 * failed < len(solved)
     return "nonlinear trouble" if ran_out else "linear trouble"
 
 
-def advice(diagnosis: Diagnosis, stuck: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
+def advice(diagnosis: Diagnosis, solve: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
     """What to try and why, most promising first; never empty."""
-    kind = trouble(diagnosis, stuck)
+    kind = failure_kind(diagnosis, solve)
     if kind == "overflow":
-        return [_overflow(diagnosis, now), *_steps(scene, now)]
-    found = _place(diagnosis, scene, now)
+        return [_overflow_advice(diagnosis, now), *_step_advice(scene, now)]
+    found = _local_advice(diagnosis, scene, now)
     static = scene.time.scheme == "static"
     if static and not scene.handles:
         found.insert(0, "handles (nothing holds the sheet)")
-        return [*found, *_linear(stuck, scene, now)]
+        return [*found, *_linear_advice(solve, scene, now)]
     if kind == "linear trouble":
-        return [*_linear(stuck, scene, now), *found]
-    limit = _limit(stuck, now)
-    if limit and (now.max_iterations < FEW_ITERATIONS or stuck.snes_reason == SNES.DIVERGED_FUNCTION_COUNT):
-        return [*limit, *found, *_steps(scene, now)]
-    found += [*_nearly(diagnosis, scene, now), *limit, *_steps(scene, now)]
+        return [*_linear_advice(solve, scene, now), *found]
+    limit = _iteration_advice(solve, now)
+    if limit and (now.max_iterations < FEW_ITERATIONS or solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT):
+        return [*limit, *found, *_step_advice(scene, now)]
+    found += [*_tolerance_advice(diagnosis, scene, now), *limit, *_step_advice(scene, now)]
     if not found:
         found = [
             "more handles, or a damped motion instead" if static else "more material.damping, or a finer mesh"
@@ -121,7 +121,7 @@ def advice(diagnosis: Diagnosis, stuck: FailedSolve, scene: Scene, now: Circumst
     return found
 
 
-def more_room(meets: NearPair, scene: Scene) -> str:
+def contact_advice(meets: NearPair, scene: Scene) -> str:
     """What to change where two parts meet that may not."""
     moving = [name for name, obstacle in (scene.obstacles or {}).items() if obstacle.motion]
     handled = any(handle.motion for handle in scene.handles)
@@ -138,7 +138,7 @@ def more_room(meets: NearPair, scene: Scene) -> str:
     return f"time.integrator: beuler, which stands impacts that {scene.time.scheme} does not"
 
 
-def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:
+def _overflow_advice(diagnosis: Diagnosis, now: Circumstances) -> str:
     absurd = "smaller numbers where one is absurd, or lost its unit: in "
     if not diagnosis.iterate_finite or not diagnosis.overflowing:
         return absurd + "material, gravity, loads, wind, initial, motions, or mesh.transform.scale"
@@ -151,7 +151,7 @@ def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:
     return f"{absurd}{keys} (what overflows: {', '.join(diagnosis.overflowing)})"
 
 
-def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
+def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     """What is odd at the worst vertex and triangle."""
     found = []
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
@@ -190,26 +190,26 @@ def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     return found
 
 
-def _linear(stuck: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
+def _linear_advice(solve: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
     direct = "a direct solver: -pc_type lu"
     if now.ranks > 1:
         direct += " -pc_factor_mat_solver_type mumps"
-    if stuck.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR:
+    if solve.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR:
         return [f"-ksp_max_it above {now.linear_iterations}", direct]
-    if stuck.ksp_reason == KSP.DIVERGED_INDEFINITE_MAT and scene.solver.hessian != "regularised":
+    if solve.ksp_reason == KSP.DIVERGED_INDEFINITE_MAT and scene.solver.hessian != "regularised":
         return ["solver.hessian: regularised", direct]
     if now.preconditioner in ("lu", "cholesky"):
         return ["-pc_factor_shift_type positive_definite, or smaller numbers where material has absurd ones"]
     return [direct, f"another preconditioner than -pc_type {now.preconditioner}"]
 
 
-def _limit(stuck: FailedSolve, now: Circumstances) -> list[str]:
+def _iteration_advice(solve: FailedSolve, now: Circumstances) -> list[str]:
     """Whether more iterations would help."""
-    if stuck.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
+    if solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
         return ["a larger -snes_max_funcs"]
-    if stuck.snes_reason != SNES.DIVERGED_MAX_IT:
+    if solve.snes_reason != SNES.DIVERGED_MAX_IT:
         return []
-    norms = [each.residual for each in stuck.iterations]
+    norms = [each.residual for each in solve.iterations]
     early = 2 * len(norms) // 3
     falling = early > 0 and min(norms[early:]) < 0.5 * min(norms[1:early] or norms[:1])
     above = f"{now.iterations_key} above {now.max_iterations}"
@@ -222,7 +222,7 @@ def _limit(stuck: FailedSolve, now: Circumstances) -> list[str]:
     ]
 
 
-def _nearly(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
+def _tolerance_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     """Whether the tolerances ask for more than there is."""
     asked = scene.solver.force_tolerance
     if diagnosis.scale == 0.0 or diagnosis.norm > NEARLY * diagnosis.scale:
@@ -240,7 +240,7 @@ def _nearly(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]
     return [f"solver.force_tolerance: {loose:.0e}, if that will do {balance}"]
 
 
-def _steps(scene: Scene, now: Circumstances) -> list[str]:
+def _step_advice(scene: Scene, now: Circumstances) -> list[str]:
     if now.nominal > MANY_CUTS * now.dt:
         return []
     if scene.time.scheme == "static":

@@ -122,7 +122,7 @@ def diagnose(
     points: Layout,
     membrane: Membrane,
     held: ExactHandles,
-    stuck: FailedSolve,
+    solve: FailedSolve,
     x: Array,
     mass: Array,
     tags: Array | None,
@@ -135,7 +135,7 @@ def diagnose(
     membrane : Membrane
         For its triangles.
     held : ExactHandles
-    stuck : FailedSolve
+    solve : FailedSolve
     x : (n_owned, 3) or more rows
         Positions before the step [m].
     mass : (n_owned,) [kg]
@@ -143,32 +143,32 @@ def diagnose(
         Of the .msh file.
     """
     comm, n = points.comm, points.n_vertices
-    stuck = stuck.of_vertices(n)
-    free = ~stuck.prescribed
-    residual = np.where(free, stuck.residual, 0.0)
+    solve = solve.of_vertices(n)
+    free = ~solve.prescribed
+    residual = np.where(free, solve.residual, 0.0)
     wrong = ~np.isfinite(residual).all(axis=1)
-    forces = {name: np.where(free, part, 0.0) for name, part in stuck.forces.items()}
-    squares = {name: _square(comm, part) for name, part in forces.items()}
+    forces = {name: np.where(free, part, 0.0) for name, part in solve.forces.items()}
+    squares = {name: _squared_norm(comm, part) for name, part in forces.items()}
     finite = [square for square in squares.values() if np.isfinite(square)]
-    handle, jump = _furthest(comm, held, stuck, x[:n])
+    handle, jump = _largest_handle_motion(comm, held, solve, x[:n])
     return Diagnosis(
-        norm=float(np.sqrt(_square(comm, residual))),
+        norm=float(np.sqrt(_squared_norm(comm, residual))),
         scale=float(np.sqrt(max(finite, default=0.0))),
         not_finite=int(comm.allreduce(int(wrong.sum()))),
-        iterate_finite=not comm.allreduce(int(not np.isfinite(stuck.velocity).all())),
+        iterate_finite=not comm.allreduce(int(not np.isfinite(solve.velocity).all())),
         overflowing=[name for name, square in squares.items() if not np.isfinite(square)],
-        vertex=_vertex(points, stuck, residual, forces, x[:n], mass, tags),
-        triangle=_triangle(points, membrane, stuck, residual),
+        vertex=_vertex(points, solve, residual, forces, x[:n], mass, tags),
+        triangle=_triangle(points, membrane, solve, residual),
         handle=handle,
         jump=jump,
     )
 
 
-def _square(comm: MPI.Comm, rows: Array) -> float:
+def _squared_norm(comm: MPI.Comm, rows: Array) -> float:
     return float(comm.allreduce(float(np.sum(rows * rows))))
 
 
-def _size(rows: Array) -> Array:
+def _norms(rows: Array) -> Array:
     """Norms of the rows, whose squares may overflow; infinite where a number is not finite."""
     largest = np.abs(rows).max(axis=-1, initial=0.0)
     usable = np.isfinite(largest) & (largest > 0.0)
@@ -177,7 +177,7 @@ def _size(rows: Array) -> Array:
     return np.where(np.isfinite(largest), sizes, np.inf)
 
 
-def worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
+def describe_worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
     """``describe`` the row of the largest size, of the smallest number among equals; collective.
 
     Parameters
@@ -196,14 +196,14 @@ def worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int],
     first = int(numbers[bad].min()) if len(bad) else none
     number, rank = comm.allreduce((first, comm.rank), MPI.MIN)
     mine = describe(int(bad[np.argmin(numbers[bad])])) if rank == comm.rank and number != none else None
-    told: Result | None = comm.bcast(mine, root=rank)
-    assert told is not None
-    return told
+    result: Result | None = comm.bcast(mine, root=rank)
+    assert result is not None
+    return result
 
 
 def _vertex(
     points: Layout,
-    stuck: FailedSolve,
+    solve: FailedSolve,
     residual: Array,
     forces: dict[str, Array],
     x: Array,
@@ -214,27 +214,27 @@ def _vertex(
         return Vertex(
             number=int(points.mesh_vertices[row]),
             tag=0 if tags is None else int(tags[row]),
-            position=_numbers(stuck.position[row]),
-            before=_numbers(x[row]),
-            residual=_numbers(residual[row]),
-            forces={name: float(_size(part[row])) for name, part in forces.items()},
-            moved=float(_size(stuck.position[row] - x[row])),
+            position=_floats(solve.position[row]),
+            before=_floats(x[row]),
+            residual=_floats(residual[row]),
+            forces={name: float(_norms(part[row])) for name, part in forces.items()},
+            moved=float(_norms(solve.position[row] - x[row])),
             mass=float(mass[row]),
         )
 
-    return worst(points.comm, _size(residual), points.mesh_vertices, describe)
+    return describe_worst(points.comm, _norms(residual), points.mesh_vertices, describe)
 
 
-def _triangle(points: Layout, membrane: Membrane, stuck: FailedSolve, residual: Array) -> Triangle:
+def _triangle(points: Layout, membrane: Membrane, solve: FailedSolve, residual: Array) -> Triangle:
     n, owned = points.n_vertices, membrane.n_owned
     # with the ghosts: residual norms and mesh numbers, and positions
     known, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
-    known[:n, 0], known[:n, 1] = _size(residual), points.mesh_vertices
-    position[:n] = stuck.position
+    known[:n, 0], known[:n, 1] = _norms(residual), points.mesh_vertices
+    position[:n] = solve.position
     points.update_ghosts(known)
     points.update_ghosts(position)
     stencil = membrane.stencil[:owned]
-    sizes = _size(known[:, 0][stencil])
+    sizes = _norms(known[:, 0][stencil])
     inverse = membrane.elements.data["inverse"]
 
     def describe(row: int) -> Triangle:
@@ -242,13 +242,13 @@ def _triangle(points: Layout, membrane: Membrane, stuck: FailedSolve, residual: 
         return Triangle(
             number=int(membrane.elements.index[row]),
             vertices=tuple(int(number) for number in known[stencil[row], 1]),
-            centre=_numbers(corners.mean(axis=0)),
+            centre=_floats(corners.mean(axis=0)),
             residual=float(sizes[row]),
             aspect=_aspect(inverse[row]),
             stretches=_stretches(corners, inverse[row]),
         )
 
-    return worst(points.comm, sizes, membrane.elements.index[:owned].astype(np.int64), describe)
+    return describe_worst(points.comm, sizes, membrane.elements.index[:owned].astype(np.int64), describe)
 
 
 def _aspect(inverse: Array) -> float:
@@ -262,12 +262,14 @@ def _stretches(corners: Array, inverse: Array) -> tuple[float, ...]:
     gradient = np.column_stack([corners[1] - corners[0], corners[2] - corners[0]]) @ inverse
     if not np.isfinite(gradient).all():
         return (float("nan"), float("nan"))
-    return _numbers(np.linalg.svd(gradient, compute_uv=False)[::-1])
+    return _floats(np.linalg.svd(gradient, compute_uv=False)[::-1])
 
 
-def _furthest(comm: MPI.Comm, held: ExactHandles, stuck: FailedSolve, x: Array) -> tuple[int | None, float]:
+def _largest_handle_motion(
+    comm: MPI.Comm, held: ExactHandles, solve: FailedSolve, x: Array
+) -> tuple[int | None, float]:
     """The handle that moves its vertices furthest, and how far [m]."""
-    ways = _size(np.where(stuck.prescribed, stuck.goal - x, 0.0))
+    ways = _norms(np.where(solve.prescribed, solve.goal - x, 0.0))
     numbers = held.numbers
     if not numbers:
         return None, 0.0
@@ -278,5 +280,5 @@ def _furthest(comm: MPI.Comm, held: ExactHandles, stuck: FailedSolve, x: Array) 
     return (numbers[first], float(furthest[first])) if furthest[first] > 0.0 else (None, 0.0)
 
 
-def _numbers(row: Array) -> tuple[float, ...]:
+def _floats(row: Array) -> tuple[float, ...]:
     return tuple(float(value) for value in row)

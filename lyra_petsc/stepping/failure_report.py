@@ -34,8 +34,8 @@ class FailedAttempt:
     def of(cls, attempt: Attempt, dt: float, solver: str) -> FailedAttempt:
         """From the stepper's outcome."""
         iterations = attempt.newton_iterations, attempt.linear_iterations
-        norm = attempt.residual if attempt.stuck is None else attempt.stuck.norm
-        return cls(dt, solver, *iterations, norm, attempt.words)
+        norm = attempt.residual if attempt.failed_solve is None else attempt.failed_solve.norm
+        return cls(dt, solver, *iterations, norm, attempt.message)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Failure:
     advice : list of str
     sources : list of Source
         Of the mesh.
-    stuck : FailedSolve
+    failed_solve : FailedSolve
         The last attempt's arrays, of this rank.
     near : NearPair or None
         With contact, what would meet in the last attempt, else what is nearest where it stands.
@@ -74,7 +74,7 @@ class Failure:
     diagnosis: Diagnosis
     advice: list[str]
     sources: list[Source]
-    stuck: FailedSolve
+    failed_solve: FailedSolve
     near: NearPair | None = None
     obstacle: NearPair | None = None
 
@@ -87,9 +87,9 @@ class Failure:
     def sentence(self) -> str:
         """What happened, where, and what to try, in one line."""
         last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
-        near = f": {_apart(self.near)}" if self.near is not None and self.near.blocks else ""
+        near = f": {_pair_text(self.near)}" if self.near is not None and self.near.blocks else ""
         what = f"{self.tried[-1].words}{near}"
-        if self.stuck.iterations or not near:
+        if self.failed_solve.iterations or not near:
             what += (
                 f" ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
                 f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
@@ -103,7 +103,7 @@ class Failure:
     @property
     def lines(self) -> tuple[str, ...]:
         """The rest, short."""
-        history = ", ".join(_shortened([_iterate(each) for each in self.stuck.iterations]))
+        history = ", ".join(_shortened([_iteration_text(each) for each in self.failed_solve.iterations]))
         found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
         found += [line for line in (self._linear(), self._earlier()) if line]
         found += self._places()
@@ -116,7 +116,7 @@ class Failure:
         rows += [f"  {self._attempt(each)}: {each.words}" for each in self.tried]
         rows += ["", "The last attempt, Newton iteration by iteration:"]
         rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}  part taken"]
-        for number, each in enumerate(self.stuck.iterations):
+        for number, each in enumerate(self.failed_solve.iterations):
             part = "" if each.taken is None else f"{each.taken:.3g}"
             linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
             rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
@@ -125,7 +125,7 @@ class Failure:
         rows += ["", "What to try:", *(f"  {words}" for words in self.advice)]
         if self._linear():
             rows += ["", "The last linear solve, residual norm by iteration:"]
-            norms = self.stuck.linear_residuals
+            norms = self.failed_solve.linear_residuals
             rows += [f"  {number:4d}  {norm:12.5e}" for number, norm in enumerate(norms)]
         return "\n".join(rows) + "\n"
 
@@ -136,7 +136,7 @@ class Failure:
             "load_factor" if self.static else "time": self.time,
             "kind": self.kind,
             "attempts": [asdict(each) for each in self.tried],
-            "iterations": [asdict(each) for each in self.stuck.iterations],
+            "iterations": [asdict(each) for each in self.failed_solve.iterations],
             **asdict(self.diagnosis),
             **({} if self.near is None else {"near": asdict(self.near)}),
             **({} if self.obstacle is None else {"obstacle": asdict(self.obstacle)}),
@@ -163,7 +163,7 @@ class Failure:
 
     def _linear(self) -> str:
         """The linear solve, where it is what failed."""
-        norms = self.stuck.linear_residuals
+        norms = self.failed_solve.linear_residuals
         if self.kind != "linear trouble" or len(norms) < 2:
             return ""
         return f"last linear solve: residual {norms[0]:.3g} → {norms[-1]:.3g} in {len(norms) - 1} iterations"
@@ -175,8 +175,8 @@ class Failure:
         many = self.diagnosis.not_finite
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),
-            *([f"nearest, or in the way: {_apart(self.near)}"] if self.near is not None else []),
-            *([f"nearest obstacle: {_apart(self.obstacle)}"] if self.obstacle is not None else []),
+            *([f"nearest, or in the way: {_pair_text(self.near)}"] if self.near is not None else []),
+            *([f"nearest obstacle: {_pair_text(self.obstacle)}"] if self.obstacle is not None else []),
             f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
             f"residual {size:.3g} N of forces [N] {forces}",
             f"{self._triangle()} of vertices {', '.join(map(str, triangle.vertices))} around "
@@ -204,13 +204,13 @@ class Failure:
         return self.sources[which].label, number - int(ends[which] - counts[which])
 
 
-def _apart(near: NearPair) -> str:
+def _pair_text(near: NearPair) -> str:
     """A pair, and what is left between its parts."""
     beyond = f" beside contact.thickness = {near.kept:g} m" if near.kept else ""
     return f"{near.text} {near.gap:.3g} m apart{beyond}"
 
 
-def _iterate(each: Iteration) -> str:
+def _iteration_text(each: Iteration) -> str:
     linear = f" ({each.linear_iterations})" if each.taken is not None else ""
     part = f" ×{each.taken:.2g}" if each.taken is not None and each.taken < 0.995 else ""
     return f"{each.residual:.3g}{linear}{part}"

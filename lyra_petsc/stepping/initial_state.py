@@ -1,4 +1,4 @@
-"""The state at t = 0 beside the start positions: noise and velocities (rank 0, whole mesh)."""
+"""Noise and velocities of the state at t = 0, of the whole mesh on rank 0."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.scene.schema import MAX_SPEED, Initial, Scene
 
 RESOLVED = 1e6
-"""Mean edge over the round-off of the largest coordinate, at least."""
+"""Smallest mean edge length over the round-off of the largest coordinate."""
 
 
 def start_positions(initial: Initial, mesh: Mesh, held: dict[int, NDArray[np.int64]]) -> dict[str, Array]:
-    """``start`` (V, 3) [m]: displaced along the vertex normals by normal noise, but for held vertices.
-
-    Empty without noise.
+    """``start`` (V, 3) [m], positions displaced along vertex normals by Gaussian noise except at held
+    vertices; empty without noise.
     """
     if initial.noise == 0.0:
         return {}
@@ -43,7 +42,7 @@ def start_velocities(
     Raises
     ------
     InputError
-        Beyond `MAX_SPEED`.
+        If a vertex is faster than `MAX_SPEED`.
     """
     if not any(initial.velocity) and not any(initial.angular_velocity):
         return {}
@@ -51,7 +50,7 @@ def start_velocities(
     with np.errstate(over="ignore", invalid="ignore"):
         spin = np.cross(np.asarray(initial.angular_velocity), mesh.positions - centre)
         velocity = np.asarray(initial.velocity) + spin
-    fastest = float(np.abs(velocity).max())  # whose square may not be a number
+    fastest = float(np.abs(velocity).max())  # a norm might overflow
     if not fastest <= MAX_SPEED:
         key = "velocity" if np.abs(initial.velocity).max() > MAX_SPEED else "angular_velocity"
         raise InputError(
@@ -62,17 +61,18 @@ def start_velocities(
     return {"velocity": velocity}
 
 
-def check_resolved(spacing: float, reach: float, scene: Scene) -> None:
-    """Refuse a mesh whose edges, ``spacing`` [m] in the mean, are lost in coordinates up to ``reach`` [m].
+def check_resolved(spacing: float, largest: float, scene: Scene) -> None:
+    """Refuse a mesh whose mean edge length ``spacing`` [m] is too near the round-off of its ``largest``
+    coordinate [m].
 
     Raises
     ------
     InputError
     """
-    smallest = RESOLVED * float(np.finfo(np.float64).eps) * reach
+    smallest = RESOLVED * float(np.finfo(np.float64).eps) * largest
     if spacing < smallest:
         raise InputError(
-            f"edges of {spacing:.3g} m in the mean are too short for coordinates of {reach:.3g} m, whose "
+            f"edges of {spacing:.3g} m in the mean are too short for coordinates of {largest:.3g} m, whose "
             f"round-off moves them; at least {smallest:.2g} m: move the sheet nearer to the origin",
             file=scene.source,
             key="mesh",

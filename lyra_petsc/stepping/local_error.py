@@ -32,45 +32,46 @@ class LocalError:
 
     @property
     def needs_acceleration(self) -> bool:
-        """Whether the coming step's accelerations at its start are asked for."""
+        """Whether accelerations at the start of the coming step are needed."""
         return self._system.integrator.order > 1 and self._slope is None
 
     def set_acceleration(self, acceleration: Array) -> None:
-        """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
+        """Set the accelerations (n_owned, 3) [m/s²] at the start of the step."""
         self._slope, self._dt = acceleration, 0.0
 
     def restart(self) -> None:
-        """Forces jump at the start of the coming step."""
+        """Forget the history, as forces jump at the start of the coming step."""
         self._slope = None
 
-    def of(self, v_before: Array, dt: float) -> float:
-        """Largest local error [m] over the free coordinates of the step just taken, from v_before on."""
+    def estimate(self, v_before: Array, dt: float) -> float:
+        """Largest local error [m] over the free coordinates of the step just taken, which began with
+        velocities v_before (n_owned, 3) [m/s].
+        """
         system = self._system
         n = system.points.n_owned
-        slope = (
-            system.v[:n] - v_before
-        ) / dt  # rows of edges follow the vertices and have no error of their own
+        slope = (system.v[:n] - v_before) / dt
         if system.integrator.order == 1:
             error = 0.5 * dt * dt * slope
         else:
             assert self._slope is not None
             third = 2.0 * (slope - self._slope) / (dt + self._dt)
             error = system.integrator.error_constant * dt**3 * third
+        # edge unknowns follow the vertices and have no error of their own
         vertices = slice(0, system.points.n_vertices)
         largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.prescribed.free[vertices]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
     def record_step(self, v_before: Array, dt: float) -> None:
-        """The step stands."""
+        """Record the slope of the accepted step."""
         if self._system.integrator.order > 1:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
 
     def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
-        """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
+        """Arrays (n_owned, 3) and numbers of a checkpoint."""
         return ({} if self._slope is None else {"slope": self._slope}), {"slope_dt": self._dt}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
-        """Go on with a memory."""
+        """Restore a checkpoint's memory."""
         self._slope = arrays.get("slope")
         self._dt = float(numbers.get("slope_dt", 0.0))

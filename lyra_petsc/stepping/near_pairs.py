@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.failure_diagnosis import worst
+from lyra_petsc.stepping.failure_diagnosis import describe_worst
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
 
@@ -126,7 +126,7 @@ def _worst(system: StageEquations, x: Array, badness: Callable[[Elastic], Array]
         blocks = system.refused_displacement is not None or gap <= TIGHT * term.skin
         return NearPair(parts, pair.obstacle, middle, gap, pair.thickness, blocks)
 
-    return worst(points.comm, values, first, describe)
+    return describe_worst(points.comm, values, first, describe)
 
 
 def _named(part: tuple[int, ...]) -> str:

@@ -1,4 +1,4 @@
-"""Unknowns that are prescribed in a step: which, where to, and with what velocity at the stage."""
+"""Prescribed unknowns of a step: their indices, final positions, and velocities at the stage."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from lyra_petsc.terms.prescribed_handles import ExactHandles
 
 
 class Prescribed:
-    """The exact handles of a scene in one step on one rank, and unknowns that nothing uses.
+    """Unknowns that exact handles prescribe in a step on one rank, and the unused ones of the padding row.
 
     Attributes
     ----------
     mask : (n_local, 3) bool
-        Prescribed unknowns.
+        True for prescribed unknowns.
     free : (n_owned, 3) bool
-        The others.
-    at : (m,) int
-        Which of all owned unknowns, row by row, are prescribed.
+        True for owned unknowns that are not prescribed.
+    indices : (m,) int
+        Prescribed unknowns among the owned ones, numbered row by row, ascending.
     not_counted : (k,) int
-        Those, ascending, whose forces a residual is not measured by: the same, but not while vertices are
-        held.
+        Unknowns whose forces do not count in the scale of the residual: ``indices`` without the vertices of
+        `hold_vertices`.
     goal : (m,)
         Positions [m] of the prescribed unknowns at the end of the step.
     velocity : (m,)
@@ -56,7 +56,7 @@ class Prescribed:
         self._constrained = None
 
     def resize(self) -> None:
-        """Follow the layout to other ghosts; collective."""
+        """Resize to the layout's present ghosts; collective."""
         self._set(~self.free)
 
     @property
@@ -68,7 +68,9 @@ class Prescribed:
         return self._constrained[1]
 
     def begin_step(self, t0: float, t1: float, x: Array) -> bool:
-        """Take the handles of the step t0..t1 [s] from x (n_owned, 3); whether they changed; collective."""
+        """Prescribe what handles hold in the step t0..t1 [s] from positions x (n_owned, 3); return whether
+        the set of handles has changed since the step before; collective.
+        """
         if not self.held:
             return False
         self._x = x
@@ -87,7 +89,7 @@ class Prescribed:
         return changed
 
     def hold_vertices(self, x: Array) -> None:
-        """Prescribe all vertices where x (n_owned, 3) has them, too, until `release_vertices`; collective."""
+        """Prescribe all vertices at positions x (n_owned, 3), too, until `release_vertices`; collective."""
         layout = self._discretisation.layout
         self._kept = ~self.free, self.goal, self.velocity
         own = ~self.free
@@ -96,36 +98,36 @@ class Prescribed:
         self.goal = x.take(self.indices)
 
     def release_vertices(self) -> None:
-        """Prescribe again what was prescribed before `hold_vertices`; collective."""
+        """Prescribe only the unknowns from before `hold_vertices`; collective."""
         own, self.goal, self.velocity = self._kept
         self._set(own)
 
     def set_velocity_to_goal(self, x_h: Array, c: float) -> None:
-        """Take the velocities that lead from the history x_h (n_owned, 3) to the goal."""
+        """Set the velocities that lead from the history x_h (n_owned, 3) to the goal: (goal − x_h) / c."""
         self.velocity = (self.goal - x_h.take(self.indices)) / c
 
-    def set_motion_at(self, at: float, x_h: Array, c: float) -> None:
-        """Take position and velocity at time ``at`` [s], and change x_h (n_owned, 3) to agree with them."""
-        self.velocity = self._rates(at)
-        self.overwrite(x_h, self._positions(at) - c * self.velocity)
+    def set_motion_at(self, time: float, x_h: Array, c: float) -> None:
+        """Set velocities to those of handles at ``time`` [s], and x_h (n_owned, 3) to fit their positions."""
+        self.velocity = self._rates(time)
+        self.overwrite(x_h, self._positions(time) - c * self.velocity)
 
     def overwrite(self, values: Array, prescribed: Array) -> None:
         """Overwrite the prescribed unknowns of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""
         np.put(values, self.indices, prescribed)
 
     def overwrite_with_end_velocity(self, velocity: Array) -> None:
-        """Write ẋ* [m/s] at the end of the step over the prescribed unknowns of ``velocity``."""
+        """Overwrite prescribed unknowns of ``velocity`` by the handles' velocities at the end of the step."""
         if self.held and self._span[1] > self._span[0]:
             self.overwrite(velocity, self._rates(self._span[1]))
 
     def overwrite_with_start_velocity(self, velocity: Array) -> None:
-        """Write ẋ* [m/s] just after the start of the step, where it may jump."""
+        """Overwrite them by the handles' velocities just after the start of the step, where they may jump."""
         if self.held and self._span[1] > self._span[0]:
             start, end = self._span
             self.overwrite(velocity, self._rates(start + 1e-3 * (end - start)))
 
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
-        """Write what handles prescribe at time ``at`` [s] over present positions in ``out`` (n_owned, 3)."""
+        """Overwrite positions in ``out`` (n_owned, 3) by those that handles prescribe at time ``at`` [s]."""
         self.held.targets(t0, t1, at, self._reference.at, out)
 
     def _positions(self, at: float) -> Array:

@@ -1,4 +1,4 @@
-"""Set-up: from a checked scene to one rank's part of the discretised problem; collective."""
+"""Set-up of the discretised problem: from a checked scene to each rank's part of it; collective."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ FLAT = 1e-6
 """Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
 
 TOO_NEAR = 1e-3
-"""Part of contact's gap that is at least between what a scene starts with: what is nearer has the energy
-k gap² / 1e-3 for each vertex, and is thrown apart.
+"""Smallest separation at the start over contact's gap: nearer vertices, each with the energy k gap² / 1e-3,
+would be thrown apart.
 """
 
 
 @dataclass
 class Outline:
-    """What every rank knows of the whole: a few numbers and names."""
+    """Properties of the whole problem that every rank knows."""
 
     n_vertices: int
     n_triangles: int
@@ -64,7 +64,7 @@ class Outline:
     """Mean rest edge length [m]."""
     size: float
     """Diagonal [m] of the rest shape's bounding box."""
-    reach: float
+    largest_coordinate: float
     """Largest coordinate [m] of the start and rest shape."""
     terms: list[str]
     sources: list[Source]
@@ -74,26 +74,26 @@ class Outline:
 
 @dataclass
 class Problem:
-    """One rank's part of a scene, ready to step.
+    """One rank's part of a scene, ready for time steps.
 
     Attributes
     ----------
     scene, outline
     discretisation : Discretisation
     terms : dict of name → Term
-        The active ones.
+        The active terms.
     system : StageEquations
     surface : Surface
-        The mesh as it was before the scene's start moved it.
+        The mesh before ``initial`` of the scene displaced it.
     probes : dict of name → (n,) int
         Owned vertices of each probe, local numbering.
     mesh : Mesh or None
         The whole mesh, on rank 0, until ``release``.
     partitioner : str
     start : (n_vertices, 3) or None
-        Positions [m] of the owned vertices at t = 0, where a field of the states needs them.
+        Positions [m] of the owned vertices at t = 0, if a field of the states needs them.
     tags : (n_vertices,) or None
-        Node tags that a .msh file gives the owned vertices, 0 for others, as float64.
+        Node tags of the owned vertices in a .msh file, 0 for vertices without, as float64.
     """
 
     scene: Scene
@@ -109,18 +109,18 @@ class Problem:
     start: Array | None = None
 
     def release(self) -> None:
-        """Free the whole mesh; from here on no rank holds a global array."""
+        """Free the whole mesh; afterwards no rank holds a global array."""
         self.mesh = None
-        _give_back_freed()
+        _trim_heap()
 
     @property
     def points(self) -> Layout:
-        """The rows of this rank and their ghosts."""
+        """This rank's rows and ghosts."""
         return self.discretisation.layout
 
     @property
     def pattern(self) -> BlockPattern:
-        """Of the matrix."""
+        """Block pattern of the matrix."""
         return self.discretisation.rows.pattern
 
     @property
@@ -134,12 +134,12 @@ def build_problem(
 ) -> Problem:
     """Mesh, partition, terms and matrix pattern of a scene; collective.
 
-    ``known`` is the mesh and ``owner`` (V,) the rank of each vertex, on rank 0 and where these are settled.
+    ``known`` is the mesh, and ``owner`` (V,) the rank of each vertex, on rank 0 if they are known already.
 
     Raises
     ------
     InputError
-        On all ranks alike, for whatever in the scene or its meshes cannot be simulated.
+        On all ranks, if the scene or its meshes cannot be simulated.
     """
     whole: GlobalMesh | None = None
     mesh: Mesh | None = None
@@ -147,7 +147,7 @@ def build_problem(
     def prepare() -> Outline:
         nonlocal whole, mesh
         mesh = known or build_scene_mesh(scene, phases.report)
-        outline, whole = _whole(scene, mesh)
+        outline, whole = _prepare(scene, mesh)
         whole.owner = owner
         return outline
 
@@ -157,21 +157,21 @@ def build_problem(
         part = distribute(comm, whole)
         whole = None
     with phases("assembly"):
-        problem = _local(scene, outline, part, mesh)
+        problem = _build_local(scene, outline, part, mesh)
         del part
-        _give_back_freed()
+        _trim_heap()
         return problem
 
 
-def _give_back_freed() -> None:
-    """Let the system have the memory that was freed."""
-    # a library of PETSc's (SuperLU_dist) tells malloc to keep it
+def _trim_heap() -> None:
+    """Return freed memory to the operating system."""
+    # SuperLU_dist, loaded with PETSc, sets malloc to keep it
     with suppress(AttributeError, OSError):  # glibc only
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def events(scene: Scene) -> list[float]:
-    """Times [s] on which a step must end: handles and loads begin and end there, or velocities jump."""
+def event_times(scene: Scene) -> list[float]:
+    """Times [s] at which a step must end, as handles and loads begin or end or velocities jump there."""
     windows = [Window.of(handle) for handle in scene.handles]
     jumps = [
         t
@@ -183,13 +183,13 @@ def events(scene: Scene) -> list[float]:
     return [*(t for window in windows for t in window.events()), *jumps]
 
 
-def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
-    """Everything there is to distribute (rank 0)."""
+def _prepare(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
+    """Compute everything that is to be distributed (on rank 0)."""
     rest = RestShape(scene, mesh)
-    light = np.flatnonzero(~(rest.mass > 0.0))
-    if len(light):
+    massless = np.flatnonzero(~(rest.mass > 0.0))
+    if len(massless):
         raise InputError(
-            f"{len(light)} vertices without mass (first: {light[:5].tolist()}); "
+            f"{len(massless)} vertices without mass (first: {massless[:5].tolist()}); "
             "give their material a density > 0",
             file=scene.source,
             key="material",
@@ -203,8 +203,9 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         names.append(entry.name)
         if found is not None:
             elements[entry.name] = found
-    spacing, reach = mean_edge_length(mesh), float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
-    check_resolved(spacing, reach, scene)
+    spacing = mean_edge_length(mesh)
+    largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
+    check_resolved(spacing, largest, scene)
     held = select_exact(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
@@ -214,7 +215,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
         if entry.edge_state and any(handle.holds_slope for handle in scene.handles):
-            from lyra_petsc.terms import clamped_edges  # of use for nothing else
+            from lyra_petsc.terms import clamped_edges  # only scenes with clamps need it
 
             clamps = clamped_edges.elements(rest)
             elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
@@ -239,7 +240,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
         n_triangles=mesh.n_triangles,
         spacing=spacing,
         size=float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
-        reach=reach,
+        largest_coordinate=largest,
         terms=names,
         sources=mesh.sources,
         barrier=_barrier(rest),
@@ -251,20 +252,20 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
-    """Refuse symmetry planes that are none, or on which hinges end."""
+    """Refuse symmetry handles whose vertices are not in one plane, or at which hinges end."""
     scene, mesh = rest.scene, rest.mesh
-    slack = FLAT * float(np.ptp(mesh.positions, axis=0).max())
+    tolerance = FLAT * float(np.ptp(mesh.positions, axis=0).max())
     for number, vertices in held.items():
         axis = scene.handles[number].symmetry
         if axis is None:
             continue
-        along = mesh.positions[vertices][:, AXES.index(axis)]
-        off = np.abs(along - np.median(along))
+        coordinate = mesh.positions[vertices][:, AXES.index(axis)]
+        distance = np.abs(coordinate - np.median(coordinate))
         problem = ""
-        if off.max() > slack:
+        if distance.max() > tolerance:
             problem = (
-                f"vertex {vertices[off.argmax()]} lies {off.max():.2g} m beside the plane {axis} = "
-                f"{np.median(along):.6g} m; choose only vertices in one plane, or hold axes instead"
+                f"vertex {vertices[distance.argmax()]} lies {distance.max():.2g} m beside the plane {axis} = "
+                f"{np.median(coordinate):.6g} m; choose only vertices in one plane, or hold axes instead"
             )
         elif (np.isin(mesh.triangles[rest.bends_with("hinge")], vertices).sum(axis=1) > 1).any():
             problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
@@ -273,9 +274,9 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
 
 
 def _check_sliding(rest: RestShape, held: Selection) -> None:
-    """Refuse clamps that slide and turn, or slide out of the sheet's plane, or on which hinges end.
+    """Refuse clamps that slide and turn, or slide out of the sheet's plane, or at which hinges end.
 
-    The director of an edge that slides in a plane normal to it stays as it is.
+    A clamp keeps the slope of an edge that slides in the sheet's plane by keeping its director constant.
     """
     scene, mesh = rest.scene, rest.mesh
     for number, vertices in held.items():
@@ -283,18 +284,18 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
         free = [axis for axis in range(3) if axis not in handle.axis_numbers]
         if not handle.clamp or not free:
             continue
-        from lyra_petsc.terms.midedge import normals_of  # with kernels
+        from lyra_petsc.terms.midedge import normals_of  # only clamps need its kernels
 
-        there = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
-        leaning = np.abs(normals_of(mesh.positions, mesh.triangles[there])[:, free]).max(initial=0.0)
+        at_clamp = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
+        slope = np.abs(normals_of(mesh.positions, mesh.triangles[at_clamp])[:, free]).max(initial=0.0)
         keyframes = scene.motions[handle.motion] if handle.motion is not None else ()
         names = ", ".join(AXES[axis] for axis in free)
         problem = ""
-        if leaning > FLAT:
+        if slope > FLAT:
             problem = (
                 f"keeps the slope of an edge that slides in its sheet's plane, not along {names} out of it"
             )
-        elif (there & rest.bends_with("hinge")).any():
+        elif (at_clamp & rest.bends_with("hinge")).any():
             problem = "is not kept by hinges on edges that slide; give the material bending_model: midedge"
         elif any(keyframe.rotate is not None for keyframe in keyframes):
             problem = "keeps no slope of an edge that turns and slides"
@@ -307,10 +308,10 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
 
 
 def _barrier(rest: RestShape) -> Barrier | None:
-    """What all ranks need to know of contact, where a scene has it."""
+    """Parameters of contact for all ranks, or None if the scene has no contact."""
     if rest.scene.contact is None:
         return None
-    from lyra_petsc.terms.contact import barrier  # with kernels
+    from lyra_petsc.terms.contact import barrier  # only contact needs its kernels
 
     return barrier(rest)
 
@@ -318,7 +319,7 @@ def _barrier(rest: RestShape) -> Barrier | None:
 def _set_up_contact(
     scene: Scene, outline: Outline, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
 ) -> None:
-    """Tell contact of the obstacles; collective."""
+    """Pass the obstacles to the contact and friction terms; collective."""
     if outline.barrier is None or scene.contact is None:
         return
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
@@ -334,7 +335,7 @@ def _set_up_contact(
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 
 
-def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -> Problem:
+def _build_local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
     terms = {
@@ -351,7 +352,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     _check_indices(layout, discretisation.rows.pattern.n_couplings)
     held = ExactHandles(
         scene,
-        {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
+        {n: _owned_vertices(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
         _clamped_edges(scene, part, terms),
     )
     mass = np.zeros(layout.n_owned)
@@ -363,7 +364,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
         held,
         integrator=integrator,
         starts=[Window.of(handle).start for handle in scene.handles],
-        events=events(scene),
+        events=event_times(scene),
     )
     for term in system.active.elastic:
         if term.registration.coarse:
@@ -381,7 +382,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     surface = Surface(
         system.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
     )
-    # handles start from the undisturbed shape
+    # reference positions of handles are those before noise
     system.set_references(0.0)
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
@@ -391,7 +392,7 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
         term.initialise(system.x)
     system.hold_targets(0.0)
     refuse_contact(system, scene, "at the start", TOO_NEAR * outline.barrier.gap if outline.barrier else 0.0)
-    probes = {name: _own(part, f"probe {name}") for name in scene.probes}
+    probes = {name: _owned_vertices(part, f"probe {name}") for name in scene.probes}
     return Problem(
         scene,
         outline,
@@ -407,23 +408,23 @@ def _local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -
     )
 
 
-def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float = 0.0) -> None:
-    """Refuse a state, named by ``when``, in which contact has what is not apart, or not by ``least`` [m];
+def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: float = 0.0) -> None:
+    """Refuse a state, described by ``when``, with a contact pair not separated by more than ``minimum`` [m];
     collective.
 
     Raises
     ------
     InputError
-        Where it is worst.
+        Names the nearest pair.
     """
     near = nearest_pair(system, system.x)
-    if near is None or near.gap > least:
+    if near is None or near.gap > minimum:
         return
     apart, remedy = "not apart", "move them apart"
     if near.gap > 0.0:
         apart = f"{near.gap:.3g} m apart" + (", beside contact.thickness" if near.kept else "")
         apart += ", less than a thousandth of contact.gap, which would throw them from each other"
-        remedy += f", best by {least / TOO_NEAR:.3g} m"
+        remedy += f", best by {minimum / TOO_NEAR:.3g} m"
     elif near.kept > 0.0:
         apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
         apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
@@ -435,7 +436,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float
 
 
 def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> ClampedEdges | None:
-    """The edges that handles clamp, where they have unknowns."""
+    """The edges that handles clamp, if edges have unknowns; else None."""
     clamping = {n: handle for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements}
     if not clamping:
         return None
@@ -452,7 +453,7 @@ def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> 
 
 
 def _check_indices(points: Layout, n_blocks: int) -> None:
-    """Refuse more unknowns, or more entries on a rank, than PETSc's integers count; collective."""
+    """Refuse more unknowns, or more matrix entries on a rank, than PETSc's integers count; collective."""
     largest = int(np.iinfo(PETSc.IntType).max)
     most_entries = 9 * points.comm.allreduce(n_blocks, MPI.MAX)
     if 3 * points.n_global <= largest and most_entries <= largest:
@@ -466,7 +467,7 @@ def _check_indices(points: Layout, n_blocks: int) -> None:
 
 
 def _spectral_radius(scene: Scene) -> float | None:
-    """That of the scene, or PETSc's ``-ts_alpha_radius``."""
+    """Spectral radius of the scene or of PETSc's ``-ts_alpha_radius``; None if the integrator has none."""
     if scene.time.spectral_radius is None:
         return None
     radius = petsc_number("ts_alpha_radius", scene.time.spectral_radius)
@@ -475,7 +476,7 @@ def _spectral_radius(scene: Scene) -> float | None:
     return radius
 
 
-def _own(part: LocalMesh, name: str) -> Ints:
-    """Owned vertices of a set of single-vertex elements, local numbering."""
+def _owned_vertices(part: LocalMesh, name: str) -> Ints:
+    """Owned vertices of the single-vertex elements ``name``, in local numbering."""
     elements = part.elements[name]
     return elements.stencil[: elements.n_owned, 0].astype(np.int64)

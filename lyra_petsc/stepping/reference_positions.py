@@ -1,4 +1,4 @@
-"""Reference positions of handles: where their vertices were when they started to act."""
+"""Reference positions of handles: those of their vertices when the handle started to act."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from lyra_petsc.mesh.points import Layout
 
 
 class ReferencePositions:
-    """Positions of the vertices of handles and springs at each time at which one of them starts.
+    """Positions of the vertices of handles and springs at each time at which a handle or spring starts.
 
     Parameters
     ----------
     layout : Layout
     rows : (n,) int64
-        Local rows of all these vertices, in any order.
+        Local rows of these vertices, in any order.
     starts : iterable of float
-        Times [s] at which something starts to act.
+        Times [s] at which handles and springs start.
 
     Attributes
     ----------
     late : dict of float to (n_owned, 3) array
-        All positions [m] at starts after t = 0, which a checkpoint must hold.
+        Positions [m] of all owned rows at each start after t = 0, for checkpoints.
     """
 
     def __init__(self, layout: Layout, rows: Ints, starts: Iterable[float]) -> None:
@@ -33,14 +33,14 @@ class ReferencePositions:
         self._positions: dict[float, Array] = {}
         self.late: dict[float, Array] = {}
 
-    def until(self, time: float, x: Array) -> None:
-        """Let everything that starts to act by ``time`` [s] do so from positions x (n_local, 3)."""
+    def record_starts(self, time: float, x: Array) -> None:
+        """Record positions x (n_local, 3) for every start up to ``time`` [s] not recorded before."""
         for start in self._starts:
             if start <= time and start not in self._positions:
                 self._begin(start, x)
 
-    def resume(self, start: float, x: Array) -> None:
-        """What started at ``start`` [s] did so from positions x (n_owned, 3); collective."""
+    def restore(self, start: float, x: Array) -> None:
+        """Restore from a checkpoint the positions x (n_owned, 3) at ``start`` [s]; collective."""
         shape = np.zeros((self._layout.n_local, 3))
         shape[: len(x)] = x
         self._layout.update_ghosts(shape)
@@ -52,7 +52,7 @@ class ReferencePositions:
         self._positions[start] = x[self._rows]
 
     def at(self, start: float, rows: Ints) -> Array:
-        """Positions (n, 3) [m] of local rows at a start; before it, those at the latest start so far."""
+        """Positions (n, 3) [m] of local rows at a start; if it is to come, at the latest start so far."""
         found = self._positions.get(start)
         if found is None:
             found = self._positions[max(self._positions)]

@@ -1,4 +1,4 @@
-"""A scene in motion: steps with retries, no files."""
+"""Stepping through a scene: choice of Δt, retries and recovery from failures; writes no files."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, Ledger
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
-from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
+from lyra_petsc.stepping.failure_advice import Circumstances, advice, contact_advice, failure_kind
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
-from lyra_petsc.stepping.problem import Problem, build_problem, events, refuse_contact
+from lyra_petsc.stepping.problem import Problem, build_problem, event_times, refuse_contact
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
-from lyra_petsc.stepping.stepper import MEETS, Attempt, Stepper
+from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
 
 SMALLEST_FRACTION = 2.0**-12
-"""Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""
+"""Smallest Δt of a retry over the nominal Δt (``-ts_adapt_dt_min`` overrides it)."""
 
 LARGEST_FRACTION = 0.1
 """Largest Δt of an adaptive run over its length (``-ts_adapt_dt_max`` overrides it)."""
 
-FINER = 0.2
-"""Part of Δt down to which a step that makes energy is halved before an impact is taken to be why."""
+IMPACT_DT = 0.2
+"""Δt over the nominal one below which backward Euler repeats steps that fail in contact."""
 
-FINEST = 0.02
-"""The same under the midpoint rule, whose steps keep angular momentum over an impact, if they find a way."""
+IMPACT_DT_EXACT_WORK = 0.02
+"""The same under the midpoint rule, which conserves angular momentum over an impact if it converges."""
 
-FAR = 20.0
-"""Skins of a search through which a vertex goes in a step, above which halvings do not resolve an impact."""
+UNRESOLVED_SKINS = 20.0
+"""Displacement in a step, over the skin of the contact search, above which halvings resolve no impact."""
 
-FOLLOWED, FOLLOWED_OF_RUN = 0.02, 1e-4
-"""Parts of a search's skin that vertices go in a step, and of the run, below which automatic steps do not
-become shorter for the error of an impact: it may be followed into ever smaller parts of the gap.
+IMPACT_SKIN_FRACTION, IMPACT_RUN_FRACTION = 0.02, 1e-4
+"""Displacement in a step over the skin of the contact search, and Δt over the length of the run, below which
+adaptive steps are not shortened for the error of an impact, which would lead to ever shorter ones.
 """
 
-MOST_STEPS, MOST_STATES = 1e8, 1e6
-"""Beyond them a run would never end, or fill any disk."""
+MAX_STEPS, MAX_STATES = 1e8, 1e6
+"""Upper bounds of a run's numbers of steps and of states."""
 
 SMALLEST_ADAPTED = 1e-6
 """Smallest Δt of an adaptive run over the largest (``-ts_adapt_dt_min`` overrides it)."""
@@ -68,7 +68,7 @@ SMALLEST_ADAPTED = 1e-6
 
 @dataclass
 class StepReport:
-    """One accepted step; ``left`` [m] is what more Newton iterations would move."""
+    """One accepted step; ``remaining`` [m] is the estimated displacement of further Newton iterations."""
 
     step: int
     time: float
@@ -80,11 +80,11 @@ class StepReport:
     wall_seconds: float
     smallest_stretch: float = 1.0
     largest_stretch: float = 1.0
-    left: float = math.inf
+    remaining: float = math.inf
 
 
 def _positive(name: str, seconds: float) -> float:
-    """A time [s] from PETSc's options, or from the scene and then positive anyway."""
+    """Return ``seconds`` of an option ``name``; refuse what is not positive and finite."""
     if not 0.0 < seconds < math.inf:
         raise InputError(f"must be a finite number of seconds > 0, not {seconds:g}", key=name)
     return seconds
@@ -98,32 +98,32 @@ class SteppedScene:
     comm : MPI.Comm
     scene : Scene
     phases : Phases, optional
-        Where wall time is charged.
+        Collects wall time by phase.
     mesh : Mesh, optional
-        The scene's on rank 0, where it stands already.
-    land : sequence of float
-        Further times [s] on which a step shall end.
+        The scene's mesh on rank 0, if it has been built already.
+    stops : sequence of float
+        Further times [s] at which a step must end.
 
     Attributes
     ----------
     scene : Scene
-        With the integrator and the kind of steps that PETSc's options chose.
+        With the integrator and the step control that PETSc's options choose.
     problem : Problem
     time : float
         [s]
     step_number : int
     roundoff : float
-        Most that round-off may make of the norm [N] of the residual.
+        Upper bound of round-off in the norm [N] of the residual.
     totals : dict of str to int
         Newton and linear iterations, and rejected attempts, of all steps.
     stability : dict
-        Of a static analysis: what summary.json says of the last equilibrium.
+        Static analysis: entries of summary.json on the last equilibrium.
     failure : Failure or None
         Why the last step could not be taken.
     notes : list of str
-        What the user should know: mesh repairs, changed linear solver, …
+        Messages to the user: mesh repairs, changed linear solver, …
     earlier_notes : int
-        How many of them are of the run that a checkpoint is of.
+        How many of the notes come from the run that wrote the checkpoint.
 
     Raises
     ------
@@ -138,9 +138,9 @@ class SteppedScene:
         phases: Phases | None = None,
         *,
         mesh: Mesh | None = None,
-        land: Sequence[float] = (),
+        stops: Sequence[float] = (),
     ) -> None:
-        self.comm, self.scene, self._mesh, self._land = comm, scene, mesh, list(land)
+        self.comm, self.scene, self._mesh, self._stops = comm, scene, mesh, list(stops)
         self.phases = phases or Phases()
         COMPILATION.begins, COMPILATION.ends = self.phases.begin_compilation, self.phases.end_compilation
         self._filled = fill_gaps(scene.petsc)
@@ -149,7 +149,7 @@ class SteppedScene:
             self.scene = with_ts_options(scene)
             self._set_up(self.scene)
         except BaseException:
-            self._take_back_options()
+            self._remove_filled_options()
             raise
 
     def _set_up(self, scene: Scene) -> None:
@@ -158,7 +158,7 @@ class SteppedScene:
         outline, system = self.problem.outline, self.problem.system
         check_size(self.problem.points.n_unknowns)
         with self.phases("solve"):
-            floor = residual_roundoff(system, outline.reach)
+            floor = residual_roundoff(system, outline.largest_coordinate)
             if not math.isfinite(floor):
                 raise InputError(
                     "stiffness times size overflows; give smaller numbers or another unit of length",
@@ -169,7 +169,7 @@ class SteppedScene:
         self.roundoff = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
-        self.control = self._control(
+        self.control = self._create_control(
             _positive(f"-{step_option()}", petsc_number(step_option(), ts.getTimeStep())),
             _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
         )
@@ -178,17 +178,17 @@ class SteppedScene:
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
         self.compression = CompressionWatch(self.problem)
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.stability: dict[str, Any] = {}
         if scene.time.analysis == "static":
             self.stability = Stability(reason="the end is not reached").content
         self.totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
-        self._repeated: dict[str, int] = {}
-        self._least = math.inf
+        self._repeats: dict[str, int] = {}
+        self._smallest_dt = math.inf
         self.failure: Failure | None = None
-        self._tried: list[FailedAttempt] = []
+        self._failed_attempts: list[FailedAttempt] = []
         self.stepper.start(0.0, 0)
-        if self.problem.points.n_edges_global and not self.stepper.settle_edges(floor):
+        if self.problem.points.n_edges_global and not self.stepper.balance_edge_moments(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
         for term in system.active.elastic:
             if term.registration.element_vertices:  # friction, which knows of no way before the start
@@ -197,50 +197,50 @@ class SteppedScene:
         if scene.time.static:
             sizes = outline.spacing, outline.size, floor
             self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
-        self._usual = system.integrator
+        self._scene_integrator = system.integrator
         self.ledger = Ledger(system)
         self.guard = EnergyGuard(system) if system.integrator.dynamic else None
 
-    def _control(self, step: float, end: float) -> StepControl:
-        """Plan of the steps: fixed, by a tolerance, or of a load factor."""
+    def _create_control(self, step: float, end: float) -> StepControl:
+        """Create the control of fixed steps, of steps by a tolerance, or of load increments."""
         time, every = self.scene.time, self.scene.output.every
-        # the end of the run is found within a fraction of Δt, which must not be the whole of it
+        # the end of the run is recognised within a fraction of Δt, so Δt must not exceed the run's length
         largest = LARGEST_FRACTION * end if time.adaptive else min(step, end)
         largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
         smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
         smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
-        stops = [*events(self.scene), *self._land]
+        stops = [*event_times(self.scene), *self._stops]
         if time.analysis == "static":
-            most = petsc_number("ts_adapt_dt_max", end)
-            return LoadControl(largest, end, stops, smallest, most)
+            maximum = petsc_number("ts_adapt_dt_max", end)
+            return LoadControl(largest, end, stops, smallest, maximum)
         if time.adaptive:
             return ToleranceControl(step, largest, end, every, stops, smallest)
         return StepControl(largest, end, every, stops, smallest)
 
     def _check_length(self, control: StepControl) -> None:
-        """Refuse what would never end."""
+        """Refuse runs of more than `MAX_STEPS` steps or `MAX_STATES` states."""
         time, every = self.scene.time, self.scene.output.every
-        if time.analysis == "static":  # an increment grows while it is easy
+        if time.analysis == "static":  # increments grow while Newton's method converges easily
             return
         steps = control.end / control.step
-        if steps > MOST_STEPS:
+        if steps > MAX_STEPS:
             names = [f"-{name}" for name in ("ts_adapt_dt_max", *STEP_OPTIONS, "ts_max_time") if is_set(name)]
-            self._refuse_length(f"{steps:.3g} steps", MOST_STEPS, control.step, [*names, "time.step"][0])
+            self._refuse_length(f"{steps:.3g} steps", MAX_STEPS, control.step, [*names, "time.step"][0])
         states = steps if every is None else control.end / every
-        if states > MOST_STATES:
+        if states > MAX_STATES:
             step = control.step if every is None else every
-            self._refuse_length(f"{states:.3g} states", MOST_STATES, step, "output.every")
+            self._refuse_length(f"{states:.3g} states", MAX_STATES, step, "output.every")
 
-    def _refuse_length(self, count: str, most: float, step: float, key: str) -> None:
+    def _refuse_length(self, count: str, maximum: float, step: float, key: str) -> None:
         raise InputError(
-            f"{step:g} s makes {count} in {self.control.end:g} s; at most {most:g} are made: give more",
+            f"{step:g} s makes {count} in {self.control.end:g} s; at most {maximum:g} are made: give more",
             file=None if key.startswith("-") else self.scene.source,
             key=key,
         )
 
     @property
     def budget(self) -> Budget:
-        """Energies and works up to the present state."""
+        """Energies of the present state and works up to it."""
         return self.ledger.budget
 
     @property
@@ -254,20 +254,20 @@ class SteppedScene:
         return self.control.is_end(self.time)
 
     def step(self) -> StepReport:
-        """One accepted step, retried with a smaller Δt where needed.
+        """Take one step, retried with a smaller Δt until it is accepted.
 
         Raises
         ------
         SolverError
-            If even the smallest Δt fails; the state is that before the step.
+            If even the smallest Δt fails; the state is then that before the step.
         """
         started = clock.perf_counter() - COMPILATION.seconds
         system, n = self.problem.system, self.problem.points.n_owned
         x_before, v_before = system.x, system.v
         newton = linear = rejected = halvings = 0
-        self._tried = []
-        system.integrator = self._usual
-        if not self._usual.iterates and system.has_friction_pairs:
+        self._failed_attempts = []
+        system.integrator = self._scene_integrator
+        if not self._scene_integrator.iterates and system.has_friction_pairs:
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
@@ -279,11 +279,11 @@ class SteppedScene:
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
-                if not self._find_way(attempt, end - self.time):
-                    self._recover(attempt, end)
+                if not self._switch_at_crossing(attempt, end - self.time):
+                    self._recover_from_failure(attempt, end)
             else:
-                accurate = self._accurate(v_before[:n], end - self.time)
-                if accurate and self._keeps_energy(x_before, v_before, end):
+                accurate = self._is_accurate(v_before[:n], end - self.time)
+                if accurate and self._conserves_energy(x_before, v_before, end):
                     break
                 system.state.set(x_before[:n], v_before[:n])
                 system.integrator.restore(*past)
@@ -293,23 +293,23 @@ class SteppedScene:
                     if self.local_error is not None and past_slope is not None:
                         self.local_error.restore(*past_slope)
                     assert self.guard is not None
-                    # not under the midpoint rule, which keeps angular momentum
+                    # not under the midpoint rule, which conserves angular momentum
                     last = halvings == HALVINGS - 1
-                    impact = not system.integrator.exact_work and self._take_impact(
-                        end - self.time, self.guard.words, last=last
+                    impact = not system.integrator.exact_work and self._switch_to_backward_euler(
+                        end - self.time, self.guard.message, last=last
                     )
                     if not impact:
-                        self._lessen(end - self.time, halvings)
+                        self._halve_step(end - self.time, halvings)
                         halvings += 1
             rejected += 1
-        if system.integrator is not self._usual:
+        if system.integrator is not self._scene_integrator:
             by_end = system.integrator.order == 1
-            system.integrator = self._usual
-            self._usual.restart()
-            if by_end:  # before velocities jumped at the end, over which stiff damping would accelerate much
+            system.integrator = self._scene_integrator
+            self._scene_integrator.restart()
+            if by_end:  # from stage velocities: those after the impact would give stiff damping huge forces
                 rate = (system.stage_velocity - v_before[:n]) / (end - self.time)
                 moves = system.prescribed.free & (system.mass[:, None] > 0.0)
-                self._usual.set_acceleration(np.where(moves, rate, 0.0))
+                self._scene_integrator.set_acceleration(np.where(moves, rate, 0.0))
             if self.local_error is not None:
                 self.local_error.restart()
         if self._equilibrium is not None and self.control.is_end(end):
@@ -320,20 +320,20 @@ class SteppedScene:
             self.stability = settled.stability.content
             if settled.note:
                 self.notes.append(settled.note)
-        self.control.succeeded(newton)
+        self.control.record_success(newton)
         dt, self.time = end - self.time, end
         self.step_number += 1
         with self.phases("balance"):
             if self.guard is None:
                 self.ledger.record(x_before[:n])
-            when = f"step {self.step_number} ({self._now()})"
-            note = self.compression.check(when, reported="compression" in self._told)
+            when = f"step {self.step_number} ({self._time_text()})"
+            note = self.compression.check(when, reported="compression" in self._reported)
         if note:
-            self._tell_once("compression", note)
-        if attempt.at_roundoff and "roundoff" not in self._told:
-            self._tell_of_roundoff(attempt.residual)
+            self._note_once("compression", note)
+        if attempt.at_roundoff and "roundoff" not in self._reported:
+            self._note_roundoff(attempt.residual)
         if self.stepper.stopped_by:
-            self._tell_once(
+            self._note_once(
                 "option",
                 f"{when}: {self.stepper.stopped_by} stopped Newton's method at a residual of "
                 f"{attempt.residual:.2g} N, short of solver.force_tolerance",
@@ -349,151 +349,166 @@ class SteppedScene:
         for name, number in zip(self.totals, took, strict=False):
             self.totals[name] += int(number)
         stretch = self.compression.smallest, self.compression.largest
-        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.left)
+        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.remaining)
 
-    def _tell_once(self, of: str, note: str) -> None:
-        """Note something unless the run has been told of it, which checkpoints keep."""
-        if of not in self._told:
-            self._told.add(of)
+    def _note_once(self, subject: str, note: str) -> None:
+        """Add a note unless the run has one on this subject; checkpoints hold the subjects."""
+        if subject not in self._reported:
+            self._reported.add(subject)
             self.notes.append(note)
 
-    def _tell_of_roundoff(self, residual: float) -> None:
-        """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
+    def _note_roundoff(self, residual: float) -> None:
+        """Note once that round-off keeps the residual [N] above the scene's force tolerance; collective."""
         loads = float(np.sum(self.problem.system.applied.force**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
-            self._tell_once(
+            self._note_once(
                 "roundoff",
-                f"step {self.step_number} ({self._now()}) ended at round-off: double precision leaves a "
-                f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads",
+                f"step {self.step_number} ({self._time_text()}) ended at round-off: double precision leaves "
+                f"a residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads",
             )
 
-    def _now(self) -> str:
-        """The present time, or load factor, in words."""
+    def _time_text(self) -> str:
+        """Text of the present time, or load factor."""
         moves = self.problem.system.integrator.dynamic
         return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
-    def _accurate(self, v_before: Array, dt: float) -> bool:
-        """Whether the step just taken keeps its share of the tolerance."""
+    def _is_accurate(self, v_before: Array, dt: float) -> bool:
+        """Whether the local error of the step just taken is within its share of the tolerance."""
         control = self.control
         if self.local_error is None or not isinstance(control, ToleranceControl):
             return True
         size = self.problem.outline.size
-        error = self.local_error.of(v_before, dt) / size
+        error = self.local_error.estimate(v_before, dt) / size
         share = (self.scene.time.tolerance or 0.0) * dt / control.end
-        least = self._shortest_over_impacts()
-        stands = control.judge(dt, error / share, self.problem.system.integrator.order, least)
-        if stands:
+        minimum = self._minimum_dt_in_contact()
+        accepted = control.accept(dt, error / share, self.problem.system.integrator.order, minimum)
+        if accepted:
             self.local_error.record_step(v_before, dt)
             self.estimated_error += error
             if error > share:
-                where = "of those that follow impacts " if least > control.smallest else ""
-                self._tell_once(
+                where = "of those that follow impacts " if minimum > control.smallest else ""
+                self._note_once(
                     "error",
                     f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
                     f"the smallest Δt = {dt:.3g} s {where}(-ts_adapt_dt_min)",
                 )
-        return stands
+        return accepted
 
-    def _shortest_over_impacts(self) -> float:
-        """Δt [s] below which automatic steps are not shortened for their error where something touches; 0
-        where nothing does, or ``-ts_adapt_dt_min`` is given; collective.
+    def _minimum_dt_in_contact(self) -> float:
+        """Smallest Δt [s] of adaptive steps while something touches; 0 without contact, or if
+        ``-ts_adapt_dt_min`` is given; collective.
         """
         system = self.problem.system
         if not system.has_active_pairs or is_set("ts_adapt_dt_min"):
             return 0.0
-        return min(FOLLOWED * self._time_through_skin(), FOLLOWED_OF_RUN * self.control.end)
+        return min(IMPACT_SKIN_FRACTION * self._time_through_skin(), IMPACT_RUN_FRACTION * self.control.end)
 
     def _time_through_skin(self) -> float:
-        """Time [s] in which the fastest vertex goes through the skin of a search for contact; collective."""
+        """Time [s] in which the fastest vertex crosses the skin of the contact search; collective."""
         system = self.problem.system
         fastest = float(self.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
         return min(term.skin for term in system.active.limiting) / max(fastest, 1e-300)
 
-    def _keeps_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
-        """Whether the step just taken made no energy."""
+    def _conserves_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
+        """Whether the energy guard accepts the step just taken; if so, it is recorded in the ledger."""
         if self.guard is None:
             return True
         system = self.problem.system
         with self.phases("balance"):
-            kept = self.ledger.kept()
+            snapshot = self.ledger.snapshot()
             after = self.ledger.record(x_before[: system.points.n_owned])
-            balance = self.guard.balance(x_before, v_before, kept[0], after, self.ledger.works)
-            # by shorter steps, and at last by backward Euler where that keeps what the integrator keeps
-            strict = not system.integrator.exact_work or end - self.time > FINER * self.control.step
-            stands = self.guard.stands(balance, strict=strict)
-            if not stands:
-                self.ledger.take_back(kept)
-            return stands
+            balance = self.guard.balance(x_before, v_before, snapshot[0], after, self.ledger.works)
+            # short steps of the midpoint rule are judged leniently: backward Euler would not conserve
+            # angular momentum as they do
+            strict = not system.integrator.exact_work or end - self.time > IMPACT_DT * self.control.step
+            accepted = self.guard.accept(balance, strict=strict)
+            if not accepted:
+                self.ledger.revert(snapshot)
+            return accepted
 
-    def _find_way(self, attempt: Attempt, dt: float) -> bool:
-        """Let another integrator repeat a step of dt [s] in which something would pass; whether one does.
+    def _switch_at_crossing(self, attempt: Attempt, dt: float) -> bool:
+        """Let another integrator repeat a step of dt [s] in which parts would cross; return whether one does.
 
-        The midpoint rule and generalised-α go on from their stage to the end of the step, with small gaps
-        through what held the sheet at the stage. BDF2, of second order, too, has its stage at the end. Where
-        some halvings of Δt resolve the impact it loses more energy than they do.
+        The midpoint rule and generalised-α extrapolate from their stage to the end of the step, with small
+        gaps across the contact that held the sheet at the stage. BDF2, also of second order, has its stage
+        at the end, but dissipates more energy than a few halvings of Δt where these resolve the impact.
         """
-        system, usual = self.problem.system, self._usual
-        if system.integrator is usual and attempt.words.startswith(MEETS):
-            ends, far = system.stage.offset == system.dt, dt > FAR * self._time_through_skin()
-            if ends or self.scene.time.adaptive or not far:
-                return self._take_impact(dt, "finds no way")
+        system, usual = self.problem.system, self._scene_integrator
+        if system.integrator is usual and attempt.message.startswith(WOULD_CROSS):
+            stage_at_end = system.stage.offset == system.dt
+            unresolved = dt > UNRESOLVED_SKINS * self._time_through_skin()
+            if stage_at_end or self.scene.time.adaptive or not unresolved:
+                return self._switch_to_backward_euler(dt, "finds no way")
             from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # of use for nothing else
 
             system.integrator = Bdf2()
-            self._tell_of_impact("finds no way", "bdf2")
+            self._note_impact("finds no way", "bdf2")
             return True
         if system.integrator is usual or system.integrator.order == 1:
             return False
         system.integrator = usual
-        return self._take_impact(dt, "finds no way")
+        return self._switch_to_backward_euler(dt, "finds no way")
 
-    def _take_impact(self, dt: float, why: str, *, last: bool = False) -> bool:
-        """Let backward Euler repeat a short step that failed where something touches; whether it does.
+    def _switch_to_backward_euler(self, dt: float, why: str, *, last: bool = False) -> bool:
+        """Let backward Euler repeat a short step that failed in contact; return whether it does.
 
-        Neither a formula for smooth motions nor one linear solve holds over an impact. Automatic steps are
-        short where they do not become shorter over impacts, or at the ``last`` halving.
+        Neither a formula for smooth motions nor one linear solve is valid over an impact. Adaptive steps are
+        short near their minimum in contact, and at the ``last`` halving.
         """
-        system, usual = self.problem.system, self._usual
+        system, usual = self.problem.system, self._scene_integrator
         if self.scene.time.adaptive:
-            long = not last and dt > 2.0 * self._shortest_over_impacts()
+            long = not last and dt > 2.0 * self._minimum_dt_in_contact()
         else:
-            long = dt > (FINEST if usual.exact_work else FINER) * self.control.step
+            long = dt > (IMPACT_DT_EXACT_WORK if usual.exact_work else IMPACT_DT) * self.control.step
         if long or usual.name == "beuler" or not usual.dynamic or not system.has_active_pairs:
             return False
         if system.integrator is not usual and system.integrator.order == 1:
-            system.integrator = usual  # nor did that help
+            system.integrator = usual  # backward Euler failed, too
             return False
         system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
-        self._tell_of_impact(why, "backward Euler")
+        self._note_impact(why, "backward Euler")
         return True
 
-    def _tell_of_impact(self, why: str, by: str) -> None:
-        """Say once by which integrator such steps are repeated."""
-        self._tell_once(
+    def _note_impact(self, why: str, by: str) -> None:
+        """Note once which integrator repeats steps that fail in contact."""
+        where = f"step {self.step_number + 1} ({self._time_text()}): {self._scene_integrator.name} {why}"
+        self._note_once(
             "impact" if by == "backward Euler" else f"impact {by}",
-            f"step {self.step_number + 1} ({self._now()}): {self._usual.name} {why} where something touches; "
-            f"such steps are repeated by {by}",
+            f"{where} where something touches; such steps are repeated by {by}",
         )
 
-    def _lessen(self, dt: float, halvings: int) -> None:
-        """Halve a step that made energy, or give up; the state is that before it."""
+    def _halve_step(self, dt: float, halvings: int) -> None:
+        """Halve Δt after a step that gained energy; the state is that before it.
+
+        Raises
+        ------
+        SolverError
+            If Δt is as small as it may be.
+        """
         assert self.guard is not None
-        where, scheme = f"step {self.step_number + 1} ({self._now()})", self.scene.time.scheme
+        where, scheme = f"step {self.step_number + 1} ({self._time_text()})", self.scene.time.scheme
         if halvings >= HALVINGS or not self.control.shorten(dt, first=halvings == 0):
             raise SolverError(
-                f"{where}: {scheme} {self.guard.words}, even with Δt = {dt:.3g} s; "
-                f"the state at {self._now()} is kept; try {self.guard.instead}",
+                f"{where}: {scheme} {self.guard.message}, even with Δt = {dt:.3g} s; "
+                f"the state at {self._time_text()} is kept; try {self.guard.remedy}",
                 collective=True,
             )
         if self.guard.gains.repeated == 1:
             self.notes.append(
-                f"{where}: {scheme} {self.guard.words} with Δt = {dt:.3g} s; such steps are repeated with "
-                f"half of it (energy_balance in summary.json has their number); try {self.guard.instead}"
+                f"{where}: {scheme} {self.guard.message} with Δt = {dt:.3g} s; such steps are repeated with "
+                f"half of it (energy_balance in summary.json has their number); try {self.guard.remedy}"
             )
 
-    def _recover(self, attempt: Attempt, end: float) -> None:
-        self._tried.append(FailedAttempt.of(attempt, end - self.time, self.stepper.preset))
+    def _recover_from_failure(self, attempt: Attempt, end: float) -> None:
+        """Change to the next linear solver or halve Δt after a failed attempt.
+
+        Raises
+        ------
+        SolverError
+            If neither is left; `failure` says why.
+        """
+        self._failed_attempts.append(FailedAttempt.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
             previous, slow = self.stepper.preset, self.stepper.convergence.too_slow
             following = self.stepper.next_preset()
@@ -505,47 +520,48 @@ class SteppedScene:
                 )
                 return
         in_vain = self._equilibrium is not None and self._equilibrium.in_vain
-        if in_vain or self.stepper.stopped_by or not self.control.failed():
-            self.failure = self._explain(attempt, end)
+        if in_vain or self.stepper.stopped_by or not self.control.halve_after_failure():
+            self.failure = self._explain_failure(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
-        why = attempt.words or "no solution was found"
-        if attempt.stuck and attempt.stuck.snes_reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
+        why = attempt.message or "no solution was found"
+        solve = attempt.failed_solve
+        if solve and solve.snes_reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
             why += f" ({self._iterations_key} {self.stepper.snes.getTolerances()[3]})"
-        self._repeated[why] = self._repeated.get(why, 0) + 1
-        self._least = min(self._least, self.control.factor * self.control.step)
+        self._repeats[why] = self._repeats.get(why, 0) + 1
+        self._smallest_dt = min(self._smallest_dt, self.control.factor * self.control.step)
 
     @property
     def _iterations_key(self) -> str:
-        """Where the limit of Newton's iterations stands."""
+        """Name of the option or key that limits Newton's iterations."""
         return "-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations"
 
     @property
     def note_of_repeats(self) -> str:
-        """How many attempts so far were repeated with a smaller step, and why; nothing if none was."""
-        if not self._repeated:
+        """How many attempts so far were repeated with a smaller step, and why; empty if none was."""
+        if not self._repeats:
             return ""
-        times = sum(self._repeated.values())
-        often = sorted(self._repeated.items(), key=lambda each: -each[1])
+        times = sum(self._repeats.values())
+        often = sorted(self._repeats.items(), key=lambda each: -each[1])
         reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
         what, unit = ("Δt", " s") if self.problem.system.integrator.dynamic else ("increment", "")
         note = f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "
-        note += f"down to {self._least:.3g}{unit} ({reasons})"
+        note += f"down to {self._smallest_dt:.3g}{unit} ({reasons})"
         if self.scene.time.adaptive or not self.problem.system.integrator.dynamic:
             return note
         planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
         return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
 
-    def _explain(self, attempt: Attempt, end: float) -> Failure:
-        """Why the last attempt at a step failed; collective."""
-        problem, scene, stuck = self.problem, self.scene, attempt.stuck
-        assert stuck is not None
+    def _explain_failure(self, attempt: Attempt, end: float) -> Failure:
+        """Report on the last failed attempt at a step; collective."""
+        problem, scene, solve = self.problem, self.scene, attempt.failed_solve
+        assert solve is not None
         system, outline, stepper = problem.system, problem.outline, self.stepper
         diagnosis = diagnose(
-            problem.points, problem.membrane, system.held, stuck, system.x, system.mass, problem.tags
+            problem.points, problem.membrane, system.held, solve, system.x, system.mass, problem.tags
         )
         near = worst_pair(system)
         between_sheets = near is not None and not near.obstacle
-        room = [more_room(near, scene)] if near is not None and near.blocks else []
+        on_contact = [contact_advice(near, scene)] if near is not None and near.blocks else []
         now = Circumstances(
             dt=end - self.time,
             nominal=self.control.step,
@@ -562,22 +578,22 @@ class SteppedScene:
             time=self.time,
             dt=now.dt,
             static=not system.integrator.dynamic,
-            kind=trouble(diagnosis, stuck),
-            tried=self._tried,
+            kind=failure_kind(diagnosis, solve),
+            tried=self._failed_attempts,
             diagnosis=diagnosis,
             advice=[
                 *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
-                # forces grow without bounds where parts would pass, whatever the numbers of the scene
-                *(room or advice(diagnosis, stuck, scene, now)),
+                # contact forces grow without bounds where parts would cross, so other advice would mislead
+                *(on_contact or advice(diagnosis, solve, scene, now)),
             ],
             sources=outline.sources,
-            stuck=stuck,
+            failed_solve=solve,
             near=near,
             obstacle=nearest_obstacle(system) if between_sheets else None,
         )
 
     def memory(self) -> dict[str, Any]:
-        """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""
+        """Numbers of a checkpoint, besides positions and velocities, to continue as if never stopped."""
         equilibrium = self._equilibrium
         return {
             "time": self.time,
@@ -585,25 +601,25 @@ class SteppedScene:
             "budget": self.ledger.memory()[1],
             "totals": dict(self.totals),
             "stability": self.stability,
-            "repeated": dict(self._repeated),
-            "least": self._least if self._repeated else None,
+            "repeated": dict(self._repeats),
+            "least": self._smallest_dt if self._repeats else None,
             "notes": list(self.notes),
-            "told": sorted(self._told),
+            "told": sorted(self._reported),
             **self.control.memory(),
             "estimated_error": self.estimated_error,
-            "integrator": self._numbers(),
+            "integrator": self._integrator_numbers(),
             **self.stepper.memory(self.time)[1],
             **({} if equilibrium is None else {"equilibrium": equilibrium.memory(self.time)[1]}),
             "energy": None if self.guard is None else self.guard.memory(),
             "late_starts": sorted(self.problem.system.reference.late),
         }
 
-    def _numbers(self) -> dict[str, float]:
+    def _integrator_numbers(self) -> dict[str, float]:
         numbers = self.problem.system.integrator.memory()[1]
         return numbers if self.local_error is None else numbers | self.local_error.memory()[1]
 
     def arrays(self) -> dict[str, Array]:
-        """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
+        """Arrays (n_owned, 3) of a checkpoint besides positions and velocities."""
         arrays = dict(self.problem.system.integrator.memory()[0])
         arrays |= self.ledger.memory()[0] | self.stepper.memory(self.time)[0]
         if self._equilibrium is not None:
@@ -619,22 +635,22 @@ class SteppedScene:
         edges: Mapping[str, Array] = MappingProxyType({}),
         elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
     ) -> None:
-        """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
+        """Continue from a checkpoint whose x and v of owned rows are in ``problem.system`` already."""
         system = self.problem.system
         system.state.update_ghosts()
         term_memory.restore_fixed(system, edges, elements)
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
-        # loads and handles that a changed scene lets start before now start here; the others have started
+        # loads and handles which only the changed scene lets start earlier start now; the others have started
         system.set_references(self.time)
         system.hold_targets(self.time)
-        refuse_contact(system, self.scene, f"at {self._now()}")
+        refuse_contact(system, self.scene, f"at {self._time_text()}")
         self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)
         if self._equilibrium is not None:
             self._equilibrium.restore(arrays, memory.get("equilibrium", {}), self.time)
         self.estimated_error = float(memory["estimated_error"])
         system.integrator.restore(arrays, memory["integrator"])
-        if self.guard is not None and memory.get("energy"):  # older ones have none
+        if self.guard is not None and memory.get("energy"):  # older checkpoints have none
             same = memory.get("scheme") == self.scene.time.scheme
             self.guard.restore(memory["energy"], same=same)
         if self.local_error is not None:
@@ -643,19 +659,19 @@ class SteppedScene:
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
         self.stability = self.stability and memory.get("stability", self.stability)
-        self._repeated = {str(why): int(count) for why, count in memory.get("repeated", {}).items()}
-        self._least = math.inf if memory.get("least") is None else float(memory["least"])
-        self._told |= set(memory.get("told", ()))
+        self._repeats = {str(why): int(count) for why, count in memory.get("repeated", {}).items()}
+        self._smallest_dt = math.inf if memory.get("least") is None else float(memory["least"])
+        self._reported |= set(memory.get("told", ()))
         earlier = [str(note) for note in memory.get("notes", ())]
         self.earlier_notes = len(earlier)
         self.notes[:] = [*earlier, *(note for note in self.notes if note not in earlier)]
 
     def destroy(self) -> None:
-        """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""
+        """Free all PETSc and MPI objects and remove the scene's PETSc options; collective."""
         self.stepper.destroy()
         self.problem.discretisation.destroy()
-        self._take_back_options()
+        self._remove_filled_options()
 
-    def _take_back_options(self) -> None:
+    def _remove_filled_options(self) -> None:
         for name in self._filled:
             PETSc.Options().delValue(name)

@@ -200,7 +200,7 @@ class StageEquations:
 
     def set_references(self, time: float) -> None:
         """Take the present positions as reference of handles that start to act by ``time`` [s]."""
-        self.reference.until(time, self.x)
+        self.reference.record_starts(time, self.x)
 
     def hold_targets(self, time: float) -> None:
         """Put moving targets at their positions at ``time`` [s], between two steps; collective."""
@@ -263,10 +263,10 @@ class StageEquations:
         self.points.update_ghosts(v)
         x, turns = self._frozen_positions(at), bool(self.active.pushing)
         if turns:  # at the stage an obstacle may be where the sheet still is now
-            self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
+            self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
         total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
         if turns:
-            self.active.turn_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
+            self.active.move_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         force, mass = np.where(self.prescribed.free, -total, 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
@@ -490,7 +490,7 @@ class StageEquations:
         self.history = np.zeros((n, 3))
         self._xh = resized(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
-        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
+        self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
         self._solving_edges = True
         self.prescribed.set_velocity_to_goal(self._xh[:n], dt)
@@ -534,7 +534,7 @@ class StageEquations:
         if self.stage.offset == self.dt or not (self.active.moving or self.active.constraints):
             return 0.0
         before = self.active.moving_energy(self.x)
-        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
+        self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
 
     @property

@@ -23,13 +23,13 @@ class State:
         self.x, self.v = np.zeros((n_local, 3)), np.zeros((n_local, 3))
 
     def update_ghosts(self) -> None:
-        """Let ghosts be what their owners have; collective."""
+        """Copy the owners' values to the ghost rows; collective."""
         layout = self._discretisation.layout
         for values in (self.x, self.v):
             layout.update_ghosts(values)
 
     def resize(self) -> None:
-        """Follow the layout to other ghosts; collective."""
+        """Resize to the layout's present ghosts; collective."""
         layout = self._discretisation.layout
         self.x, self.v = (
             resized(self.x, layout.n_owned, layout.n_local),
@@ -38,14 +38,14 @@ class State:
         self.update_ghosts()
 
     def set(self, x: Array, v: Array) -> None:
-        """Take positions and velocities (n_owned, 3); collective. The arrays before stay what they are."""
+        """Set positions and velocities (n_owned, 3), in new arrays; collective."""
         layout = self._discretisation.layout
         self.x, self.v = (resized(values, layout.n_owned, layout.n_local) for values in (x, v))
         self.update_ghosts()
 
 
 def resized(values: Array, n_owned: int, n_local: int) -> Array:
-    """The owned rows of an array, with room for so many local rows."""
+    """Copy of an array's owned rows, followed by zeros up to n_local rows."""
     out = np.zeros((n_local, 3))
     out[:n_owned] = values[:n_owned]
     return out

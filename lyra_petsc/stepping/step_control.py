@@ -1,4 +1,4 @@
-"""Which step comes next: its length, where it must land, and what a failure or an error makes of it."""
+"""Step control: the length of the next step, from output times, events, failures and estimated errors."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import math
 from collections.abc import Iterable, Mapping
 
 SLACK = 1e-6
-"""Fraction of Δt by which a step may differ from its length to avoid an extra tiny one."""
+"""Fraction of Δt by which a step may be longer to avoid an extra tiny one."""
 
 GROW_AFTER = 2
 """Successful steps after which a shortened Δt is doubled."""
 
 HALVINGS = 6
-"""How many times a step that was solved and is not good is halved."""
+"""How many times a step is halved that was solved, but rejected for its energy."""
 
-MOST_PATIENCE = 128
-"""The most such steps, after others that were repeated because of their energy."""
+MAX_PATIENCE = 128
+"""Upper bound of the successful steps before a Δt shortened because of energy is doubled."""
 
 SAFETY = 0.85
 SHRINK, GROW = 0.2, 2.0
-"""By how much a tolerance may change Δt at once; BDF2 is stable up to a factor of 2.4."""
+"""Bounds of the ratio of successive Δt in adaptive steps; BDF2 is stable up to 2.4."""
 
 
 class StepControl:
-    """Plans the end of each step of a nominal length; halved after a failure.
+    """Plans the end of each step from a nominal Δt, which is halved after a failure.
 
     Parameters
     ----------
@@ -33,18 +33,18 @@ class StepControl:
     end : float
         Last time [s].
     every : float or None
-        States are written at its multiples [s]; None: at every step.
+        States are written at multiples of this time [s]; None: at every step.
     events : iterable of float
         Further times [s] on which a step must end.
     smallest : float
-        Δt [s] below which no retry is made.
+        Smallest Δt [s] of a retry.
 
     Attributes
     ----------
     factor : float
         Present Δt over the nominal one.
-    good : int
-        Successful steps since it last changed.
+    successes : int
+        Successful steps since the factor last changed.
     patience : int
         Successful steps after which a shortened Δt is doubled.
     """
@@ -55,17 +55,17 @@ class StepControl:
         self.step, self.end, self._every, self.smallest = step, end, every, smallest
         self._events = sorted({t for t in events if 0.0 < t < end} | {end})
         self.factor = 1.0
-        self.good, self.patience = 0, GROW_AFTER
+        self.successes, self.patience = 0, GROW_AFTER
 
     def next_end(self, time: float) -> float:
         """End of the step that starts at ``time`` [s]."""
         dt = self.step * self.factor
         target = min(self._next_event(time), self._next_state(time))
-        # landing exactly on the event also when it lies a rounding beyond the step
-        return target if target - time <= dt * (1.0 + SLACK) else time + self._part(dt, target - time)
+        # end exactly at the event even if it is a round-off error beyond the step
+        return target if target - time <= dt * (1.0 + SLACK) else time + self._partial_step(dt, target - time)
 
-    def _part(self, dt: float, left: float) -> float:
-        """Length of a step that does not reach what lies ``left`` [s] ahead."""
+    def _partial_step(self, dt: float, remaining: float) -> float:
+        """Length [s] of a step of at most dt that ends before the next target, ``remaining`` [s] ahead."""
         return dt
 
     def _next_event(self, time: float) -> float:
@@ -85,56 +85,60 @@ class StepControl:
         return abs(multiple - round(multiple)) <= SLACK
 
     def is_end(self, time: float) -> bool:
-        """Whether the run is over."""
+        """Whether ``time`` [s] is the end of the run."""
         return time >= self.end - SLACK * min(self.step, self.smallest)
 
-    def failed(self) -> bool:
-        """Halve Δt after a failed attempt; False if it is as small as it may be."""
-        self.good = 0
+    def halve_after_failure(self) -> bool:
+        """Halve Δt after a failed attempt; return False if it is as small as it may be."""
+        self.successes = 0
         if 0.5 * self.factor * self.step < self.smallest:
             return False
         self.factor *= 0.5
         return True
 
     def shorten(self, dt: float, *, first: bool) -> bool:
-        """Halve a step of dt [s] that was solved and is not good; False if it is as small as it may be.
-
-        After each step for which that is the ``first`` time a larger Δt is tried later.
+        """Halve a step of dt [s] that was solved, but rejected for its energy; return False if it is as small
+        as it may be. ``first``: it is the step's first halving, after which a larger Δt is tried later.
         """
-        self.good = 0
+        self.successes = 0
         if first:
-            self.patience = min(2 * self.patience, MOST_PATIENCE)
-        if 0.5 * dt < self.smallest or self._halved(dt) >= HALVINGS:
+            self.patience = min(2 * self.patience, MAX_PATIENCE)
+        if 0.5 * dt < self.smallest or self._halvings(dt) >= HALVINGS:
             return False
         self.factor = 0.5 * dt / self.step
         return True
 
-    def _halved(self, dt: float) -> int:
-        """How many times the nominal step was halved to dt [s], unless it was cut short to land somewhere."""
+    def _halvings(self, dt: float) -> int:
+        """Halvings from the nominal step to dt [s]; 0 for a step that was cut to end at an event."""
         return round(math.log2(self.step / dt)) if dt >= self.factor * self.step * (1.0 - SLACK) else 0
 
-    def succeeded(self, iterations: int) -> None:
-        """Let a shortened Δt recover."""
-        self.good += 1
-        if self.factor < 1.0 and self.good >= self.patience:
+    def record_success(self, iterations: int) -> None:
+        """Double a shortened Δt after enough successful steps."""
+        self.successes += 1
+        if self.factor < 1.0 and self.successes >= self.patience:
             self.factor = min(1.0, 2.0 * self.factor)
-            self.good = 0
+            self.successes = 0
 
     def memory(self) -> dict[str, float]:
-        """What a checkpoint must hold to go on alike."""
-        return {"factor": self.factor, "good": self.good, "patience": self.patience, "nominal": self.step}
+        """Numbers of a checkpoint."""
+        return {
+            "factor": self.factor,
+            "good": self.successes,
+            "patience": self.patience,
+            "nominal": self.step,
+        }
 
     def restore(self, memory: Mapping[str, float]) -> None:
-        """Go on with a memory; one of another nominal step has no say."""
+        """Restore a checkpoint's memory, unless its nominal step is another."""
         if float(memory.get("nominal", self.step)) == self.step:
-            self.factor, self.good = float(memory["factor"]), int(memory["good"])
+            self.factor, self.successes = float(memory["factor"]), int(memory["good"])
             self.patience = int(memory.get("patience", GROW_AFTER))
 
 
 class ToleranceControl(StepControl):
     """Chooses Δt such that local errors add up to a tolerance by the end.
 
-    ``step`` is the largest Δt; ``factor`` begins at ``first`` over it.
+    ``first`` and ``step`` are the first and the largest Δt [s].
     """
 
     def __init__(
@@ -149,32 +153,32 @@ class ToleranceControl(StepControl):
         super().__init__(step, end, every, events, smallest)
         self.factor = min(1.0, first / step)
 
-    def _part(self, dt: float, left: float) -> float:
-        # two equal steps rather than a full one and a crumb
-        return 0.5 * left if left < 2.0 * dt else dt
+    def _partial_step(self, dt: float, remaining: float) -> float:
+        # two equal steps rather than a full one and a tiny one
+        return 0.5 * remaining if remaining < 2.0 * dt else dt
 
-    def judge(self, dt: float, ratio: float, order: int, least: float = 0.0) -> bool:
-        """Whether a step of length dt [s] may stand, with its error over what it may be; plans the next.
+    def accept(self, dt: float, ratio: float, order: int, minimum: float = 0.0) -> bool:
+        """Whether to accept a step of dt [s], ``ratio`` its error over the allowed one; plans the next.
 
-        A step that cannot be shortened, or not below ``least`` [s], stands whatever its error.
+        A step that cannot be shortened, or not below ``minimum`` [s], is accepted whatever its error.
         """
-        least = max(least, self.smallest)
+        minimum = max(minimum, self.smallest)
         planned = self.factor * self.step
         allowed = math.inf if ratio == 0.0 else dt * SAFETY * ratio ** (-1.0 / order)
-        stands = ratio <= 1.0 or dt <= least * (1.0 + SLACK)
-        # a step shortened to end at an output time is no reason against the longer one planned
-        most = max(GROW * dt, planned) if stands else 0.9 * dt
-        self.factor = max(min(max(allowed, SHRINK * dt), most, self.step), least) / self.step
-        return stands
+        accepted = ratio <= 1.0 or dt <= minimum * (1.0 + SLACK)
+        # a step that was cut to end at an output time does not shorten the planned one
+        maximum = max(GROW * dt, planned) if accepted else 0.9 * dt
+        self.factor = max(min(max(allowed, SHRINK * dt), maximum, self.step), minimum) / self.step
+        return accepted
 
-    def succeeded(self, iterations: int) -> None:
-        """The error alone decides."""
+    def record_success(self, iterations: int) -> None:
+        """Do nothing: the error alone determines Δt."""
 
-    def _halved(self, dt: float) -> int:
+    def _halvings(self, dt: float) -> int:
         return 0
 
     def restore(self, memory: Mapping[str, float]) -> None:
-        """Go on with a memory; one of another largest step says how long the last was."""
+        """Restore a checkpoint's memory; if its largest step is another, only the length of the next step."""
         super().restore(memory)
         nominal = float(memory.get("nominal", self.step))
         if nominal != self.step:
@@ -183,10 +187,10 @@ class ToleranceControl(StepControl):
 
 
 class LoadControl(StepControl):
-    """Increments of the load factor: larger after an easy step, halved after a failure.
+    """Plans increments of the load factor: doubled after an easy step, halved after a failure.
 
-    ``step`` is the first increment, and the largest one after an event, ``largest`` the largest of all;
-    ``factor`` may grow beyond 1.
+    ``step`` is the first increment and the largest one after an event, ``largest`` the largest of all;
+    ``factor`` may exceed 1.
     """
 
     EASY = 12
@@ -199,10 +203,10 @@ class LoadControl(StepControl):
         self._largest = largest
 
     def next_end(self, time: float) -> float:
-        if time in self._events:  # where motions and loads may turn: equilibria lead elsewhere
+        if time in self._events:  # motions and loads may turn here, and with them the path of equilibria
             self.factor = min(self.factor, 1.0)
         return super().next_end(time)
 
-    def succeeded(self, iterations: int) -> None:
+    def record_success(self, iterations: int) -> None:
         larger = 2.0 * self.factor if iterations <= self.EASY else self.factor
         self.factor = min(larger, self._largest / self.step)

@@ -1,4 +1,4 @@
-"""PETSc TS, SNES, KSP and Mat of a run, owned here, and one attempt at a step."""
+"""The stepper: owns PETSc's TS, SNES, KSP and Mat of a run, and makes one attempt at a step."""
 
 from __future__ import annotations
 
@@ -29,35 +29,49 @@ from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.ts_options import hidden
+from lyra_petsc.stepping.ts_options import hidden_options
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """Outcome of one attempt at a step."""
+    """Outcome of one attempt at a step.
+
+    Attributes
+    ----------
+    residual : float
+        Norm [N] of the last residual.
+    remaining : float
+        Estimated displacement [m] of further Newton iterations.
+    message : str
+        Why the attempt failed; else empty.
+    at_roundoff : bool
+        Whether the solve ended because the residual was round-off.
+    failed_solve : FailedSolve or None
+        The last iterate and residual of a failed attempt.
+    """
 
     converged: bool
     newton_iterations: int
     linear_iterations: int
     residual: float
-    left: float = math.inf
-    words: str = ""
+    remaining: float = math.inf
+    message: str = ""
     at_roundoff: bool = False
-    stuck: FailedSolve | None = None
+    failed_solve: FailedSolve | None = None
 
 
-FIRST_OF_ALL = 1e-3
-"""First Δt of an adaptive run over its length; the estimate corrects it at once."""
+FIRST_DT_FRACTION = 1e-3
+"""First Δt of an adaptive run over its length; the error estimate corrects it at once."""
 
-
-MEETS = "something would pass through the sheet"
+WOULD_CROSS = "something would pass through the sheet"
+"""Message of an attempt whose step would lead through a contact."""
 
 
 class Stepper:
-    """Each step's stage by TSBEULER or TSTHETA on the stage equations.
+    """Solves each step's stage equations by TSBEULER or TSTHETA.
 
-    TSBDF and TSALPHA2 keep their histories where neither a checkpoint nor a changed linear solver reaches
-    them; ours are in the integrator, and TS solves for the stage.
+    TSBDF and TSALPHA2 are not used, as neither checkpoints nor a changed linear solver reach their histories;
+    the integrator holds these instead, and TS only solves for the stage.
 
     Parameters
     ----------
@@ -78,9 +92,9 @@ class Stepper:
     preset : str
         Name of the linear solver in use.
     presets : list of str
-        It and those still to try when it breaks down.
+        The linear solver in use and those to try next if it breaks down.
     our_options : list of str
-        Options this class filled in.
+        Options that this class set because the user did not.
 
     Raises
     ------
@@ -94,7 +108,8 @@ class Stepper:
         self._scene, self._equations, self._surface = scene, equations, surface
         self._spacing, self._floor = spacing, floor
         self._iterates = equations.integrator.iterates
-        self._left: tuple[list[str], dict[str, float]] | None = None  # while it solves otherwise than usual
+        # presets and state of Newton's method, while another integrator replaces the scene's
+        self._suspended: tuple[list[str], dict[str, float]] | None = None
         points = equations.points
         self.presets = self._candidates()
         self._blend = Blend(self._hessian)
@@ -103,7 +118,7 @@ class Stepper:
         self._linear_failed = False
         self._shape = (points.n_owned, 3)
         self._extrapolation = Extrapolation(points.comm)
-        self._create()
+        self._create_objects()
 
     # -- objects -------------------------------------------------------------------------------------
 
@@ -113,7 +128,7 @@ class Stepper:
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
         return presets.candidates(
-            points.n_vertices_global if static else points.n_global,  # edges hardly add to the factors
+            points.n_vertices_global if static else points.n_global,  # edges hardly enlarge the factors
             points.comm.size,
             static=static,
             newton=self._iterates,
@@ -126,24 +141,24 @@ class Stepper:
         return self._scene.solver.hessian if self._iterates else "regularised"
 
     def follow_integrator(self) -> None:
-        """Solve by Newton's method or by one linear solve, as the present integrator does; collective."""
+        """Change between Newton's method and one linear solve as the integrator demands; collective."""
         if self._equations.integrator.iterates == self._iterates:
             return
         time, step = self.ts.getTime(), self.ts.getStepNumber()
-        left, memory = self._left, self._newton.memory()
+        suspended, memory = self._suspended, self._newton.memory()
         self.destroy()
         self._iterates = not self._iterates
         self._blend = Blend(self._hessian)
-        if left is None:
-            self._left, self.presets = (self.presets, memory), self._candidates()
+        if suspended is None:
+            self._suspended, self.presets = (self.presets, memory), self._candidates()
         else:
-            self._left, (self.presets, memory) = None, left
-        self._create()
-        if left is not None:
+            self._suspended, (self.presets, memory) = None, suspended
+        self._create_objects()
+        if suspended is not None:
             self._newton.restore(memory)
         self.start(time, step)
 
-    def _create(self) -> None:
+    def _create_objects(self) -> None:
         equations, scene = self._equations, self._scene
         points = equations.points
         self.preset = self.presets[0]
@@ -163,7 +178,7 @@ class Stepper:
         ts.setIFunction(self._ifunction, self.residual)
         self._set_jacobian()
         ts.setMaxTime(scene.time.end)
-        ts.setTimeStep(FIRST_OF_ALL * scene.time.end if scene.time.step == "auto" else scene.time.step)
+        ts.setTimeStep(FIRST_DT_FRACTION * scene.time.end if scene.time.step == "auto" else scene.time.step)
         ts.setMaxSteps(np.iinfo(PETSc.IntType).max - 1)
         ts.setMaxSNESFailures(1)
         ts.setErrorIfStepFails(False)
@@ -196,23 +211,23 @@ class Stepper:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(newton.globalisation.objective)
-            # to be seen; those of options are looked at besides. PETSc takes no rtol from 1 on
+            # shown by -snes_view, and compared with what options set. PETSc accepts only rtol < 1
             rtol, stol = min(scene.solver.force_tolerance, 0.99), scene.solver.step_tolerance
             snes.setTolerances(rtol=rtol, atol=self._floor, stol=stol, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(newton.converged)
             snes.setLineSearchPreCheck(newton.correct_direction)
-            # a Hessian that is not positive definite costs an iteration, not the step
+            # an indefinite Hessian costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
             ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=ONCE, max_it=5000)
             ksp.setInitialGuessNonzero(True)
-        # what PETSc frees when Python is gone must not call it
-        self._at_exit = weakref.finalize(self, _forget_python, ksp)
+        # objects that PETSc frees after Python has ended must not call Python
+        self._at_exit = weakref.finalize(self, _remove_python_types, ksp)
         try:
             self.velocity.setFromOptions()
-            with hidden():
+            with hidden_options():
                 ts.setFromOptions()
             self.linear.attach(ksp)
         except Exception as error:
@@ -222,7 +237,7 @@ class Stepper:
             self.destroy()
             raise problem from None
         if ksp.getType() in presets.CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
-            # a preconditioner near breakdown makes the preconditioned norm meaningless
+            # the preconditioned norm is meaningless if the preconditioner is near breakdown
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ts.setSolution(self.velocity)
 
@@ -230,14 +245,14 @@ class Stepper:
         self.ts.setIJacobian(self._ijacobian, self.linear.operator.mat, self.linear.preconditioner.mat)
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
-        """Before a Newton iteration; collective."""
+        """Update stencils and frames before a Newton iteration; collective."""
         self._follow_stencils()
         if iteration > 0 and self._equations.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
 
     def _follow_stencils(self) -> bool:
-        """Let the matrices be those of the present stencils; whether they are others; collective."""
+        """Renew the matrices if stencils have changed; return whether they have; collective."""
         if not self.linear.update_pattern():
             return False
         self._set_jacobian()
@@ -248,18 +263,18 @@ class Stepper:
         self.our_options += [name for name in self._filled if name not in self.our_options]
 
     def next_preset(self) -> str | None:
-        """Change to the next linear solver; its name, or None if there is none left; collective."""
+        """Change to the next linear solver and return its name, or None if none is left; collective."""
         if len(self.presets) < 2:
             return None
         time, step = self.ts.getTime(), self.ts.getStepNumber()
         self.destroy()
         self.presets.pop(0)
-        self._create()
+        self._create_objects()
         self.start(time, step)
         return self.preset
 
     def destroy(self) -> None:
-        """Free all PETSc objects and take back the options that were filled in; collective."""
+        """Free all PETSc objects and remove the options that were filled in; collective."""
         database = PETSc.Options()
         for name in self._filled:
             database.delValue(name)
@@ -279,54 +294,54 @@ class Stepper:
         self.velocity.setArray(self._equations.v[: self._shape[0]].ravel())
 
     def attempt(self, t0: float, t1: float) -> Attempt:
-        """Try the step from t0 to t1 [s]; on success the state is the new one; collective."""
+        """Try the step from t0 to t1 [s]; the state changes only on success; collective."""
         equations = self._equations
         with PETSc.Log.Event(FROZEN):
             equations.begin_step(t0, t1)
         number = self.ts.getStepNumber()
         before = equations.x[: self._shape[0]].copy() if equations.solves_edges_at_end else None
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
-        stuck: FailedSolve | None = None
+        failed: FailedSolve | None = None
         if equations.discretisation.limits_motion and not equations.find_start():
             self._trace.begin_solve()
-            stuck = self._trace.failed_solve(equations.stationary_velocity())
-            return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=stuck)
-        velocity, words = self._solve(t0)
+            failed = self._trace.failed_solve(equations.stationary_velocity())
+            return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
+        velocity, message = self._solve(t0)
         if (
             velocity is not None
             and equations.discretisation.limits_motion
             and not equations.end_is_collision_free(velocity)
         ):
-            velocity, words = None, MEETS
+            velocity, message = None, WOULD_CROSS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.remaining, outcome.at_roundoff
         if velocity is not None:
             if not self._iterates and equations.active.with_edges:
-                velocity = self._with_triangles(velocity)
+                velocity = self._turn_directors(velocity)
             equations.accept(velocity)
             if before is not None:
                 assert rate_before is not None
                 equations.begin_edge_solve(before)
-                rates, words = self._solve(t0)
+                rates, message = self._solve(t0)
                 newton, linear = (
                     newton + self.snes.getIterationNumber(),
                     linear + self._newton.linear_iterations,
                 )
                 if rates is None:
-                    stuck, velocity = self._trace.failed_solve(), None
+                    failed, velocity = self._trace.failed_solve(), None
                 equations.end_edge_solve(rates)
                 if rates is None:
                     equations.state.set(before, rate_before)
         else:
-            stuck = self._trace.failed_solve()
+            failed = self._trace.failed_solve()
         self.ts.setTimeStep(t1 - t0)
         if velocity is not None:
             self.velocity.setArray(equations.v[: self._shape[0]].ravel())
             self.ts.setTime(t1)
             self.ts.setStepNumber(number + 1)
-            norm, left, at_roundoff = ended
-            return Attempt(True, newton, linear, norm, left, at_roundoff=at_roundoff)
+            norm, remaining, at_roundoff = ended
+            return Attempt(True, newton, linear, norm, remaining, at_roundoff=at_roundoff)
         self.ts.setTime(t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
@@ -337,21 +352,23 @@ class Stepper:
         ):
             self.linear.reuse.discard()
             return self.attempt(t0, t1)
-        return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
+        return Attempt(False, newton, linear, outcome.norm, message=message, failed_solve=failed)
 
-    def _with_triangles(self, velocity: Array) -> Array:
-        """Velocities (n_owned, 3) with directors that go far turned with their triangles; collective."""
+    def _turn_directors(self, velocity: Array) -> Array:
+        """Velocities (n_owned, 3) whose directors turn with their triangles if they turn far; collective."""
         equations = self._equations
         staying = equations.stationary_velocity()
-        way = velocity - staying
-        if equations.turn_directors(staying, way):
-            velocity = staying + way
+        increment = velocity - staying
+        if equations.turn_directors(staying, increment):
+            velocity = staying + increment
         equations.evaluate_at(velocity)
         equations.update_frames()
         return velocity
 
-    def settle_edges(self, floor: float) -> bool:
-        """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
+    def balance_edge_moments(self, floor: float) -> bool:
+        """Solve for edge unknowns until moments on edges balance at the start shape, to ``floor`` [N];
+        return whether they do; collective.
+        """
         equations, n = self._equations, self._shape[0]
         before = np.inf
         while floor < (moments := equations.initial_edge_moments()) < before:
@@ -369,7 +386,7 @@ class Stepper:
         equations, stage = self._equations, self._equations.stage
         self._follow_stencils()
         self.velocity.setArray(equations.history.ravel())
-        # a TS step that ends where its stage shall be, with the shift that the integrator wants
+        # a TS step whose stage is at the integrator's time and whose shift is the integrator's σ
         theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
         self.ts.setTime(t0 + stage.offset - theta * length)
@@ -410,12 +427,12 @@ class Stepper:
         return velocity, ""
 
     def memory(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Arrays (n_owned, 3) and numbers with which the steps after ``time`` [s] go on alike; collective."""
+        """Arrays (n_owned, 3) and numbers of a checkpoint at ``time`` [s]; collective."""
         arrays: dict[str, Array] = {}
-        names, newton = self._left or (self.presets, self._newton.memory())
+        names, newton = self._suspended or (self.presets, self._newton.memory())
         numbers: dict[str, Any] = {"preset": names[0], **newton}
-        self.linear.reuse.discard()  # who goes on from here has none
-        if not self._iterates or self._left is not None:
+        self.linear.reuse.discard()  # a resumed run has no preconditioner to reuse, and must behave alike
+        if not self._iterates or self._suspended is not None:
             self._extrapolation.record(time, self._equations.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()
         return arrays, numbers
@@ -423,7 +440,7 @@ class Stepper:
     def restore(
         self, arrays: Mapping[str, Array], numbers: Mapping[str, Any], time: float, step: int
     ) -> None:
-        """Go on with a memory from the state at ``time`` [s], after ``step`` steps; collective."""
+        """Restore a checkpoint's memory for the state at ``time`` [s], after ``step`` steps; collective."""
         while numbers["preset"] in self.presets[1:]:
             self.next_preset()
         self._newton.restore(numbers)
@@ -433,13 +450,13 @@ class Stepper:
         self.start(time, step)
 
     def tangent(self, force: Array) -> tuple[Array | None, int]:
-        """How far (n_owned, 3) [m] a small force (n_owned, 3) [N] leads from where the last solve ended, by
-        the factors it had, if any, and linear iterations; collective.
+        """Linear response (n_owned, 3) [m] to a small force (n_owned, 3) [N] at the end of the last solve, by
+        its factors, or None without; and the number of linear iterations; collective.
         """
         return self._newton.tangent(force)
 
-    def lowest(self) -> Array | None:
-        """Positions (n_owned, 3) of the iterate of least energy of the last solve, if that is less than where
+    def lowest_energy_positions(self) -> Array | None:
+        """Positions (n_owned, 3) of the iterate of least energy in the last solve, or None if that is where
         Newton's method started; collective.
         """
         velocity = self._newton.globalisation.lowest_iterate()
@@ -450,12 +467,12 @@ class Stepper:
 
     @property
     def convergence(self) -> Convergence:
-        """The test that ends its nonlinear solves."""
+        """The convergence test of the nonlinear solves."""
         return self._newton.convergence
 
     @property
     def stopped_by(self) -> str:
-        """The option that ended the last solve short of the scene's force tolerance; or nothing."""
+        """The option that ended the last solve short of the scene's force tolerance; else empty."""
         return self._newton.convergence.stopped_by
 
     @property
@@ -485,7 +502,7 @@ class Stepper:
         if first_guess(self._equations, guess):
             self._newton.curve_guess(self._equations.stationary_velocity(), guess)
         if not self._iterates:
-            # the linear solve starts there; its tolerance stays relative to the whole
+            # the linear solve starts from the extrapolation; its tolerance stays relative to the full step
             equations = self._equations
             ahead = self._extrapolation.extrapolate(equations.t1, equations.t0, equations.v[: len(guess)])
             equations.prescribe(ahead)
@@ -500,8 +517,8 @@ class Stepper:
         return True
 
 
-def _forget_python(ksp: PETSc.KSP) -> None:
-    """Let a KSP and its PC be of types that run no Python; collective."""
+def _remove_python_types(ksp: PETSc.KSP) -> None:
+    """Change a KSP and its PC of Python type to types without Python; collective."""
     pc = ksp.getPC()
     if pc.getType() == PETSc.PC.Type.PYTHON:
         pc.setType(PETSc.PC.Type.NONE)
@@ -510,7 +527,7 @@ def _forget_python(ksp: PETSc.KSP) -> None:
 
 
 def _runs_foreign_python() -> bool:
-    """Whether PETSc calls Python that is not this program's."""
+    """Whether PETSc calls Python code of the user's."""
     options = PETSc.Options().getAll()
     return any(
         value != presets.PYTHON_TYPE for name, value in options.items() if name.endswith(PYTHON_SUFFIXES)

@@ -15,7 +15,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
 
 
-def of_vertices(system: StageEquations) -> dict[str, Array]:
+def vertex_arrays(system: StageEquations) -> dict[str, Array]:
     """Arrays (n_vertices, 3) of the owned vertices."""
     return {
         f"{term.name}.{name}": values
@@ -24,7 +24,7 @@ def of_vertices(system: StageEquations) -> dict[str, Array]:
     }
 
 
-def of_edges(system: StageEquations) -> dict[str, Array]:
+def edge_arrays(system: StageEquations) -> dict[str, Array]:
     """Arrays (n_edges,) of the owned edges with an unknown."""
     layout, found = system.points, {}
     for term in system.active.elastic:
@@ -35,7 +35,7 @@ def of_edges(system: StageEquations) -> dict[str, Array]:
     return found
 
 
-def of_elements(system: StageEquations) -> dict[str, Array]:
+def element_arrays(system: StageEquations) -> dict[str, Array]:
     """Of elements (E, n + m) each, of which the first n are numbers of vertices in the mesh."""
     layout, found = system.points, {}
     for term in system.active.elastic:
@@ -60,7 +60,7 @@ def restore_fixed(
         if term.registration.edge_state:
             _restore_edges(system, term, edges)
         if term.name in elements and not term.registration.neighbours:
-            vertices, values = _brought(system, *elements[term.name])
+            vertices, values = _send_to_owners(system, *elements[term.name])
             _restore_values(term, system.points.global_number[term.stencil], vertices, values)
 
 
@@ -75,11 +75,11 @@ def restore_changing(
             term.restore({name: array for name, array in known.items() if array is not None})
         if term.name in elements and term.registration.neighbours:
             own = range(layout.start, layout.start + layout.n_owned)
-            term.restore_elements(*_brought(system, *elements[term.name]), own)
+            term.restore_elements(*_send_to_owners(system, *elements[term.name]), own)
             term.initialise_pairs(system.x, system.active.frozen[term])
 
 
-def _brought(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:
+def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:
     """Elements of all ranks that have a vertex of this one."""
     layout, comm = system.points, system.points.comm
     owner = np.searchsorted(layout.bounds, vertices, side="right") - 1

@@ -1,7 +1,7 @@
 """PETSc's options of the TS: which integrator and which control of the steps they choose.
 
 ``-ts_type`` and ``-ts_adapt_type`` win over a scene's ``time``. The TS itself only solves for the stage of
-the integrator, so that it must not see them (`hidden`).
+the integrator, so that it must not see them (`hidden_options`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TOLERANCE = 1e-3
 STEP_OPTIONS = ("ts_dt", "ts_time_step")
 """Names of Δt: that of PETSc up to 3.24, and that of PETSc from 3.25 on."""
 
-OURS = ("ts_type", "ts_theta_theta", "ts_bdf_order", "ts_adapt_type", *STEP_OPTIONS)
+OWN_OPTIONS = ("ts_type", "ts_theta_theta", "ts_bdf_order", "ts_adapt_type", *STEP_OPTIONS)
 """Options that are not for the TS that solves the stages."""
 
 
@@ -118,10 +118,10 @@ def _steps(time: Time) -> dict[str, Any]:
 
 
 @contextmanager
-def hidden() -> Iterator[None]:
-    """Keep `OURS` from a TS that reads its options meanwhile."""
+def hidden_options() -> Iterator[None]:
+    """Keep `OWN_OPTIONS` from a TS that reads its options meanwhile."""
     database = PETSc.Options()
-    kept = {name: database.getString(name, "") for name in OURS if is_set(name)}
+    kept = {name: database.getString(name, "") for name in OWN_OPTIONS if is_set(name)}
     for name in kept:
         database.delValue(name)
     try:

@@ -73,12 +73,12 @@ class WholeStiffness:
             last = force
             self._set_positions(system.x[:n] + displacement)
         system.state.set(x, np.zeros_like(x))
-        system.active.carry_frames(system.x, frozen)
+        system.active.transport_frames(system.x, frozen)
         return None
 
     def _set_positions(self, x: Array) -> None:
         self._system.state.set(x, np.zeros_like(x))
-        self._system.active.carry_frames(self._system.x)
+        self._system.active.transport_frames(self._system.x)
 
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""

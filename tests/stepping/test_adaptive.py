@@ -90,11 +90,11 @@ def test_limits_of_the_step_hold_and_are_told_of(comm: MPI.Comm) -> None:
 
 def test_a_large_error_shortens_the_step_and_a_small_one_lengthens_it() -> None:
     control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
-    assert control.judge(0.01, 0.01, 2)
+    assert control.accept(0.01, 0.01, 2)
     assert control.next_end(0.0) == pytest.approx(0.02)
-    assert not control.judge(0.02, 4.0, 2)
+    assert not control.accept(0.02, 4.0, 2)
     assert control.next_end(0.0) == pytest.approx(0.02 * 0.85 / 2.0)
-    assert not control.judge(0.01, 1e9, 2)
+    assert not control.accept(0.01, 1e9, 2)
     assert control.next_end(0.0) == pytest.approx(0.002)
 
 
@@ -102,7 +102,7 @@ def test_no_crumb_is_left_before_a_landing() -> None:
     control = ToleranceControl(0.01, 0.1, 1.0, 0.05, [], 1e-6)
     assert control.next_end(0.035) == pytest.approx(0.0425)
     # a step cut short does not shorten those after it
-    assert control.judge(0.0075, 0.9, 2)
+    assert control.accept(0.0075, 0.9, 2)
     assert control.factor * control.step == pytest.approx(0.0075 * 0.85 / 0.9**0.5)
-    assert control.judge(0.0001, 1e-6, 2)
+    assert control.accept(0.0001, 1e-6, 2)
     assert control.factor * control.step >= 0.0067

@@ -10,7 +10,7 @@ import pytest
 from petsc4py import PETSc
 from physics import grid, scene_of
 
-from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
+from lyra_petsc.stepping.failure_advice import Circumstances, advice, failure_kind
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis, Triangle, Vertex
 from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 
@@ -75,7 +75,7 @@ def advised(
 def test_a_nonlinear_failure(diagnosis: Diagnosis, now: Circumstances, words: str) -> None:
     tolerances = {"force_tolerance": 1e-6, "step_tolerance": 1e-9}
     told = advised(diagnosis, now=now, solver=tolerances)
-    assert trouble(diagnosis, STUCK) == "nonlinear trouble"
+    assert failure_kind(diagnosis, STUCK) == "nonlinear trouble"
     assert words in told[0]
 
 
@@ -86,10 +86,10 @@ def test_a_cause_that_is_not_there_is_not_told() -> None:
 def test_iterations_that_ran_out() -> None:
     ran_out = replace(STUCK, snes_reason=SNES.DIVERGED_MAX_IT, iterations=iterations(1.0, 1.0, 1.0, 1.0, 0.9))
     falling = replace(ran_out, iterations=iterations(1.0, 0.5, 0.3, 0.1, 0.01))
-    assert advised(stuck=falling)[0] == "solver.max_iterations above 50 (the residual was still falling)"
-    assert "more material.damping" in advised(stuck=ran_out)[0]
+    assert advised(solve=falling)[0] == "solver.max_iterations above 50 (the residual was still falling)"
+    assert "more material.damping" in advised(solve=ran_out)[0]
     few = replace(NOW, max_iterations=4, iterations_key="-snes_max_it")
-    assert advised(stuck=ran_out, now=few)[0] == "-snes_max_it above 4"
+    assert advised(solve=ran_out, now=few)[0] == "-snes_max_it above 4"
 
 
 @pytest.mark.parametrize(
@@ -104,15 +104,18 @@ def test_iterations_that_ran_out() -> None:
 )
 def test_a_linear_failure(reason: int, now: Circumstances, words: str) -> None:
     stuck = replace(STUCK, snes_reason=SNES.DIVERGED_LINEAR_SOLVE, ksp_reason=int(reason))
-    assert trouble(DIAGNOSIS, stuck) == "linear trouble"
-    assert words in advised(stuck=stuck, now=now)[0]
+    assert failure_kind(DIAGNOSIS, stuck) == "linear trouble"
+    assert words in advised(solve=stuck, now=now)[0]
 
 
 def test_linear_solves_that_fail_now_and_then_are_no_linear_trouble() -> None:
     stuck = replace(STUCK, snes_reason=SNES.DIVERGED_MAX_IT, ksp_reason=int(KSP.DIVERGED_INDEFINITE_MAT))
     mixed = (*iterations(1.0, 1.0, 1.0, 1.0), *iterations(1.0, 1.0, linear=-10)[1:])
-    assert trouble(DIAGNOSIS, replace(stuck, iterations=mixed)) == "nonlinear trouble"
-    assert trouble(DIAGNOSIS, replace(stuck, iterations=iterations(1.0, 1.0, linear=-10))) == "linear trouble"
+    assert failure_kind(DIAGNOSIS, replace(stuck, iterations=mixed)) == "nonlinear trouble"
+    assert (
+        failure_kind(DIAGNOSIS, replace(stuck, iterations=iterations(1.0, 1.0, linear=-10)))
+        == "linear trouble"
+    )
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ def test_linear_solves_that_fail_now_and_then_are_no_linear_trouble() -> None:
     ],
 )
 def test_overflow(diagnosis: Diagnosis, words: str) -> None:
-    assert trouble(diagnosis, STUCK) == "overflow"
+    assert failure_kind(diagnosis, STUCK) == "overflow"
     assert words in advised(diagnosis)[0]
 
 

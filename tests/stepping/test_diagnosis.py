@@ -15,7 +15,7 @@ from physics import CLOTH, direct_solver, gathered, grid, stepped
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping import equilibrium
-from lyra_petsc.stepping.failure_diagnosis import worst
+from lyra_petsc.stepping.failure_diagnosis import describe_worst
 from lyra_petsc.stepping.failure_report import Failure
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -117,14 +117,14 @@ def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
         for one, other in ((alone.diagnosis.vertex, together.diagnosis.vertex),
                            (alone.diagnosis.triangle, together.diagnosis.triangle)):  # fmt: skip
             assert one.number == other.number
-        residual = gathered(simulation.problem.points, together.stuck.residual)
+        residual = gathered(simulation.problem.points, together.failed_solve.residual)
         residual[[0, 5]] = 0.0
         sizes = np.linalg.norm(residual, axis=1)
         assert together.diagnosis.vertex.number == sizes.argmax()
         assert together.diagnosis.norm == pytest.approx(np.linalg.norm(residual))
         assert together.diagnosis.norm == pytest.approx(alone.diagnosis.norm, rel=1e-5)
         assert together.kind == "nonlinear trouble"
-        norms = [each.residual for each in together.stuck.iterations]
+        norms = [each.residual for each in together.failed_solve.iterations]
         assert len(norms) == 4
         assert norms[-1] == pytest.approx(together.diagnosis.norm)
         assert error.details[0].startswith("residual [N] by iteration (linear iterations): ")
@@ -181,14 +181,16 @@ def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPat
     with failing(comm, {"time": {"analysis": "static"}}) as (simulation, error, failure):
         assert "(load factor 0) did not converge even with an increment of" in str(error)
         assert "no equilibrium within 2 proximal steps" in str(error)
-        assert len(failure.stuck.iterations) == 3  # before the first proximal step and after each
-        assert failure.stuck.time == pytest.approx(failure.dt)
-        force = failure.stuck.residual
+        assert len(failure.failed_solve.iterations) == 3  # before the first proximal step and after each
+        assert failure.failed_solve.time == pytest.approx(failure.dt)
+        force = failure.failed_solve.residual
         assert np.sqrt(comm.allreduce(float(np.vdot(force, force)))) == pytest.approx(failure.diagnosis.norm)
         # the state is the one before the load step, the iterate another
         x = simulation.problem.system.x[: simulation.problem.points.n_owned]
         assert comm.allreduce(float(np.abs(x[:, 2]).max(initial=0.0)), MPI.MAX) == 0.0
-        assert comm.allreduce(float(np.abs(failure.stuck.position - x).max(initial=0.0)), MPI.MAX) > 0.0
+        assert (
+            comm.allreduce(float(np.abs(failure.failed_solve.position - x).max(initial=0.0)), MPI.MAX) > 0.0
+        )
 
 
 def test_without_handles_an_equilibrium_is_not_sought_in_vain(comm: MPI.Comm) -> None:
@@ -223,10 +225,13 @@ def test_of_equals_the_smallest_number_is_the_worst(comm: MPI.Comm) -> None:
     # ten rows dealt to the ranks backwards; rows 3, 4 and 8 are equal but for round-off
     numbers = np.arange(10)[::-1][comm.rank :: comm.size]
     sizes = np.array([0.0, 1, 2, 7 * (1 - 1e-9), 7, 5, 6, 4, 7 * (1 + 1e-9), 3])[numbers]
-    assert worst(comm, sizes, numbers, lambda row: int(numbers[row])) == 3
-    assert worst(comm, np.where(numbers < 6, sizes, np.inf), numbers, lambda row: int(numbers[row])) == 6
-    assert worst(comm, np.zeros(len(numbers)), numbers, lambda row: int(numbers[row])) == 0
+    assert describe_worst(comm, sizes, numbers, lambda row: int(numbers[row])) == 3
+    assert (
+        describe_worst(comm, np.where(numbers < 6, sizes, np.inf), numbers, lambda row: int(numbers[row]))
+        == 6
+    )
+    assert describe_worst(comm, np.zeros(len(numbers)), numbers, lambda row: int(numbers[row])) == 0
     # a rank without rows
     mine = numbers if comm.rank == comm.size - 1 else numbers[:0]
     least = int(np.arange(10)[::-1][comm.size - 1 :: comm.size].min())
-    assert worst(comm, np.ones(len(mine)), mine, lambda row: int(mine[row])) == least
+    assert describe_worst(comm, np.ones(len(mine)), mine, lambda row: int(mine[row])) == least

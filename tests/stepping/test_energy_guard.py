@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from physics import grid, scene_of, shape
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.energy_guard import Balance, GuardState, _with_gain
+from lyra_petsc.stepping.energy_guard import Balance, GuardState, _append_gain
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
@@ -103,11 +103,11 @@ def test_heat_of_what_turns_is_of_second_order(integrator: str) -> None:
 
 
 def test_what_is_given_back_of_a_loss_passes_out_of_sight_with_it() -> None:
-    assert _with_gain([-0.2, -0.03], 0.05, 4) == pytest.approx([-0.18, 0.0, 0.0])
-    assert _with_gain([-0.2, 0.0, 0.0, 0.0], 0.05, 4) == [-0.2, 0.0, 0.0, 0.0, 0.05]
-    assert _with_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
-    assert _with_gain([-0.2], 0.05, 1) == [-0.2, 0.05]
-    assert _with_gain([0.1], -0.05, 4) == [0.1, -0.05]
+    assert _append_gain([-0.2, -0.03], 0.05, 4) == pytest.approx([-0.18, 0.0, 0.0])
+    assert _append_gain([-0.2, 0.0, 0.0, 0.0], 0.05, 4) == [-0.2, 0.0, 0.0, 0.0, 0.05]
+    assert _append_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
+    assert _append_gain([-0.2], 0.05, 1) == [-0.2, 0.05]
+    assert _append_gain([0.1], -0.05, 4) == [0.1, -0.05]
 
 
 def test_a_step_that_makes_nothing_stands_whatever_others_made() -> None:
@@ -118,7 +118,7 @@ def test_a_step_that_makes_nothing_stands_whatever_others_made() -> None:
     for gain in (-1e-6, 1e-6):
         one.guard.gains = GuardState(start=0.0, scale=1.0, total=0.2, recent=[0.2])
         step = Balance(gain, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1e-12)
-        stood.append(one.guard.stands(step, strict=True))
+        stood.append(one.guard.accept(step, strict=True))
     one.destroy()
     assert stood == [True, False]
 

@@ -74,9 +74,9 @@ def test_forces_at_the_end_of_a_linear_step_serve_the_next(monkeypatch: pytest.M
         )
         assert term.frames is system.active.frozen[term]
     assert simulation.guard is not None
-    verdicts, stands = iter([False, True]), simulation.guard.stands
+    verdicts, accept = iter([False, True]), simulation.guard.accept
     monkeypatch.setattr(
-        simulation.guard, "stands", lambda *given, **how: stands(*given, **how) and next(verdicts)
+        simulation.guard, "accept", lambda *given, **how: accept(*given, **how) and next(verdicts)
     )
     asked.clear()
     assert simulation.step().rejected == 1

@@ -50,7 +50,7 @@ def test_positions_are_as_near_as_asked(
         iterations.append((report.newton_iterations, beside.newton_iterations))
         x, true = (shape(one) for one in (asked, exact))
         assert np.abs(x - true).max() <= tolerance * spacing
-        assert report.left <= tolerance * spacing
+        assert report.remaining <= tolerance * spacing
     assert any(fewer < more for fewer, more in iterations)
     asked.destroy()
     exact.destroy()

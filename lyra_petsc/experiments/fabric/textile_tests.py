@@ -77,7 +77,7 @@ def _load_path_simulation(
 ) -> Iterator[Iterator[SteppedScene]]:
     """The simulation of a scene at each of these values except the first, even if it takes shorter steps."""
     factors = [k / (len(values) - 1) for k in range(1, len(values))]
-    with bench.simulation(content | _path(values), land=factors[:-1]) as trial:
+    with bench.simulation(content | _path(values), stops=factors[:-1]) as trial:
         yield trial.run_through(factors)
 
 

@@ -146,11 +146,11 @@ class Model:
 
     def _evaluate(self, numbers: Array, derivatives: bool, progress: Progress) -> Evaluation:
         scene = self.at(numbers.tolist())
-        land = [instant.time for instant in self._instants]
+        stops = [instant.time for instant in self._instants]
         values: list[Array] = []
         slopes: list[Array] = []
         self.runs += 1
-        with open_simulation(self.comm, scene, mesh=self.mesh, land=land) as simulation:
+        with open_simulation(self.comm, scene, mesh=self.mesh, stops=stops) as simulation:
             sensitivities: Sensitivities | None = None
             if derivatives:
                 chosen = [

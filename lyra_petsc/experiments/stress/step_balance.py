@@ -343,7 +343,7 @@ class BalanceRecorder:
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
-        floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
+        floor = residual_roundoff(system, max(reach, simulation.problem.outline.largest_coordinate))
         n = len(free)
         displacement = system.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
@@ -454,7 +454,7 @@ class StageBalanceRecorder(BalanceRecorder):
         self._update_start_ghosts()
         x0, x1 = self._x, system.x
         # moving targets are at the end of the step by now; damping needs the frames of the step
-        system.active.turn_targets(self._at(system.t0 + system.stage.offset))
+        system.active.move_targets(self._at(system.t0 + system.stage.offset))
         parts = dict(system.forces_at_stage())
         ended = self._at(system.t1)
         frozen = {term: term.freeze(ended) for term in system.active.elastic}
@@ -651,9 +651,11 @@ def judge_resolution(record: RunRecord) -> Verdict:
     """
     steps = zip(record.balances, record.reports, strict=True)
     by_force = [ratio(balance.residual, NEGLIGIBLE * balance.driving) for balance in record.balances]
-    by_displacement = [ratio(report.left, NEGLIGIBLE * balance.displacement) for balance, report in steps]
+    by_displacement = [
+        ratio(report.remaining, NEGLIGIBLE * balance.displacement) for balance, report in steps
+    ]
     number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_displacement[i]))
-    worst, last = record.balances[number], record.reports[number].left
+    worst, last = record.balances[number], record.reports[number].remaining
     text = (
         f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
     )
