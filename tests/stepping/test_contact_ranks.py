@@ -237,12 +237,12 @@ def test_there_is_room_near_the_start_of_a_way() -> None:
         reach = 0.5 * contact.approach_limit
         x_way = np.zeros_like(x)
         x_way[:, 0] = 1.0
-        known.follow(x, 0.3 * reach * x_way)
+        known.update_stencils(x, 0.3 * reach * x_way)
         back = x - 0.69 * reach * x_way
-        assert known.largest_step(back, -0.1 * reach * x_way) == 1.0
-        assert known.largest_step(back, -reach * x_way) == pytest.approx(0.31)
-        assert known.largest_step(x, reach * x_way) == 1.0
-        assert known.largest_step(x, 2.0 * reach * x_way) == pytest.approx(0.65)
+        assert known.searched_fraction(back, -0.1 * reach * x_way) == 1.0
+        assert known.searched_fraction(back, -reach * x_way) == pytest.approx(0.31)
+        assert known.searched_fraction(x, reach * x_way) == 1.0
+        assert known.searched_fraction(x, 2.0 * reach * x_way) == pytest.approx(0.65)
 
 
 def test_of_ways_through_everything_the_beginning_is_searched(
@@ -256,9 +256,9 @@ def test_of_ways_through_everything_the_beginning_is_searched(
         known, x = simulation.problem.discretisation, simulation.problem.system.x
         numbers = simulation.problem.points.global_number[: len(x)]
         ways = np.random.default_rng(1).uniform(-0.3, 0.3, (12 * 81, 3))[numbers]
-        known.follow(x, ways)
+        known.update_stencils(x, ways)
         assert 0 < barrier.n_elements < 200 * len(x)
-        assert 0.01 < known.largest_step(x, ways) < 0.5
+        assert 0.01 < known.searched_fraction(x, ways) < 0.5
 
 
 def test_the_pairs_of_a_stack_are_shared(comm: MPI.Comm) -> None:

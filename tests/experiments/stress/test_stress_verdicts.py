@@ -74,7 +74,7 @@ def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: s
 @pytest.mark.parametrize(("left", "good"), [(0.9e-4, True), (1.1e-4, False), (math.nan, False)])
 def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(left: float, good: bool) -> None:
     stiff = replace(GOOD, residual=1e-6, driving=1e-6, promised=1e-9, floor=2e-6)
-    found = failures(record(stiff, replace(STEP, left=left)))
+    found = failures(record(stiff, replace(STEP, remaining=left)))
     assert ("resolved" in found) is not good
 
 
