@@ -47,13 +47,13 @@ def iterations(*norms: float, linear: int = 2) -> tuple[Iteration, ...]:
 
 def advised(
     diagnosis: Diagnosis = DIAGNOSIS,
-    stuck: FailedSolve = STUCK,
+    solve: FailedSolve = STUCK,
     now: Circumstances = NOW,
     **scene: Any,
 ) -> list[str]:
     content = {"mesh": grid(1, 1, 2, 2), "handles": [{"nodes": [0]}, {"nodes": [8], "motion": "lift"}],
                "motions": {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}]}}  # fmt: skip
-    return advice(diagnosis, stuck, scene_of(content | scene), now)
+    return advice(diagnosis, solve, scene_of(content | scene), now)
 
 
 @pytest.mark.parametrize(
