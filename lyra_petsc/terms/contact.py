@@ -619,7 +619,7 @@ class ContactBarrier(Elastic):
         out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self._stiffness[active.pair])
         return out
 
-    def sizes(self, size: float) -> Array:
+    def coordinate_scale(self, size: float) -> Array:
         return np.maximum(size, self._largest_coordinate)
 
     # -- limits and corrections of Newton's increments ---------------------------------------------
