@@ -53,13 +53,13 @@ class Arcs:
 
     Parameters
     ----------
-    equations : StageEquations
+    system : StageEquations
         Those of a scene with directors on edges and without changing stencils.
     """
 
-    def __init__(self, equations: StageEquations) -> None:
-        self._equations, layout = equations, equations.points
-        self._term = next(term for term in equations.active.elastic if isinstance(term, Membrane))
+    def __init__(self, system: StageEquations) -> None:
+        self._system, layout = system, system.points
+        self._term = next(term for term in system.active.elastic if isinstance(term, Membrane))
         name, stencil = self._term.name, self._term.stencil
         self._pattern = BlockPattern({name: stencil}, layout.n_owned, layout.n_local)
         data = self._term.elements.data
@@ -71,7 +71,7 @@ class Arcs:
 
     def turns_notably(self, increment: Array) -> bool:
         """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
-        return self._equations.largest_turn(increment * self._equations.stage.c) > MIN_TURN
+        return self._system.largest_turn(increment * self._system.stage.c) > MIN_TURN
 
     def curve(self, v: Array, increment: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """An increment (n_owned, 3) [m/s] from v along arcs, and the linear one.
@@ -79,11 +79,11 @@ class Arcs:
         Both are shortened so that no triangle turns by more than `MAX_TURN`. Without ``strains`` they are not
         shortened, and triangles keep their strain.
         """
-        equations = self._equations
-        x, displacement = equations.displacement(v, increment)
+        system = self._system
+        x, displacement = system.displacement(v, increment)
         deformation, spin, strain = self._spin_and_strain(x, displacement)
         turn = np.linalg.norm(spin, axis=1)
-        largest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
+        largest = float(system.points.global_max(float(turn.max(initial=0.0)))[0])
         part = min(1.0, MAX_TURN / largest) if strains and largest > 0.0 else 1.0
         displacement, increment = part * displacement, part * increment
         stretch = np.eye(3) + (part * strain if strains else 0.0)
@@ -93,8 +93,8 @@ class Arcs:
         forces = [
             np.bincount(corners, element_forces[:, :, i].ravel(), len(x))[: len(increment)] for i in range(3)
         ]
-        curved = increment + self._solve(np.stack(forces, axis=1)) / equations.stage.c
-        equations.match_directors(v, increment, curved)
+        curved = increment + self._solve(np.stack(forces, axis=1)) / system.stage.c
+        system.match_directors(v, increment, curved)
         return curved, increment
 
     def _gradients(self, x: Array) -> Array:
@@ -122,8 +122,8 @@ class Arcs:
 
     def _solve(self, forces: Array) -> Array:
         """Displacements (n_owned, 3) [m] of the free unknowns by the Poisson equation for ``forces``."""
-        mask, free = self._equations.prescribed.mask, self._equations.prescribed.free
-        (changed,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
+        mask, free = self._system.prescribed.mask, self._system.prescribed.free
+        (changed,) = self._system.points.global_max(float(not np.array_equal(mask, self._held)))
         if changed:
             self._factor()
         assert self._matrix is not None
@@ -138,7 +138,7 @@ class Arcs:
 
     def _factor(self) -> None:
         self.destroy()
-        layout, rows, mask = self._equations.points, BlockRows(self._pattern), self._equations.prescribed.mask
+        layout, rows, mask = self._system.points, BlockRows(self._pattern), self._system.prescribed.mask
         self._held = mask.copy()
         size = np.einsum("eck,eck->e", self._slopes, self._slopes)
         (largest,) = layout.global_max(float((self._area * size).max(initial=0.0)))

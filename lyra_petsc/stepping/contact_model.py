@@ -35,7 +35,7 @@ class ContactModel:
     Parameters
     ----------
     ksp : PETSc.KSP
-    equations : StageEquations
+    system : StageEquations
     linear : LinearSystem
     follow : callable
         Updates the matrices to the present stencils, and returns whether they changed; collective.
@@ -47,9 +47,9 @@ class ContactModel:
     """
 
     def __init__(
-        self, ksp: PETSc.KSP, equations: StageEquations, linear: LinearSystem, follow: Callable[[], bool]
+        self, ksp: PETSc.KSP, system: StageEquations, linear: LinearSystem, follow: Callable[[], bool]
     ) -> None:
-        self._ksp, self._equations, self._linear, self._follow = ksp, equations, linear, follow
+        self._ksp, self._system, self._linear, self._follow = ksp, system, linear, follow
         self.linear_iterations = 0
 
     def improve(
@@ -74,14 +74,14 @@ class ContactModel:
         tolerance : float
             Tolerance of the linear solves, relative to the residual.
         """
-        equations, linear, self.linear_iterations = self._equations, self._linear, 0
-        self._springs = equations.contact_springs(v, -y.getArray(readonly=True).reshape(v.shape))
+        system, linear, self.linear_iterations = self._system, self._linear, 0
+        self._springs = system.contact_springs(v, -y.getArray(readonly=True).reshape(v.shape))
         self._set_springs(list(self._springs.values()))
         change, size = self._elongations(y), residual.norm()
         length = self._length + change
         force, expected = self._law(length)[0], self._force - self._stiffness * change
         if self._mismatch(force, expected) <= MATCH * size:
-            equations.release_contact_springs({})
+            system.release_contact_springs({})
             return False
         if self._follow():
             assemble()
@@ -108,7 +108,7 @@ class ContactModel:
         if not descends:
             first.copy(y)
         lengths = zip(self._springs, self._split(length), strict=True)
-        equations.release_contact_springs(dict(lengths) if descends else {})
+        system.release_contact_springs(dict(lengths) if descends else {})
         for each in (first, z, remaining):
             each.destroy()
         return descends
@@ -142,7 +142,7 @@ class ContactModel:
     def _mismatch(self, force: Array, expected: Array) -> float:
         """Norm [N] of the difference of spring forces and expected ones, if repulsive; collective."""
         off = force - np.maximum(expected, 0.0)
-        return float(np.sqrt(self._equations.points.global_sum(float(np.vdot(self._counted * off, off)))[0]))
+        return float(np.sqrt(self._system.points.global_sum(float(np.vdot(self._counted * off, off)))[0]))
 
     def _advance_residual(self, remaining: PETSc.Vec, z: PETSc.Vec, excess: Array) -> None:
         """Update the model's residual ``remaining`` [N] by a step z with the present matrix.
@@ -157,11 +157,11 @@ class ContactModel:
 
     def _elongations(self, y: PETSc.Vec) -> Array:
         """Elongations [m] of all springs in a step y; collective."""
-        equations = self._equations
-        displacement = np.zeros((equations.points.n_local, 3))
+        system = self._system
+        displacement = np.zeros((system.points.n_local, 3))
         increment = y.getArray(readonly=True).reshape(-1, 3)
-        displacement[: len(increment)] = -equations.stage.c * increment
-        equations.points.update_ghosts(displacement)
+        displacement[: len(increment)] = -system.stage.c * increment
+        system.points.update_ghosts(displacement)
         parts = [each.elongations(displacement) for each in self._springs.values()]
         return np.concatenate([np.empty(0), *parts])
 
@@ -170,11 +170,11 @@ class ContactModel:
 
         ``remaining`` [N] is the residual before the step, ``tolerance`` [N] that after it.
         """
-        ksp, linear, equations = self._ksp, self._linear, self._equations
+        ksp, linear, system = self._ksp, self._linear, self._system
         each = dict(zip(self._springs, self._split(slopes - self._stiffness), strict=True))
 
         def add(rows: Array) -> None:
-            equations.add_contact_springs(self._springs, each, rows)
+            system.add_contact_springs(self._springs, each, rows)
 
         linear.assemble_with(add)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
@@ -187,8 +187,8 @@ class ContactModel:
 
     def _forces(self, size: Array) -> Array:
         """Gradient (n_owned, 3) [N] of springs with tensions ``size`` [N], 0 at prescribed unknowns."""
-        points = self._equations.points
+        points = self._system.points
         out = np.zeros((points.n_local, 3))
         for each, force in zip(self._springs.values(), self._split(size), strict=True):
             each.add_forces(force, out)
-        return np.where(self._equations.prescribed.free, out[: points.n_owned], 0.0)
+        return np.where(self._system.prescribed.free, out[: points.n_owned], 0.0)

@@ -23,32 +23,32 @@ class ContactMonitor:
 
     Parameters
     ----------
-    equations : StageEquations
+    system : StageEquations
         Those of a scene with contact.
     step_fraction : callable
         Returns the fraction of the last Newton step that was allowed.
     """
 
-    def __init__(self, equations: StageEquations, step_fraction: Callable[[], float]) -> None:
-        self._equations, self._step_fraction = equations, step_fraction
-        near = equations.active.changing
+    def __init__(self, system: StageEquations, step_fraction: Callable[[], float]) -> None:
+        self._system, self._step_fraction = system, step_fraction
+        near = system.active.changing
         self._contact = next(term for term in near if isinstance(term, ContactBarrier))
         self._friction = next((term for term in near if isinstance(term, CoulombFriction)), None)
 
     def __call__(self, snes: PETSc.SNES, number: int, norm: float) -> None:
         """For ``SNES.setMonitor``; collective."""
-        equations, contact = self._equations, self._contact
+        system, contact = self._system, self._contact
         v = snes.getSolution().getArray(readonly=True).reshape(-1, 3)
-        x, _ = equations.evaluate_at(v)
-        frozen = equations.active.frozen[contact]
+        x, _ = system.evaluate_at(v)
+        frozen = system.active.frozen[contact]
         here, stiffest = contact.history(x, frozen), contact.largest_stiffness(x, frozen)
         sums = [here["contacts"]]
         if self._friction is not None:
-            sums += self._friction.count_sticking(x, equations.active.frozen[self._friction])
+            sums += self._friction.count_sticking(x, system.active.frozen[self._friction])
             sums.append(float(contact.find_contacts(x, frozen.stage, contact.n_owned)[2].sum()))
-        sums = equations.points.global_sum(*sums).tolist()
+        sums = system.points.global_sum(*sums).tolist()
         extremes = np.array([stiffest, -here["smallest_gap"]])
-        equations.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)
+        system.points.comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MAX)
         line = f"{number:3d} CONTACT {sums[0]:.0f} contacts, "
         if sums[0] > 0.0:
             line += f"smallest gap {-extremes[1]:.6e} m, stiffest {extremes[0]:.6e} N/m, "
@@ -57,4 +57,4 @@ class ContactMonitor:
             stick, slide, taken, now = sums[1:]
             line += f"; friction: {stick:.0f} stick, {slide:.0f} slide, "
             line += f"normal forces {taken:.6e} N, now {now:.6e} N"
-        PETSc.Sys.Print(" " * snes.getTabLevel() + line, comm=equations.points.comm)
+        PETSc.Sys.Print(" " * snes.getTabLevel() + line, comm=system.points.comm)

@@ -38,7 +38,7 @@ class Convergence:
 
     Parameters
     ----------
-    equations : StageEquations
+    system : StageEquations
     tolerances : Solver
         The block ``solver`` of the scene.
     spacing : float
@@ -72,14 +72,14 @@ class Convergence:
 
     def __init__(
         self,
-        equations: StageEquations,
+        system: StageEquations,
         tolerances: Solver,
         spacing: float,
         floor: float,
         *,
         break_even_iterations: float,
     ) -> None:
-        self._equations, self._tolerances, self.spacing = equations, tolerances, spacing
+        self._system, self._tolerances, self.spacing = system, tolerances, spacing
         self._floor = self._least_floor = floor
         self._break_even_iterations = break_even_iterations
         self.mean_iterations, self.max_displacement = 0.0, np.inf
@@ -102,7 +102,7 @@ class Convergence:
         After a failed line search PETSc reports convergence if the step is short, whatever the residual. In
         statics balanced forces are not enough, because small forces may cause large displacements.
         """
-        return self._ended or (self._equations.integrator.dynamic and self.balanced)
+        return self._ended or (self._system.integrator.dynamic and self.balanced)
 
     @property
     def balanced(self) -> bool:
@@ -123,15 +123,15 @@ class Convergence:
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
-            moved = increment * self._equations.stage.c
+            moved = increment * self._system.stage.c
             if moved > self.max_displacement:
                 return int(Reason.DIVERGED_MAX_IT)
             self._estimate_remaining(moved)
             spent = linear_iterations - self._iterations_before
             self.mean_iterations += RECENT * (spent - self.mean_iterations)
         slow = iteration > 0 and residual > STALLED * before
-        if slow and self._equations.discretisation.has_near_elements:
-            self._floor = max(self._least_floor, contact_roundoff(self._equations))
+        if slow and self._system.discretisation.has_near_elements:
+            self._floor = max(self._least_floor, contact_roundoff(self._system))
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
@@ -169,16 +169,16 @@ class Convergence:
 
         ``tolerance`` [m] is that of the remaining correction; collective.
         """
-        equations, was_good = self._equations, self._met_tolerances
+        system, was_good = self._system, self._met_tolerances
         self._met_tolerances = True
-        if was_good or not (equations.discretisation.limits_motion and equations.integrator.dynamic):
+        if was_good or not (system.discretisation.limits_motion and system.integrator.dynamic):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
-        return (self.norm > part * enough or self.remaining > part * tolerance) and equations.may_impact
+        return (self.norm > part * enough or self.remaining > part * tolerance) and system.may_impact
 
     def _force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""
-        return float(self._tolerances.force_tolerance * self._equations.largest_force())
+        return float(self._tolerances.force_tolerance * self._system.largest_force())
 
     def correction_suffices(self, correction: float, last: float, residual: float) -> bool:
         """Whether a Newton step and its corrections meet the tolerances, so that no further one is needed.
@@ -189,7 +189,7 @@ class Convergence:
         """
         part = correction / last
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
-        self._after_correction = expected * self._equations.stage.c
+        self._after_correction = expected * self._system.stage.c
         tolerance = self._tolerances.step_tolerance * self.spacing
         return self._after_correction <= tolerance and residual <= self._force_tolerance()
 

@@ -108,13 +108,13 @@ class Globalisation:
     Parameters
     ----------
     snes : PETSc.SNES
-    equations : StageEquations
+    system : StageEquations
     convergence : Convergence
     """
 
-    def __init__(self, snes: PETSc.SNES, equations: StageEquations, convergence: Convergence) -> None:
-        self._snes, self._equations, self._convergence = snes, equations, convergence
-        self._shape = (equations.points.n_owned, 3)
+    def __init__(self, snes: PETSc.SNES, system: StageEquations, convergence: Convergence) -> None:
+        self._snes, self._system, self._convergence = snes, system, convergence
+        self._shape = (system.points.n_owned, 3)
         self._watchdog = Watchdog()
         self._first_energy = -math.inf
         self.begin_solve()
@@ -127,11 +127,11 @@ class Globalisation:
 
     def note_iterate(self, u: PETSc.Vec) -> None:
         """Note energy and residual of iterate u, with which trial points are compared; collective."""
-        self._energy = self._equations.objective(u.getArray(readonly=True).reshape(self._shape))
+        self._energy = self._system.objective(u.getArray(readonly=True).reshape(self._shape))
         self._norm = self._snes.getFunctionNorm()
         # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
         # would progress slowly
-        kinks = self._equations.has_active_pairs and self._equations.integrator.dynamic
+        kinks = self._system.has_active_pairs and self._system.integrator.dynamic
         self._near_kinks = kinks and not self._convergence.balanced
         energy, size = self._energy
         if self._snes.getIterationNumber() == 0:
@@ -154,7 +154,7 @@ class Globalisation:
         self._returns = self._watchdog.must_return
         if self._returns:
             self._watchdog.return_to_best(x, y)
-            self._equations.set_iterate(None)
+            self._system.set_iterate(None)
         return self._returns
 
     @property
@@ -173,7 +173,7 @@ class Globalisation:
         value that every line search accepts.
         """
         v = u.getArray(readonly=True).reshape(self._shape)
-        value, size = self._equations.objective(v)
+        value, size = self._system.objective(v)
         here, own_size = self._energy
         if value != here and np.isfinite(value) and (self._returns or self.takes_full_steps):
             return min(value, here - self._slope)
@@ -181,8 +181,8 @@ class Globalisation:
         if value == here or not abs(value - here) < noise:
             return value
         trial = np.empty(self._shape)
-        equations = self._equations
-        equations.residual(v, equations.stage.sigma * (v - equations.history), trial)
-        (square,) = equations.points.global_sum(float(np.vdot(trial, trial)))
+        system = self._system
+        system.residual(v, system.stage.sigma * (v - system.history), trial)
+        (square,) = system.points.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._norm)
         return here - noise if smaller else here + noise

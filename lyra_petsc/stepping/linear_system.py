@@ -113,9 +113,9 @@ class Reuse:
         """Make the next solve set up its own preconditioner."""
         self._solves, self._iterations = 0, SET_UP
 
-    def begin_solve(self, equations: StageEquations) -> bool:
+    def begin_solve(self, system: StageEquations) -> bool:
         """Whether the next solve reuses the present preconditioner."""
-        reach, mask = equations.stage.c, equations.prescribed.mask
+        reach, mask = system.stage.c, system.prescribed.mask
         if self._for is None or self._for[1] is not mask or not _similar(reach, self._for[0]):
             self.discard()
         self.reused = self._acts and self._solves > 0
@@ -140,7 +140,7 @@ class LinearSystem:
 
     Parameters
     ----------
-    equations : StageEquations
+    system : StageEquations
     surface : Surface
         The surface of which multigrid's coarse meshes are made.
     preset : str
@@ -164,9 +164,9 @@ class LinearSystem:
     """
 
     def __init__(
-        self, equations: StageEquations, surface: Surface, preset: str, hessian: str, *, iterates: bool
+        self, system: StageEquations, surface: Surface, preset: str, hessian: str, *, iterates: bool
     ) -> None:
-        self._equations, self._surface, self._preset = equations, surface, preset
+        self._system, self._surface, self._preset = system, surface, preset
         self._iterates = iterates
         direct = PETSc.Options().getString("ksp_type", "cg") == PETSc.KSP.Type.PREONLY
         # Eisenstat's trick multiplies by the operator, and needs its entries
@@ -187,8 +187,8 @@ class LinearSystem:
         self._create()
 
     def _create(self) -> None:
-        discretisation = self._equations.discretisation
-        self._equations.update_pattern()  # stencils may have changed since the last matrix
+        discretisation = self._system.discretisation
+        self._system.update_pattern()  # stencils may have changed since the last matrix
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
         kind = presets.matrix_type(self._preset)
@@ -197,18 +197,18 @@ class LinearSystem:
         if is_set("mat_type") or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
-            self.operator = BlockMatrix(layout, pattern, self._equations.block_summary)
+            self.operator = BlockMatrix(layout, pattern, self._system.block_summary)
         self.preconditioner = self.operator
         if self.cycles:
             spare = self._regularised or isinstance(self.operator, AssembledMatrix)
             hierarchy = self._hierarchy(spare=spare)
             if spare:
-                summary = self._equations.block_summary
+                summary = self._system.block_summary
                 entries = None if hierarchy.rows is None else hierarchy.entries
                 self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows, entries)
             assert isinstance(self.preconditioner, BlockMatrix)
             self._multigrid = Multigrid(
-                self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask
+                self.preconditioner, hierarchy, held=lambda: self._system.prescribed.mask
             )
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE
@@ -219,17 +219,17 @@ class LinearSystem:
             )
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:
-        discretisation = self._equations.discretisation
+        discretisation = self._system.discretisation
         found = self._interpolations
         if found is None:
             found = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
         if discretisation.stencils_change:
             self._interpolations = found
         below = None
-        if self._equations.active.coarse and not discretisation.stencils_change:
+        if self._system.active.coarse and not discretisation.stencils_change:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # needed with edge unknowns only
 
-            below = VertexEquations(self._equations)
+            below = VertexEquations(self._system)
         return Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
 
     def attach(self, ksp: PETSc.KSP) -> None:
@@ -241,8 +241,8 @@ class LinearSystem:
 
     def update_pattern(self) -> bool:
         """Create new matrices if stencils have changed the pattern; whether they did."""
-        discretisation = self._equations.discretisation
-        if not self._equations.update_pattern() and discretisation.rows is self._rows:
+        discretisation = self._system.discretisation
+        if not self._system.update_pattern() and discretisation.rows is self._rows:
             return False
         self._free(permanently=False)
         self._create()
@@ -273,9 +273,9 @@ class LinearSystem:
             Whether the Hessian was positive definite in the last solve.
         """
         self.assemble_operator(v, blend)
-        if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._equations):
+        if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._system):
             self._set_preconditioner(v, keep=keep, convex=convex)
-        self._equations.forget_directors()
+        self._system.forget_directors()
 
     def _set_preconditioner(self, v: Array, *, keep: bool, convex: bool) -> None:
         if not self._regularised:
@@ -283,7 +283,7 @@ class LinearSystem:
             return
         assert self._ksp is not None
         # an equilibrium's Newton steps are large, and factors cost less than one more
-        keep = keep and (self._equations.integrator.dynamic or not self.factors)
+        keep = keep and (self._system.integrator.dynamic or not self.factors)
         self.kept_preconditioner = keep
         self.uses_operator = convex and not keep and shows_negative_curvature(self._ksp.getPC())
         if self.uses_operator:
@@ -294,11 +294,11 @@ class LinearSystem:
 
     def assemble_operator(self, v: Array, blend: float) -> None:
         """Assemble the Jacobian at velocities v (n_owned, 3) with this weight of the regularised Hessian."""
-        self._equations.jacobian(v, blend, self.operator.rows)
+        self._system.jacobian(v, blend, self.operator.rows)
         self.operator.set(self.operator.rows)
 
     def _set_regularised(self, v: Array) -> None:
-        self._equations.jacobian(v, 1.0, self.preconditioner.rows)
+        self._system.jacobian(v, 1.0, self.preconditioner.rows)
         self.preconditioner.set(self.preconditioner.rows, self.shift.value)
 
     def save_rows(self, v: Array) -> None:
@@ -306,7 +306,7 @@ class LinearSystem:
         self._saved_rows = [self.operator.rows.copy()]
         if self.preconditioner is not self.operator and self._regularised and not self.uses_operator:
             if self.kept_preconditioner:
-                self._equations.jacobian(v, 1.0, self.preconditioner.rows)
+                self._system.jacobian(v, 1.0, self.preconditioner.rows)
             self._saved_rows.append(self.preconditioner.rows.copy())
 
     def assemble_with(self, add: Callable[[Array], None]) -> None:
@@ -342,7 +342,7 @@ class LinearSystem:
         self.assemble_operator(v, blend)
 
     def _free(self, *, permanently: bool) -> None:
-        self._equations.forget_rows()
+        self._system.forget_rows()
         if self._multigrid is not None:
             self._multigrid.destroy(for_good=permanently)
             self._multigrid = None

@@ -65,7 +65,7 @@ class Newton:
     Parameters
     ----------
     snes : PETSc.SNES
-    equations : StageEquations
+    system : StageEquations
     linear : LinearSystem
     blend : Blend
     convergence : Convergence
@@ -87,7 +87,7 @@ class Newton:
     def __init__(
         self,
         snes: PETSc.SNES,
-        equations: StageEquations,
+        system: StageEquations,
         linear: LinearSystem,
         blend: Blend,
         convergence: Convergence,
@@ -95,29 +95,29 @@ class Newton:
         iterates: bool,
         follow: Callable[[], bool],
     ) -> None:
-        self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
+        self._snes, self._ksp, self._system = snes, snes.getKSP(), system
         self._linear, self._blend, self._iterates = linear, blend, iterates
-        self.convergence, self.globalisation = convergence, Globalisation(snes, equations, convergence)
-        self._shape = (equations.points.n_owned, 3)
-        skin = min((term.skin for term in equations.active.limiting), default=np.inf)
+        self.convergence, self.globalisation = convergence, Globalisation(snes, system, convergence)
+        self._shape = (system.points.n_owned, 3)
+        skin = min((term.skin for term in system.active.limiting), default=np.inf)
         self._contact: ContactModel | None = None
         if iterates and skin < SMALL_GAP * convergence.spacing:
             from lyra_petsc.stepping.contact_model import ContactModel  # needed with small gaps only
 
-            self._contact = ContactModel(self._ksp, equations, linear, follow)
+            self._contact = ContactModel(self._ksp, system, linear, follow)
         self._last_iterate: PETSc.Vec | None = None
         self._last_c = 0.0
         self._convex_at_start = False
-        static = not (equations.integrator.dynamic or equations.discretisation.limits_motion)
-        self._corrects = static and linear.factors and bool(equations.active.with_edges)
+        static = not (system.integrator.dynamic or system.discretisation.limits_motion)
+        self._corrects = static and linear.factors and bool(system.active.with_edges)
         self._arcs: Arcs | None = None
         if self._corrects:
             from lyra_petsc.stepping.arcs import Arcs, can_factor  # needed in equilibria only
 
-            self._arcs = Arcs(equations) if can_factor(equations.points.comm.size) else None
-        fixed = is_set("ksp_rtol") or not equations.integrator.dynamic
+            self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
+        fixed = is_set("ksp_rtol") or not system.integrator.dynamic
         self.forcing = Forcing(
-            self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.limits_motion
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=system.discretisation.limits_motion
         )
 
     def begin_solve(self) -> None:
@@ -126,24 +126,24 @@ class Newton:
         self._step_length, self.step_fraction = 0.0, 1.0
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
-        collides = self._iterates and self._equations.may_collide(COLLISION * self.convergence.spacing)
+        collides = self._iterates and self._system.may_collide(COLLISION * self.convergence.spacing)
         self._linear.begin_solve()
         self._linear.shift.decrease()
         self.convergence.begin_solve()
         self.globalisation.begin_solve()
-        self.forcing.begin_solve(near=self._equations.discretisation.has_near_elements, collides=collides)
+        self.forcing.begin_solve(near=self._system.discretisation.has_near_elements, collides=collides)
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
         """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
         v = self._array(u)
         if self._iterates:
-            self._equations.set_iterate(v)
+            self._system.set_iterate(v)
             self.forcing.before_solve(self.convergence.norm)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
-        self._last_c = self._equations.stage.c
+        self._last_c = self._system.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -187,9 +187,9 @@ class Newton:
             changed |= self._apply_contact_model(x, residual, y)
         full = self.globalisation.takes_full_steps
         curved = self._arcs is not None and full and self._apply_arcs(x, residual, y)
-        if self._equations.active.with_edges and full and not curved:
+        if self._system.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
-        if self._equations.limits_steps and not curved:
+        if self._system.limits_steps and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if self._corrects and full:
@@ -260,16 +260,16 @@ class Newton:
                 break
             steps.append(correction.copy())
         if corrected:
-            self._equations.linearise_to(first)
+            self._system.linearise_to(first)
         for vector in (right, correction, *steps):
             vector.destroy()
         return corrected
 
     def _residual(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
-        equations, force = self._equations, np.empty(self._shape)
-        equations.residual(v, equations.stage.sigma * (v - equations.history), force)
-        (square,) = equations.points.global_sum(float(np.vdot(force, force)))
+        system, force = self._system, np.empty(self._shape)
+        system.residual(v, system.stage.sigma * (v - system.history), force)
+        (square,) = system.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
     def curve_guess(self, v: Array, guess: Array) -> None:
@@ -277,15 +277,15 @@ class Newton:
 
         Of all expected increments it takes the one whose end has the least energy.
         """
-        integrator = self._equations.integrator
+        integrator = self._system.integrator
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
         lowest = np.inf
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
-            self._equations.prescribe(end)
-            energy = self._equations.objective(end)[0] if others else 0.0
+            self._system.prescribe(end)
+            energy = self._system.objective(end)[0] if others else 0.0
             if energy < lowest:
                 lowest, guess[:] = energy, end
 
@@ -312,7 +312,7 @@ class Newton:
         y.setArray(-curved.ravel())
         descends = bool(residual.dot(y) > 0.0)
         if descends:
-            self._equations.linearise_to(v + increment)
+            self._system.linearise_to(v + increment)
             self.step_fraction = 1.0
         else:
             before.copy(y)
@@ -327,7 +327,7 @@ class Newton:
     def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
         increment = -self._array(y)
-        if not self._equations.turn_directors(self._array(x), increment):
+        if not self._system.turn_directors(self._array(x), increment):
             return False
         before = y.copy()
         y.setArray(-increment.ravel())
@@ -342,14 +342,14 @@ class Newton:
 
         Returns whether y changed.
         """
-        equations, v = self._equations, self._array(x)
-        fraction = equations.largest_step(v, -self._array(y))
+        system, v = self._system, self._array(x)
+        fraction = system.largest_step(v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
-        separated = equations.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
+        separated = system.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
         if separated is not None:
             before = y.copy()
             y.setArray(-separated.ravel())
-            farther = equations.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
+            farther = system.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:

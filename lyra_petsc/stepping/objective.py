@@ -22,15 +22,15 @@ class Objective:
     The last two values are kept, because the end of a line search and the first guess are evaluated twice.
     """
 
-    def __init__(self, equations: StageEquations) -> None:
-        self._equations = equations
+    def __init__(self, system: StageEquations) -> None:
+        self._system = system
         self._kept: list[tuple[Array, tuple[float, float]]] = []
         self._size = 0.0
 
     def begin_step(self) -> None:
         """Drop kept values, and take the largest coordinate from the state at the start of the step."""
         self.forget()
-        self._size = float(np.abs(self._equations.x).max(initial=0.0))
+        self._size = float(np.abs(self._system.x).max(initial=0.0))
 
     def forget(self) -> None:
         """Drop kept values, after the equations have changed."""
@@ -44,7 +44,7 @@ class Objective:
         """
         if self._kept:
             same = np.array([int(np.array_equal(v, at)) for at, _ in self._kept])
-            self._equations.points.comm.Allreduce(MPI.IN_PLACE, same, MPI.MIN)
+            self._system.points.comm.Allreduce(MPI.IN_PLACE, same, MPI.MIN)
             if same.any():
                 return self._kept[int(same.argmax())][1]
         result = self._computed(v)
@@ -52,7 +52,7 @@ class Objective:
         return result
 
     def _computed(self, v: Array) -> tuple[float, float]:
-        of = self._equations
+        of = self._system
         n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.c
         x, vs = of.evaluate_at(v)
         parts, square = [sigma * kinetic_energy(of.mass, v - of.history)], 0.0
@@ -81,5 +81,5 @@ class Objective:
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
         """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
-        fixed = [term for term in self._equations.active.elastic if not term.registration.neighbours]
+        fixed = [term for term in self._system.active.elastic if not term.registration.neighbours]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}

@@ -76,7 +76,7 @@ class Stepper:
     Parameters
     ----------
     scene : Scene
-    equations : StageEquations
+    system : StageEquations
     surface : Surface
     spacing : float
         Mean edge length [m], for the step tolerance.
@@ -103,14 +103,14 @@ class Stepper:
     """
 
     def __init__(
-        self, scene: Scene, equations: StageEquations, surface: Surface, spacing: float, floor: float
+        self, scene: Scene, system: StageEquations, surface: Surface, spacing: float, floor: float
     ) -> None:
-        self._scene, self._equations, self._surface = scene, equations, surface
+        self._scene, self._system, self._surface = scene, system, surface
         self._spacing, self._floor = spacing, floor
-        self._iterates = equations.integrator.iterates
+        self._iterates = system.integrator.iterates
         # presets and state of Newton's method, while another integrator replaces the scene's
         self._suspended: tuple[list[str], dict[str, float]] | None = None
-        points = equations.points
+        points = system.points
         self.presets = self._candidates()
         self._blend = Blend(self._hessian)
         self.our_options: list[str] = []
@@ -124,7 +124,7 @@ class Stepper:
 
     def _candidates(self) -> list[str]:
         """Linear solvers to try in order; collective."""
-        equations, scene, points = self._equations, self._scene, self._equations.points
+        system, scene, points = self._system, self._scene, self._system.points
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
         return presets.candidates(
@@ -132,8 +132,8 @@ class Stepper:
             points.comm.size,
             static=static,
             newton=self._iterates,
-            iterations=0.0 if static else expected_iterations(equations, step),
-            contact=equations.discretisation.limits_motion,
+            iterations=0.0 if static else expected_iterations(system, step),
+            contact=system.discretisation.limits_motion,
         )
 
     @property
@@ -142,7 +142,7 @@ class Stepper:
 
     def follow_integrator(self) -> None:
         """Change between Newton's method and one linear solve as the integrator demands; collective."""
-        if self._equations.integrator.iterates == self._iterates:
+        if self._system.integrator.iterates == self._iterates:
             return
         time, step = self.ts.getTime(), self.ts.getStepNumber()
         suspended, memory = self._suspended, self._newton.memory()
@@ -159,12 +159,12 @@ class Stepper:
         self.start(time, step)
 
     def _create_objects(self) -> None:
-        equations, scene = self._equations, self._scene
-        points = equations.points
+        system, scene = self._system, self._scene
+        points = system.points
         self.preset = self.presets[0]
         self._fill(presets.options_of(self.preset, points.comm.size))
         self.linear = LinearSystem(
-            equations, self._surface, self.preset, scene.solver.hessian, iterates=self._iterates
+            system, self._surface, self.preset, scene.solver.hessian, iterates=self._iterates
         )
         self.velocity = PETSc.Vec().create(points.comm)
         self.velocity.setSizes((3 * points.n_owned, 3 * points.n_global), bsize=3)
@@ -172,8 +172,8 @@ class Stepper:
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
-        ts.setType(equations.integrator.ts_type)
-        if equations.integrator.ts_type == "theta":
+        ts.setType(system.integrator.ts_type)
+        if system.integrator.ts_type == "theta":
             ts.setTheta(0.5)
         ts.setIFunction(self._ifunction, self.residual)
         self._set_jacobian()
@@ -188,11 +188,11 @@ class Stepper:
         snes.setInitialGuess(self._guess)
         limit = presets.break_even_iterations(points.n_global, self.presets)
         convergence = Convergence(
-            equations, scene.solver, self._spacing, self._floor, break_even_iterations=limit
+            system, scene.solver, self._spacing, self._floor, break_even_iterations=limit
         )
         self._newton = newton = Newton(
             snes,
-            equations,
+            system,
             self.linear,
             self._blend,
             convergence,
@@ -200,13 +200,13 @@ class Stepper:
             follow=self._follow_stencils,
         )
         ksp.setType(PETSc.KSP.Type.CG)
-        self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
-        if equations.discretisation.stencils_change or (equations.active.with_edges and self._iterates):
+        self._trace = Trace(snes, system, lambda: newton.linear_iterations)
+        if system.discretisation.stencils_change or (system.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
-        if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.limits_motion:
+        if PETSc.Options().getBool("contact_monitor", False) and system.discretisation.limits_motion:
             from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
 
-            snes.setMonitor(ContactMonitor(equations, lambda: newton.step_fraction))
+            snes.setMonitor(ContactMonitor(system, lambda: newton.step_fraction))
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
@@ -218,7 +218,7 @@ class Stepper:
             snes.setLineSearchPreCheck(newton.correct_direction)
             # an indefinite Hessian costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC, max_it=5000)
+            ksp.setTolerances(rtol=LOOSEST if system.integrator.dynamic else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=ONCE, max_it=5000)
@@ -247,7 +247,7 @@ class Stepper:
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
         self._follow_stencils()
-        if iteration > 0 and self._equations.update_frames():
+        if iteration > 0 and self._system.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
 
@@ -291,38 +291,38 @@ class Stepper:
         """Set time [s] and step number, and take the velocities from the equations' state."""
         self.ts.setTime(time)
         self.ts.setStepNumber(step)
-        self.velocity.setArray(self._equations.v[: self._shape[0]].ravel())
+        self.velocity.setArray(self._system.v[: self._shape[0]].ravel())
 
     def attempt(self, t0: float, t1: float) -> Attempt:
         """Try the step from t0 to t1 [s]; the state changes only on success; collective."""
-        equations = self._equations
+        system = self._system
         with PETSc.Log.Event(FROZEN):
-            equations.begin_step(t0, t1)
+            system.begin_step(t0, t1)
         number = self.ts.getStepNumber()
-        before = equations.x[: self._shape[0]].copy() if equations.solves_edges_at_end else None
-        rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
+        before = system.x[: self._shape[0]].copy() if system.solves_edges_at_end else None
+        rate_before = system.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        if equations.discretisation.limits_motion and not equations.find_start():
+        if system.discretisation.limits_motion and not system.find_start():
             self._trace.begin_solve()
-            failed = self._trace.failed_solve(equations.stationary_velocity())
+            failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
         velocity, message = self._solve(t0)
         if (
             velocity is not None
-            and equations.discretisation.limits_motion
-            and not equations.end_is_collision_free(velocity)
+            and system.discretisation.limits_motion
+            and not system.end_is_collision_free(velocity)
         ):
             velocity, message = None, WOULD_CROSS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.remaining, outcome.at_roundoff
         if velocity is not None:
-            if not self._iterates and equations.active.with_edges:
+            if not self._iterates and system.active.with_edges:
                 velocity = self._turn_directors(velocity)
-            equations.accept(velocity)
+            system.accept(velocity)
             if before is not None:
                 assert rate_before is not None
-                equations.begin_edge_solve(before)
+                system.begin_edge_solve(before)
                 rates, message = self._solve(t0)
                 newton, linear = (
                     newton + self.snes.getIterationNumber(),
@@ -330,14 +330,14 @@ class Stepper:
                 )
                 if rates is None:
                     failed, velocity = self._trace.failed_solve(), None
-                equations.end_edge_solve(rates)
+                system.end_edge_solve(rates)
                 if rates is None:
-                    equations.state.set(before, rate_before)
+                    system.state.set(before, rate_before)
         else:
             failed = self._trace.failed_solve()
         self.ts.setTimeStep(t1 - t0)
         if velocity is not None:
-            self.velocity.setArray(equations.v[: self._shape[0]].ravel())
+            self.velocity.setArray(system.v[: self._shape[0]].ravel())
             self.ts.setTime(t1)
             self.ts.setStepNumber(number + 1)
             norm, remaining, at_roundoff = ended
@@ -356,36 +356,36 @@ class Stepper:
 
     def _turn_directors(self, velocity: Array) -> Array:
         """Velocities (n_owned, 3) whose directors turn with their triangles if they turn far; collective."""
-        equations = self._equations
-        staying = equations.stationary_velocity()
+        system = self._system
+        staying = system.stationary_velocity()
         increment = velocity - staying
-        if equations.turn_directors(staying, increment):
+        if system.turn_directors(staying, increment):
             velocity = staying + increment
-        equations.evaluate_at(velocity)
-        equations.update_frames()
+        system.evaluate_at(velocity)
+        system.update_frames()
         return velocity
 
     def balance_edge_moments(self, floor: float) -> bool:
         """Solve for edge unknowns until moments on edges balance at the start shape, to ``floor`` [N];
         return whether they do; collective.
         """
-        equations, n = self._equations, self._shape[0]
+        system, n = self._system, self._shape[0]
         before = np.inf
-        while floor < (moments := equations.initial_edge_moments()) < before:
+        while floor < (moments := system.initial_edge_moments()) < before:
             before = moments if not self._iterates else 0.0
-            equations.begin_edge_solve(equations.x[:n].copy())
-            rates, _ = self._solve(equations.t0)
-            equations.end_edge_solve(rates)
-            self.start(equations.t0, 0)
+            system.begin_edge_solve(system.x[:n].copy())
+            rates, _ = self._solve(system.t0)
+            system.end_edge_solve(rates)
+            self.start(system.t0, 0)
             if rates is None:
                 return False
         return True
 
     def _solve(self, t0: float) -> tuple[Array | None, str]:
         """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective."""
-        equations, stage = self._equations, self._equations.stage
+        system, stage = self._system, self._system.stage
         self._follow_stencils()
-        self.velocity.setArray(equations.history.ravel())
+        self.velocity.setArray(system.history.ravel())
         # a TS step whose stage is at the integrator's time and whose shift is the integrator's σ
         theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
@@ -393,16 +393,14 @@ class Stepper:
         self.ts.setTimeStep(length)
         self._newton.begin_solve()
         if not self._iterates and not is_set("ksp_rtol"):
-            self.ksp.setTolerances(
-                rtol=ONCE_IN_CONTACT if equations.discretisation.has_near_elements else ONCE
-            )
+            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if system.discretisation.has_near_elements else ONCE)
         self._trace.begin_solve()
         try:
             self.ts.step()
         except Exception as error:
             if not isinstance(error, PETSc.Error) and not _runs_foreign_python():
                 raise
-            together = all_ranks_arrive(equations.points.comm)
+            together = all_ranks_arrive(system.points.comm)
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.error_message(error)}; "
@@ -422,7 +420,7 @@ class Stepper:
                 return None, f"{self.stopped_by} stopped Newton's method short of solver.force_tolerance"
             return None, reasons.failure_reason(self.snes, self.ksp)
         velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
-        if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
+        if system.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
         return velocity, ""
 
@@ -433,7 +431,7 @@ class Stepper:
         numbers: dict[str, Any] = {"preset": names[0], **newton}
         self.linear.reuse.discard()  # a resumed run has no preconditioner to reuse, and must behave alike
         if not self._iterates or self._suspended is not None:
-            self._extrapolation.record(time, self._equations.v[: self._shape[0]])
+            self._extrapolation.record(time, self._system.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()
         return arrays, numbers
 
@@ -445,7 +443,7 @@ class Stepper:
             self.next_preset()
         self._newton.restore(numbers)
         if not self._iterates:
-            v = self._equations.v[: self._shape[0]]
+            v = self._system.v[: self._shape[0]]
             self._extrapolation.restore(arrays, numbers.get("extrapolation", {}), time, v)
         self.start(time, step)
 
@@ -462,7 +460,7 @@ class Stepper:
         velocity = self._newton.globalisation.lowest_iterate()
         if velocity is None:
             return None
-        positions: Array = self._equations.evaluate_at(velocity)[0][: len(velocity)].copy()
+        positions: Array = self._system.evaluate_at(velocity)[0][: len(velocity)].copy()
         return positions
 
     @property
@@ -495,17 +493,17 @@ class Stepper:
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
         v, rate = (vec.getArray(readonly=True).reshape(self._shape) for vec in (u, udot))
-        self._equations.residual(v, rate, f.getArray().reshape(self._shape))
+        self._system.residual(v, rate, f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
-        if first_guess(self._equations, guess):
-            self._newton.curve_guess(self._equations.stationary_velocity(), guess)
+        if first_guess(self._system, guess):
+            self._newton.curve_guess(self._system.stationary_velocity(), guess)
         if not self._iterates:
             # the linear solve starts from the extrapolation; its tolerance stays relative to the full step
-            equations = self._equations
-            ahead = self._extrapolation.extrapolate(equations.t1, equations.t0, equations.v[: len(guess)])
-            equations.prescribe(ahead)
+            system = self._system
+            ahead = self._extrapolation.extrapolate(system.t1, system.t0, system.v[: len(guess)])
+            system.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 
     def _ijacobian(

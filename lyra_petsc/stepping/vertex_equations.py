@@ -23,7 +23,7 @@ class VertexEquations:
 
     Parameters
     ----------
-    equations : StageEquations
+    system : StageEquations
         Those of a scene with terms in ``active.coarse``.
 
     Attributes
@@ -33,13 +33,13 @@ class VertexEquations:
         The edges' unknowns as functions of the vertices.
     """
 
-    def __init__(self, equations: StageEquations) -> None:
-        self._equations, layout = equations, equations.points
-        self._bent = next(term for term in equations.active.elastic if isinstance(term, MidEdge))
+    def __init__(self, system: StageEquations) -> None:
+        self._system, layout = system, system.points
+        self._bent = next(term for term in system.active.elastic if isinstance(term, MidEdge))
         self._elastic: list[Elastic] = [
-            equations.active.coarse.get(term, term) for term in equations.active.elastic
+            system.active.coarse.get(term, term) for term in system.active.elastic
         ]
-        self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.active.viscous
+        self._viscous: list[Viscous] = [] if system.integrator.lagged_loads else system.active.viscous
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
@@ -61,20 +61,20 @@ class VertexEquations:
 
         Prescribed unknowns ``held`` (n_local, 3) are decoupled.
         """
-        equations, rows = self._equations, self._rows
-        (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.active
+        system, rows = self._system, self._rows
+        (x, vs), stage, damped = system.evaluated, system.stage, system.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.update(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
-        rows.set_diagonal(stage.sigma * equations.mass, values)
+        rows.set_diagonal(stage.sigma * system.mass, values)
         for term in self._elastic:
             weight: Array | float = stage.c
             if damped and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, equations.active.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, system.active.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(vs, equations.active.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(vs, system.active.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, values)
             rows.constrain(values, held, self._constrained)
@@ -92,9 +92,9 @@ class VertexEquations:
         edge = head - tail
         normal = np.cross(edge, opposite - tail)
         square = np.sum(normal * normal, axis=1)
-        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.stage.c
-        if self._equations.damping.active:
-            factor *= 1.0 + data["damping"][triangle] / self._equations.stage.c
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._system.stage.c
+        if self._system.damping.active:
+            factor *= 1.0 + data["damping"][triangle] / self._system.stage.c
         # n nᵀ / height²
         factor *= np.divide(
             np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0
