@@ -1,4 +1,4 @@
-"""Steps that follow a tolerance, and the plan of a load factor."""
+"""Adaptive steps and increments of the load factor."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def simulated(
 
 @pytest.fixture(scope="module")
 def converged() -> Array:
-    """Positions at the end, in time far beyond every tolerance below."""
+    """Positions at the end, with an error in time far below every tolerance of the tests."""
     shapes, comm = [], MPI.COMM_WORLD
     for step in (1e-3, 5e-4):
         time = {"end": END, "step": step, "integrator": "midpoint"}
@@ -64,7 +64,7 @@ def test_the_error_keeps_the_tolerance(
     assert max(lengths) > 1.5 * min(lengths)
 
 
-def test_states_and_events_are_landed_on(comm: MPI.Comm) -> None:
+def test_steps_end_at_output_times_and_events(comm: MPI.Comm) -> None:
     handles = [*SWING["handles"], {"nodes": [5], "until": 0.07}]
     time = {"end": END, "step": "auto", "integrator": "bdf2"}
     with simulated(comm, handles=handles, time=time) as simulation:
@@ -75,7 +75,7 @@ def test_states_and_events_are_landed_on(comm: MPI.Comm) -> None:
         assert min(abs(np.array(ends) - landing)) < 1e-12
 
 
-def test_limits_of_the_step_hold_and_are_told_of(comm: MPI.Comm) -> None:
+def test_smallest_and_largest_step_are_kept_with_a_note(comm: MPI.Comm) -> None:
     options = {"ts_adapt_dt_min": "0.004", "ts_adapt_dt_max": "0.008", "ts_dt": "0.005"}
     time = {"end": 0.1, "step": "auto", "tolerance": 1e-7, "integrator": "bdf2"}
     with simulated(comm, options, time=time) as simulation:
@@ -98,7 +98,7 @@ def test_a_large_error_shortens_the_step_and_a_small_one_lengthens_it() -> None:
     assert control.next_end(0.0) == pytest.approx(0.002)
 
 
-def test_no_crumb_is_left_before_a_landing() -> None:
+def test_no_tiny_step_remains_before_an_output_time() -> None:
     control = ToleranceControl(0.01, 0.1, 1.0, 0.05, [], 1e-6)
     assert control.next_end(0.035) == pytest.approx(0.0425)
     # a step cut short does not shorten those after it

@@ -1,4 +1,4 @@
-"""What is advised after a failed step names the key or option to change, and fits the cause."""
+"""Advice after a failed step: it fits the cause, and names the key or option to change."""
 
 from __future__ import annotations
 
@@ -72,18 +72,18 @@ def advised(
         (DIAGNOSIS, replace(NOW, dt=0.005), "-ts_adapt_dt_min below 0.005"),
     ],
 )  # fmt: skip
-def test_a_nonlinear_failure(diagnosis: Diagnosis, now: Circumstances, words: str) -> None:
+def test_advice_after_a_nonlinear_failure(diagnosis: Diagnosis, now: Circumstances, words: str) -> None:
     tolerances = {"force_tolerance": 1e-6, "step_tolerance": 1e-9}
     told = advised(diagnosis, now=now, solver=tolerances)
     assert failure_kind(diagnosis, STUCK) == "nonlinear trouble"
     assert words in told[0]
 
 
-def test_a_cause_that_is_not_there_is_not_told() -> None:
+def test_causes_that_do_not_apply_are_not_mentioned() -> None:
     assert advised() == ["more material.damping, or a finer mesh"]
 
 
-def test_iterations_that_ran_out() -> None:
+def test_advice_if_the_maximum_of_iterations_is_reached() -> None:
     ran_out = replace(STUCK, snes_reason=SNES.DIVERGED_MAX_IT, iterations=iterations(1.0, 1.0, 1.0, 1.0, 0.9))
     falling = replace(ran_out, iterations=iterations(1.0, 0.5, 0.3, 0.1, 0.01))
     assert advised(solve=falling)[0] == "solver.max_iterations above 50 (the residual was still falling)"
@@ -102,13 +102,13 @@ def test_iterations_that_ran_out() -> None:
         (-11, replace(NOW, preconditioner="cholesky"), "-pc_factor_shift_type positive_definite"),
     ],
 )
-def test_a_linear_failure(reason: int, now: Circumstances, words: str) -> None:
+def test_advice_after_a_linear_failure(reason: int, now: Circumstances, words: str) -> None:
     stuck = replace(STUCK, snes_reason=SNES.DIVERGED_LINEAR_SOLVE, ksp_reason=int(reason))
     assert failure_kind(DIAGNOSIS, stuck) == "linear trouble"
     assert words in advised(solve=stuck, now=now)[0]
 
 
-def test_linear_solves_that_fail_now_and_then_are_no_linear_trouble() -> None:
+def test_occasional_linear_failures_are_not_the_cause() -> None:
     stuck = replace(STUCK, snes_reason=SNES.DIVERGED_MAX_IT, ksp_reason=int(KSP.DIVERGED_INDEFINITE_MAT))
     mixed = (*iterations(1.0, 1.0, 1.0, 1.0), *iterations(1.0, 1.0, linear=-10)[1:])
     assert failure_kind(DIAGNOSIS, replace(stuck, iterations=mixed)) == "nonlinear trouble"
@@ -130,11 +130,11 @@ def test_linear_solves_that_fail_now_and_then_are_no_linear_trouble() -> None:
         (replace(DIAGNOSIS, not_finite=9, vertex=replace(VERTEX, moved=1e9)), "initial"),
     ],
 )
-def test_overflow(diagnosis: Diagnosis, words: str) -> None:
+def test_advice_after_an_overflow(diagnosis: Diagnosis, words: str) -> None:
     assert failure_kind(diagnosis, STUCK) == "overflow"
     assert words in advised(diagnosis)[0]
 
 
-def test_a_static_analysis_without_handles() -> None:
+def test_advice_for_a_static_analysis_without_handles() -> None:
     told = advised(handles=[], motions={}, time={"analysis": "static"})
     assert told[0] == "handles (nothing holds the sheet)"

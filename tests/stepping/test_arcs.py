@@ -1,4 +1,4 @@
-"""Newton's steps of equilibria along arcs."""
+"""Newton steps of equilibria along arcs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AXIS = np.array([0.6, 0.0, 0.8])
 
 
 def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities of staying, and the way on the tangent of a turn about the origin."""
+    """Zero velocities, and the increment that is tangential to a rotation about the origin."""
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
     system.begin_step(0.0, 1.0)
     way = np.zeros_like(system.history)
@@ -38,7 +38,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
 
 
 @pytest.mark.parallel(2, 3)
-def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
+def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SHEET))
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
     staying, way = turning(simulation, 0.9 * MAX_TURN)
@@ -65,7 +65,7 @@ def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(1)
-def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
+def test_arcs_equal_the_increment_to_first_order(comm: MPI.Comm) -> None:
     content = SHEET | {"handles": [{"group": "left", "clamp": True}]}
     simulation = SteppedScene(comm, scene_of(content))
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
@@ -96,7 +96,7 @@ def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
         (lambda bench: open_cylinder_scene(bench, 16, "alternating"), 40),  # 36
     ],
 )
-def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> None:
+def test_a_shell_with_large_rotations_takes_few_iterations(shell: Any, most: int) -> None:
     bench, step = Bench(MPI.COMM_SELF, direct=False), 1.0 / 15.0
     content = shell(bench)[0] | {
         "gravity": [0, 0, 0],
@@ -111,7 +111,7 @@ def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> N
     assert newton <= most
 
 
-def test_a_leap_that_runs_out_of_iterations_is_gone_on_with(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_leap_that_reaches_its_maximum_of_iterations_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, starts = Bench(MPI.COMM_SELF, direct=False), list[np.ndarray]()
     content = open_cylinder_scene(bench, 8, "alternating")[0] | {
         "gravity": [0, 0, 0],

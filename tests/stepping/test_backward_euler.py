@@ -27,7 +27,7 @@ def test_free_fall(comm: MPI.Comm, dt: float, steps: int, z: float) -> None:
 
 
 def eigenvalue(matrix: Array) -> complex:
-    """Of a real 2 × 2 matrix the one in the upper half plane (or the larger real one)."""
+    """Eigenvalue of a real 2 × 2 matrix in the upper half plane, or the larger one if both are real."""
     values = np.linalg.eigvals(matrix)
     return complex(values[np.argmax(values.imag + 1e-9 * values.real)])
 
@@ -154,7 +154,7 @@ def test_edge_on_drag_is_linear_in_the_velocity() -> None:
         assert v == pytest.approx(density * g / drag, rel=0.05)  # near its end value
 
 
-def test_momentum_of_a_free_sheet_is_kept_and_its_spin_never_grows() -> None:
+def test_a_free_sheet_keeps_its_momentum_and_does_not_gain_spin() -> None:
     content = {
         "mesh": grid(1, 1, 4, 4),
         "material": CLOTH | {"bending": 1e-3, "damping": 0.01},

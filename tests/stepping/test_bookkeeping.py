@@ -1,4 +1,4 @@
-"""Forces of handles, energies of turning clamps, tolerances: numbers that no motion depends on."""
+"""Forces of handles, energies of moving clamps, error estimates, tolerances and restarts."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def handle_sums(comm: MPI.Comm, handles: list[dict[str, Any]]) -> Array:
 
 
 @pytest.mark.parametrize("stiffness", [None, 40.0])
-def test_handles_bear_the_weight(stiffness: float | None, comm: MPI.Comm) -> None:
-    """On any number of ranks, each of them, exact or soft: what they do to the sheet, upwards."""
+def test_handle_forces_carry_the_weight(stiffness: float | None, comm: MPI.Comm) -> None:
+    """Forces of each handle on the sheet, prescribed or by springs, on any number of ranks."""
     soft = {} if stiffness is None else {"stiffness": stiffness}
     handles = [{"nodes": [corner]} | soft for corner in (0, 6, 35, 41)]
     forces = handle_sums(comm, handles)
@@ -47,8 +47,8 @@ def test_handles_bear_the_weight(stiffness: float | None, comm: MPI.Comm) -> Non
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2"])
-def test_a_turning_clamp_stores_energy_where_it_stands(integrator: str, comm: MPI.Comm) -> None:
-    """Energies of a state are against the targets at its time, whatever time the stage had."""
+def test_energy_of_a_turning_clamp_uses_targets_of_the_same_time(integrator: str, comm: MPI.Comm) -> None:
+    """Energies of a state use the targets at its time, not those at the time of the stage."""
     turned = {"rotate": {"axis": [0, 1, 0], "degrees": -60}}
     handles = [{"group": "left", "clamp": True, "motion": "turn"}]
     motions = {"turn": [{"time": 0}, {"time": 0.1} | turned]}
@@ -66,8 +66,8 @@ def test_a_turning_clamp_stores_energy_where_it_stands(integrator: str, comm: MP
         assert comm.allreduce(here) > 1e-4
 
 
-def test_statics_end_at_their_tolerance(comm: MPI.Comm) -> None:
-    """Not far above it, where it is loose enough for the last proximal step not to end far below."""
+def test_static_analyses_end_at_their_tolerance(comm: MPI.Comm) -> None:
+    """The last proximal step must not end far above a loose tolerance, nor far below it."""
     left = []
     for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
         content = {"handles": [{"nodes": [0, 6]}], "solver": {"force_tolerance": tolerance}, "time": STATIC}
@@ -79,8 +79,8 @@ def test_statics_end_at_their_tolerance(comm: MPI.Comm) -> None:
     assert max(left) < 5.0, left
 
 
-def test_the_first_order_estimate_is_the_error_of_free_fall(comm: MPI.Comm) -> None:
-    """Where backward Euler errs by ½ g Δt² in every step, and errors add up."""
+def test_first_order_error_estimate_of_free_fall_is_exact(comm: MPI.Comm) -> None:
+    """Backward Euler has an error of ½ g Δt² in every step, and the errors add up."""
     time = {"end": 0.2, "step": "auto", "tolerance": 0.02}
     with done(comm, time=time) as simulation:
         size = simulation.problem.outline.size
@@ -90,8 +90,8 @@ def test_the_first_order_estimate_is_the_error_of_free_fall(comm: MPI.Comm) -> N
         assert error < 1.2 * 0.02
 
 
-def test_a_static_analysis_begins_in_balance(comm: MPI.Comm) -> None:
-    """What a start shape needs to stay is let go of with the load factor."""
+def test_a_static_analysis_starts_in_equilibrium(comm: MPI.Comm) -> None:
+    """Forces that hold the start shape decrease with the load factor."""
     still = {"gravity": [0, 0, 0], "initial": {"noise": 5e-3}, "handles": [{"nodes": [0, 6]}]}
     simulation = SteppedScene(comm, scene_of(SHEET | still | {"time": STATIC}))
     system, left = simulation.problem.system, []
@@ -104,8 +104,8 @@ def test_a_static_analysis_begins_in_balance(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
-def test_a_load_that_switches_begins_the_scheme_anew() -> None:
-    """What generalised-α remembers of before the jump does not count after it: it stays of second order."""
+def test_second_order_if_a_load_switches() -> None:
+    """Generalised-α computes new accelerations after a jump of the load."""
     soft = {"c11": 60.0, "c22": 40.0, "c12": 15.0, "c33": 12.0}  # so that Δt resolves it
     content = {
         "gravity": [0, 0, 0],
@@ -123,7 +123,7 @@ def test_a_load_that_switches_begins_the_scheme_anew() -> None:
     assert coarse / fine == pytest.approx(4.06, abs=0.3)  # 3.2 where it is not
 
 
-def test_round_off_makes_no_tiny_step() -> None:
+def test_round_off_of_the_time_causes_no_tiny_step() -> None:
     control = StepControl(0.1, 0.3, None, [], 1e-5)
     assert control.next_end(0.2 - 1e-9) == 0.3
     assert control.next_end(0.1 - 1e-9) == pytest.approx(0.2 - 1e-9, abs=1e-15)

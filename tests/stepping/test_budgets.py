@@ -1,4 +1,4 @@
-"""Energy and momentum of every step add up, whatever acts on the sheet."""
+"""Balances of energy and momentum in every step, under all kinds of loads and handles."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def total(budget: Budget) -> float:
 
 
 def bracket(simulation: Simulation, before: Array) -> float:
-    """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the step just made."""
+    """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the last step."""
     system = simulation.system
     n = system.points.n_owned
     change = 0.0
@@ -94,7 +94,7 @@ def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: s
 
 
 @pytest.mark.parametrize("name", ["free", "damping"])
-def test_a_free_sheet_never_gains_energy_but_through_its_bracket(comm: MPI.Comm, name: str) -> None:
+def test_a_free_sheet_gains_energy_only_by_its_bracket(comm: MPI.Comm, name: str) -> None:
     with Simulation(BASE | SCENES[name], comm) as simulation:
         system = simulation.system
         n = system.points.n_owned
@@ -112,7 +112,7 @@ def test_a_free_sheet_never_gains_energy_but_through_its_bracket(comm: MPI.Comm,
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if "clamp" not in name])
-def test_forces_and_reactions_are_the_change_of_momentum(comm: MPI.Comm, name: str) -> None:
+def test_forces_and_reactions_equal_the_change_of_momentum(comm: MPI.Comm, name: str) -> None:
     with Simulation(BASE | SCENES[name], comm) as simulation:
         system = simulation.system
         n = system.points.n_owned

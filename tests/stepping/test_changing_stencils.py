@@ -1,4 +1,4 @@
-"""Stencils that change as the sheet moves, by a term that lives in the tests: vertices repel each other."""
+"""Stencils that change as the sheet moves, with a term of the tests by which vertices repel each other."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ SPEED = 2.0
 
 @pytest.fixture(autouse=True)
 def repulsion(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every scene has the term."""
+    """Adds the term to every scene."""
     with monkeypatch.context() as patch:
         patch.setattr(registry, "REGISTRY", [*registry.REGISTRY, REPULSION])
         yield
 
 
 def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> SteppedScene:
-    """Two sheets that fly at each other."""
+    """Two sheets that fly towards each other."""
     simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
     system = simulation.problem.system
     n = system.points.n_owned
@@ -63,7 +63,7 @@ def term_of(simulation: SteppedScene) -> Repulsion:
 
 
 def momentum(simulation: SteppedScene) -> Array:
-    """(3,) [kg m/s]."""
+    """Total momentum (3,) [kg m/s]."""
     system = simulation.problem.system
     n = system.points.n_owned
     return np.asarray(system.points.global_sum(*(system.mass @ system.v[:n])))
@@ -75,7 +75,7 @@ def flown(
     watch: Callable[[SteppedScene], None] = lambda simulation: None,
     **petsc: Any,
 ) -> tuple[Array, float, float]:
-    """Positions in mesh order, mean upward speed of the upper sheet, and most pairs, of a whole run."""
+    """Positions in mesh order, mean upward speed of the upper sheet, largest number of pairs."""
     with options(petsc):
         simulation = thrown(comm, scene)
         pairs = 0.0
@@ -110,8 +110,8 @@ def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
     assert speed > (0.3 if integrator in ("beuler", "semi-implicit") else 0.6) * SPEED
 
 
-def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
-    """Points that were near when the last matrix was made no longer are."""
+def test_the_linear_solver_can_change_together_with_stencils(comm: MPI.Comm) -> None:
+    """Points that were near when the last matrix was created are far apart now."""
     simulation = thrown(comm, {})
     simulation.step()
     system = simulation.problem.system
@@ -128,7 +128,7 @@ def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
-def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None:
+def test_nothing_crosses_and_newton_increments_are_limited(comm: MPI.Comm) -> None:
     nearest: list[float] = []
 
     def watch(simulation: SteppedScene) -> None:
@@ -153,7 +153,7 @@ ALL_SOLVERS = SOLVERS | {"assembled operator": {"pc_type": "pbjacobi", "mat_type
 
 
 @pytest.mark.parametrize("name", ALL_SOLVERS)
-def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
+def test_every_linear_solver_works(comm: MPI.Comm, name: str) -> None:
     time = {"time": SCENE["time"] | {"end": 0.03}}
     x = flown(comm, time)[0]
     np.testing.assert_allclose(
@@ -163,7 +163,7 @@ def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "alpha2"])
-def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str) -> None:
+def test_adaptive_steps(comm: MPI.Comm, integrator: str) -> None:
     time = {"end": 0.05, "step": "auto", "tolerance": 2e-3, "integrator": integrator}
     _, speed, pairs = flown(comm, {"time": time})
     assert pairs > 20
@@ -171,7 +171,7 @@ def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str) -> None:
 
 
 def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
-    """Statics: the forces between the sheets carry the load on the upper one."""
+    """In a static analysis, the forces between the sheets carry the load on the upper one."""
     pressed = {
         "mesh": [LOWER | {"name": "lower"}, UPPER | {"transform": {"translate": [0.03, 0.01, 0.07]}}],
         "handles": [
@@ -190,7 +190,7 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
         assert carried == pytest.approx(3.0, rel=1e-6)
 
 
-def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_without_change_do_not_search(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = thrown(comm, {"time": {"end": 1.0, "step": 1e-4}})
     searches = []
     term, search = term_of(simulation), Repulsion.neighbours
@@ -205,7 +205,7 @@ def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: py
     simulation.destroy()
 
 
-def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_history_has_the_columns_and_a_run_resumes_on_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     folder = shared_tmp / "run"
     simulation = thrown(comm, {})
     recorder = Recorder(simulation)
@@ -249,8 +249,8 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
     comm.Barrier()
 
 
-def test_derivatives(comm: MPI.Comm) -> None:
-    """Gradient and Hessian against differences, in the assembled matrix, where the sheets are near."""
+def test_derivatives_agree_with_finite_differences(comm: MPI.Comm) -> None:
+    """Gradient and Hessian, in the assembled matrix, while the sheets are near."""
     simulation = thrown(comm, {})
     system = simulation.problem.system
     for _ in range(12):

@@ -1,4 +1,4 @@
-"""The note on triangles that are compressed beyond where the membrane model softens."""
+"""The note on triangles that are compressed so far that the membrane model softens."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(comm: MPI.Comm, scene: Scene) -> tuple[list[str], list[tuple[float, floa
 
 
 @pytest.mark.parallel(2)
-def test_told_once_with_step_and_triangle(comm: MPI.Comm) -> None:
+def test_one_note_names_step_and_triangle(comm: MPI.Comm) -> None:
     notes, stretches = run(comm, pressed(0.5))
     expected = [0.875, 0.75, 0.625, 0.5, 0.5, 0.5]
     np.testing.assert_allclose([smallest for smallest, _ in stretches], expected)
@@ -50,7 +50,7 @@ def test_told_once_with_step_and_triangle(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_nothing_is_told_above_the_limit(comm: MPI.Comm) -> None:
+def test_no_note_above_the_limit(comm: MPI.Comm) -> None:
     notes, stretches = run(comm, pressed(SOFTENS_BELOW + 1e-3))
     assert min(smallest for smallest, _ in stretches) < SOFTENS_BELOW + 2e-3
     assert [note for note in notes if "softens" in note] == []

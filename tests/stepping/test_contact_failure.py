@@ -1,4 +1,4 @@
-"""A sheet that is squeezed to nothing ends the run with what is in the way, and where."""
+"""Contact that a step cannot resolve: failures that name the obstacle and the place, and fast obstacles."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def take_all_steps(simulation: SteppedScene) -> None:
         simulation.step()
 
 
-def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
+def test_the_obstacle_that_blocks_a_sheet_is_named(comm: MPI.Comm) -> None:
     press = [{"time": 0.0}, {"time": 0.02, "translate": [0, 0, -0.2]}]
     scene = SHEET | {
         "obstacles": SHEET["obstacles"] | {"plate": PLATE},
@@ -56,8 +56,8 @@ def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
-def test_a_load_step_in_which_a_plate_comes_to_where_the_sheet_is(comm: MPI.Comm) -> None:
-    """Forces there are no numbers; it is repeated with a smaller increment."""
+def test_a_load_step_in_which_a_plate_reaches_the_sheet_is_repeated(comm: MPI.Comm) -> None:
+    """Contact forces are not finite in the first attempt; smaller increments succeed."""
     scene = SHEET | {
         "obstacles": {"plate": {"plane": {"point": [0, 0, 0.03], "normal": [0, 0, -1]}, "motion": "press"}},
         "gravity": [0, 0, 0],
@@ -73,7 +73,7 @@ def test_a_load_step_in_which_a_plate_comes_to_where_the_sheet_is(comm: MPI.Comm
     simulation.destroy()
 
 
-def test_what_moves_does_work(comm: MPI.Comm) -> None:
+def test_moving_obstacles_do_work(comm: MPI.Comm) -> None:
     floor = {"plane": {"point": [0, 0, -0.0199], "normal": [0, 0, 1]}, "motion": "lift"}
     scene = SHEET | {
         "obstacles": {"floor": floor},
@@ -102,8 +102,8 @@ BALL: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
-def test_accelerations_are_those_before_an_obstacle_comes(comm: MPI.Comm, integrator: str) -> None:
-    """At the stage of the first step the ball is where the sheet was."""
+def test_initial_accelerations_exclude_obstacles_that_come_later(comm: MPI.Comm, integrator: str) -> None:
+    """At the stage of the first step the ball is where the sheet was at the start."""
     scene = BALL | {
         "motions": {"up": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, 100.0]}]},
         "time": {"end": 0.0025, "step": 0.0025, "integrator": integrator},
@@ -116,8 +116,8 @@ def test_accelerations_are_those_before_an_obstacle_comes(comm: MPI.Comm, integr
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
-def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) -> None:
-    """A ball goes many gaps in a step, through where the sheet was; its work is that of its force."""
+def test_a_fast_obstacle_takes_the_sheet_with_it(comm: MPI.Comm, integrator: str) -> None:
+    """A ball moves by many gaps in a step, through the sheet's old place; its work is that of its force."""
     speed, step = 20.0, 0.005
     scene = BALL | {
         "motions": {"up": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, speed]}]},
@@ -135,7 +135,7 @@ def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) 
 
 
 def test_impacts_add_little_energy_under_the_midpoint_rule(comm: MPI.Comm) -> None:
-    """A sheet thrown at a ball; 2 % without what `impacts` takes back."""
+    """A sheet thrown at a ball gains 2 % of energy without the correction by ``impacts``."""
     scene = BALL | {
         "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
         "initial": {"velocity": [0, 0, -5.0]},
@@ -161,8 +161,8 @@ ON_A_TABLE: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(("integrator", "step"), [("bdf2", 0.001), ("alpha2", 0.02), ("midpoint", 0.005)])
-def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) -> None:
-    """What these remember of a motion does not hold over an impact; there backward Euler takes over."""
+def test_impacts_create_no_energy(comm: MPI.Comm, integrator: str, step: float) -> None:
+    """Histories of other integrators are not valid across an impact; backward Euler takes these steps."""
     time = {"end": 0.04, "step": step, "integrator": integrator}
     simulation = SteppedScene(comm, scene_of(ON_A_TABLE | {"time": time}))
     start, most = simulation.budget.total, 0.0
@@ -177,7 +177,7 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) ->
     simulation.destroy()
 
 
-def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: MPI.Comm) -> None:
+def test_semi_implicit_impacts_are_computed_by_newtons_method(comm: MPI.Comm) -> None:
     time = {"end": 0.015, "step": 0.005, "integrator": "semi-implicit"}
     scene = ON_A_TABLE | {"time": time, "initial": {"velocity": [0, 0, -60.0]}}
     simulation = SteppedScene(comm, scene_of(scene))
@@ -194,7 +194,7 @@ def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: 
 
 
 @pytest.mark.parametrize("integrator", ["alpha2", "semi-implicit"])
-def test_automatic_steps_do_not_follow_an_impact_for_ever(comm: MPI.Comm, integrator: str) -> None:
+def test_adaptive_steps_are_not_shortened_without_end_by_an_impact(comm: MPI.Comm, integrator: str) -> None:
     scene = BALL | {
         "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
         "initial": {"velocity": [0, 0, -100.0]},
@@ -211,8 +211,8 @@ def test_automatic_steps_do_not_follow_an_impact_for_ever(comm: MPI.Comm, integr
     simulation.destroy()
 
 
-def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
-    """A blade turns by 120° a step, whose ends are on both sides of the sheet's edge."""
+def test_an_obstacle_that_turns_past_the_sheet_is_stopped(comm: MPI.Comm) -> None:
+    """A blade turns by 120° in a step; before and after it, it is on different sides of the sheet's edge."""
     blade = {"capsule": {"from": [-0.1, 0, 0], "to": [0.5, 0, 0], "radius": 0.01}, "motion": "turn"}
     scene = {
         "mesh": grid(0.2, 0.2, 2, 2)
@@ -233,7 +233,7 @@ def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
-def test_the_nearest_obstacle_is_named_beside_sheets_that_are_nearer(comm: MPI.Comm) -> None:
+def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm) -> None:
     far, near = ({"floor": {"plane": {"point": [0, 0, z], "normal": [0, 0, 1]}}} for z in (-9.0, -0.015))
     other = SHEET["mesh"] | {"transform": {"translate": [0.1, 0.1, 0.006]}}
     scene = SHEET | {"mesh": [SHEET["mesh"], other], "time": {"end": 0.1, "step": 0.001}}

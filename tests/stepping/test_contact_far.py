@@ -1,4 +1,4 @@
-"""What contact costs where nothing is near: the same solves as without, and one search a step."""
+"""Cost of contact if nothing is near: the same solves as without contact, and one search per step."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def timed(integrator: str) -> dict[str, Any]:
     return {"time": {"end": 1.0, "step": 0.005, "integrator": integrator}, "solver": {}}
 
 
-def test_a_linear_solve_is_that_of_a_step_without_contact() -> None:
+def test_linear_solves_are_those_of_a_step_without_contact() -> None:
     found = []
     for more in ({}, FAR):
         simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | more | timed("semi-implicit")))
@@ -43,8 +43,8 @@ def test_a_linear_solve_is_that_of_a_step_without_contact() -> None:
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint", "alpha2"])
-def test_a_step_is_searched_once(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, integrator: str) -> None:
-    """Also where vertices go farther than the gap, and equations are asked for in the middle of the way."""
+def test_one_search_per_step(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, integrator: str) -> None:
+    """Also if vertices move by more than the gap, and forces are evaluated within the step."""
     searches, search = 0, ContactBarrier.neighbours
 
     def counted(*given: Any) -> Any:
@@ -63,15 +63,15 @@ def test_a_step_is_searched_once(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
-def test_a_fall_through_many_small_gaps_needs_no_shorter_steps(integrator: str) -> None:
-    """The way on from the stage, hundreds of times the gap, is not known from the search before the step."""
+def test_falling_by_many_gaps_per_step_needs_no_shorter_steps(integrator: str) -> None:
+    """The search before the step does not cover the displacement after the stage, hundreds of gaps."""
     falls = {"handles": [], "initial": {"velocity": [0.0, 0.0, -1.0]}, "contact": {"gap": 1e-5}}
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | FAR | falls | timed(integrator)))
     assert not sum(simulation.step().rejected for _ in range(STEPS))
     simulation.destroy()
 
 
-def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> None:
+def test_damping_is_a_multiple_of_the_stiffness_until_something_is_near() -> None:
     with Simulation(SCENE | FAR, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
         values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
@@ -90,8 +90,8 @@ def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> Non
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("shape", ["sphere", "capsule"])
-def test_what_is_nearly_flat_is_felt_as_a_plane(comm: MPI.Comm, shape: str) -> None:
-    """Where nearest points to a far centre are anywhere, and distances from it have few digits."""
+def test_an_obstacle_of_huge_radius_acts_as_a_plane(comm: MPI.Comm, shape: str) -> None:
+    """With a distant centre, nearest points and distances lose digits."""
     radius, side = 1e4, 0.4
     ends = {"from": [-5.0, 0.0, -radius], "to": [5.0, 1.0, -radius]}
     place = ends if shape == "capsule" else {"center": [0.0, 0.0, -radius]}

@@ -1,4 +1,4 @@
-"""A Newton iteration sees what would touch on its way, and does not stop at each of it."""
+"""Newton's method with contact: the linear model includes pairs that would touch within the increment."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CELLS, GAP, STEPS = 24, 1e-5, 3
 
 
 def thrown_at_a_ball() -> dict[str, Any]:
-    """A sheet whose edges are far longer than the ball is round within a gap: few of its triangles touch."""
+    """A sheet whose edges are far longer than the contact region on the ball: few of its triangles touch."""
     place = {"translate": [-0.5, -0.48, 0.0]}
     return {
         "mesh": grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": place},
@@ -48,7 +48,7 @@ def steps(comm: MPI.Comm) -> tuple[Array, list[int]]:
     return gathered(system.points, system.x), newton
 
 
-def test_what_meets_in_a_step_is_found_in_few_iterations(
+def test_new_contacts_within_a_step_take_few_iterations(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     x, newton = steps(comm)

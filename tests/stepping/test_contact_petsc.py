@@ -1,4 +1,4 @@
-"""What a user of PETSc chooses and sees of contact: preconditioners, ``-contact_monitor``, ``-ksp_view``."""
+"""PETSc options with contact: preconditioners, ``-contact_monitor``, ``-ksp_view``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ KINDS: dict[str, dict[str, str]] = {
 
 
 def thrown(comm: MPI.Comm, options: dict[str, str]) -> Array:
-    """Positions (V, 3) after the steps, in mesh order; every vertex has come to touch."""
+    """Positions (V, 3) after the steps, in mesh order, when every vertex has touched."""
     for name, value in options.items():
         PETSc.Options().setValue(name, value)
     simulation = SteppedScene(comm, scene_of(SCENE))
@@ -68,14 +68,14 @@ def expected() -> Array:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("kind", KINDS)
-def test_any_preconditioner_serves_contact(comm: MPI.Comm, kind: str, expected: Array) -> None:
+def test_every_preconditioner_works_with_contact(comm: MPI.Comm, kind: str, expected: Array) -> None:
     if kind == "mumps" and not PETSc.Sys.hasExternalPackage("mumps"):
         pytest.skip("PETSc has no MUMPS")
     x = thrown(comm, KINDS[kind] | {"ksp_rtol": "1e-10"})
     np.testing.assert_allclose(x, expected, rtol=0.0, atol=1e-7 * SIDE)
 
 
-def test_the_monitor_tells_of_contact_and_friction(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_monitor_shows_contact_and_friction(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
     PETSc.Options().setValue("contact_monitor", "")
     PETSc.Options().setValue("ksp_view", "")
     simulation = SteppedScene(comm, scene_of(SCENE))

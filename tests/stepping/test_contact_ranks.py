@@ -1,4 +1,4 @@
-"""Contact does not depend on the number of ranks, and its work is shared among them."""
+"""Contact does not depend on the number of ranks, which share its work."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TURNED = {"rotate": {"axis": [0.3, 1.0, 0.5], "degrees": 20.0}}
 
 
 def on(value: Any, *ranks: int) -> Any:
-    """A parameter of a test that compares so many ranks with one."""
+    """A test's parameter that is run on ``ranks`` ranks and compared with one."""
     return pytest.param(value, marks=pytest.mark.parallel(*ranks, alone=False))
 
 
@@ -65,7 +65,7 @@ def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
 
 
 def two_sheets(folder: Path) -> dict[str, Any]:
-    """One falls, turned, on one that is held by two of its edges."""
+    """A rotated sheet falls on another one that is held by two of its edges."""
     turned = TURNED | {"translate": [0.05, 0.05, 0.08]}
     return {
         "mesh": [grid(0.3, 0.3, 6, 6), grid(0.2, 0.2, 5, 5) | {"transform": turned}],
@@ -87,7 +87,7 @@ def tent(folder: Path) -> dict[str, Any]:
 
 
 def roll(folder: Path) -> dict[str, Any]:
-    """A strip in two turns falls on the floor, and collapses on itself."""
+    """A strip, rolled up twice, falls on the floor and collapses on itself."""
     angles, wide = np.linspace(0.0, 4.0 * np.pi, 33), 4
     radius = 0.05 + 0.016 * angles / (2.0 * np.pi)
     spiral = np.column_stack([radius * np.cos(angles), radius * np.sin(angles) + 0.087])
@@ -130,7 +130,7 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
 
 @pytest.mark.parametrize("integrator", [on("semi-implicit", 2), on("beuler"), on("bdf2", 3)])
 def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) -> None:
-    """An impact magnifies what a step leaves, which depends on the number of ranks."""
+    """An impact magnifies the error that a step leaves, which depends on the number of ranks."""
     content = {
         "mesh": grid(0.5, 0.5, 12, 12) | {"transform": TURNED | {"translate": [-0.25, -0.25, 0.35]}},
         "gravity": [0.0, 0.0, -9.81],
@@ -156,7 +156,7 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
 
 @pytest.mark.parallel(2, alone=False)
 def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
-    """What linear solves leave adds up until something is near."""
+    """Errors of linear solves add up until something is near."""
     turned = {"rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 20.0}, "translate": [-0.05, -0.12, 0.05]}
     content = {
         "mesh": [grid(0.22, 0.3, 9, 12, "alternating"), grid(0.2, 0.2, 8, 8) | {"transform": turned}],
@@ -178,8 +178,10 @@ def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
 
 
 def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
-    """They buckle in one of many ways. What the preconditioner, which depends on the ranks, leaves of the
-    first directions of Newton's method must not tell in which.
+    """Sheets buckle in one of many ways.
+
+    Errors of the preconditioner in the first Newton increments, which depend on the ranks, must not decide in
+    which.
     """
     turned = TURNED | {"translate": [-0.05, 0.03, 0.06 + 0.14435478835021417]}
     content = {
@@ -212,8 +214,8 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
 
 
-def test_only_what_is_near_and_fast_collides(comm: MPI.Comm) -> None:
-    """Towards the floor, and towards each other."""
+def test_collisions_are_expected_if_parts_are_near_and_approach_fast(comm: MPI.Comm) -> None:
+    """With the floor, and with each other."""
     with Simulation(falling(0.02), comm) as simulation:
         system, n = simulation.problem.system, simulation.problem.points.n_owned
         lower = (simulation.problem.points.mesh_vertices < 4)[:, None]
@@ -229,8 +231,7 @@ def test_only_what_is_near_and_fast_collides(comm: MPI.Comm) -> None:
         assert not collides(5.0, -5.0)
 
 
-def test_there_is_room_near_the_start_of_a_way() -> None:
-    """Points as far from its end as they may be are still near its start."""
+def test_points_as_far_from_the_end_of_a_displacement_as_allowed_are_near_its_start() -> None:
     with Simulation(falling(0.02), MPI.COMM_SELF) as simulation:
         contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
         known, x = simulation.problem.discretisation, simulation.problem.system.x + 1.0
@@ -245,10 +246,10 @@ def test_there_is_room_near_the_start_of_a_way() -> None:
         assert known.searched_fraction(x, 2.0 * reach * x_way) == pytest.approx(0.65)
 
 
-def test_of_ways_through_everything_the_beginning_is_searched(
+def test_only_the_start_of_increments_through_many_parts_is_searched(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A step of Newton's method may lead all vertices of a crumpled sheet through each other."""
+    """A Newton increment may move all vertices of a crumpled sheet through each other."""
     monkeypatch.setattr(contact, "MAX_PAIRS", 0)
     layers = [grid(0.3, 0.3, 8, 8) | {"transform": {"translate": [0.0, 0.0, 0.02 * n]}} for n in range(12)]
     with Simulation({"mesh": layers, "contact": {"gap": 1e-3}}, comm) as simulation:
@@ -261,7 +262,7 @@ def test_of_ways_through_everything_the_beginning_is_searched(
         assert 0.01 < known.searched_fraction(x, ways) < 0.5
 
 
-def test_the_pairs_of_a_stack_are_shared(comm: MPI.Comm) -> None:
+def test_ranks_share_the_pairs_of_a_stack(comm: MPI.Comm) -> None:
     one, gap = grid(1.0, 1.0, 12, 12), 0.02
     content = {
         "mesh": [one | {"transform": {"translate": [0.0, 0.0, 0.9 * gap * (n + 1)]}} for n in range(4)],

@@ -1,4 +1,4 @@
-"""What contact cannot begin with is refused, with the place."""
+"""Starts that contact refuses, with the place."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def obstacle(**shape: Any) -> dict[str, Any]:
 
 
 def refusal(comm: MPI.Comm, scene: dict[str, Any]) -> str:
-    """The message, the same on all ranks."""
+    """The message, which is the same on all ranks."""
     with pytest.raises(InputError) as caught, Simulation(scene, comm):
         pass
     text = str(caught.value)
@@ -61,7 +61,7 @@ OVERLAPS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", OVERLAPS)
-def test_what_is_in_an_obstacle(comm: MPI.Comm, name: str) -> None:
+def test_a_sheet_within_an_obstacle(comm: MPI.Comm, name: str) -> None:
     shape, words = OVERLAPS[name]
     text = refusal(comm, obstacle(**shape))
     assert text.startswith("obstacles.thing: at the start ")
@@ -88,7 +88,7 @@ def test_sheets_that_cross(comm: MPI.Comm) -> None:
         pass
 
 
-def test_noise_of_the_start_counts(comm: MPI.Comm) -> None:
+def test_noise_of_the_start_is_included(comm: MPI.Comm) -> None:
     floor = obstacle(plane={"point": [0, 0, -0.01], "normal": [0, 0, 1]})
     with Simulation(floor, comm):
         pass
@@ -112,7 +112,7 @@ def test_nearer_than_thickness(comm: MPI.Comm) -> None:
     )
 
 
-def test_touching_is_not_apart(comm: MPI.Comm) -> None:
+def test_touching_sheets_are_refused(comm: MPI.Comm) -> None:
     text = refusal(comm, obstacle(plane={"point": [0, 0, 0], "normal": [0, 0, 1]}))
     assert text == (
         "obstacles.thing: at the start vertex 0 and the obstacle 'thing', around (0, 0, 0) m, are not apart; "
@@ -120,7 +120,7 @@ def test_touching_is_not_apart(comm: MPI.Comm) -> None:
     )
 
 
-def test_next_to_nothing_is_no_distance(comm: MPI.Comm) -> None:
+def test_distances_near_zero_are_refused(comm: MPI.Comm) -> None:
     above = SHEET["mesh"] | {"transform": {"translate": [0, 0, 1e-9]}}
     text = refusal(comm, sheet(mesh=[SHEET["mesh"], above], contact={"gap": 0.02}))
     assert re.match(r"contact: at the start (vertex \d+|edge \d+-\d+|the triangle .*) and ", text)

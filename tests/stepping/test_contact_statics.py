@@ -1,4 +1,4 @@
-"""Equilibria of sheets that come to lie on something, with friction and without, on any number of ranks."""
+"""Equilibria of sheets on obstacles, with and without friction, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def laid(
 
 
 def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array, int]:
-    """The scene after its last load step, positions in mesh order, Newton iterations; nothing crosses."""
+    """The scene after its last load step, positions in mesh order, Newton iterations."""
     simulation, newton = SteppedScene(comm, scene_of(scene)), 0
     while not simulation.finished:
         newton += simulation.step().newton_iterations
@@ -80,7 +80,7 @@ LAID = {
 
 
 @pytest.mark.parametrize("where", LAID)
-def test_a_cloth_is_laid(comm: MPI.Comm, where: str) -> None:
+def test_a_cloth_is_laid_on_obstacles(comm: MPI.Comm, where: str) -> None:
     how, most = LAID[where]
     simulation, x, newton = at_rest(comm, laid(*how, time={}))
     assert newton <= most
@@ -92,7 +92,7 @@ def test_a_cloth_is_laid(comm: MPI.Comm, where: str) -> None:
     simulation.destroy()
 
 
-def test_without_friction_the_proximal_term_holds_what_nothing_else_does(comm: MPI.Comm) -> None:
+def test_without_friction_rigid_motions_are_held_by_the_proximal_term(comm: MPI.Comm) -> None:
     simulation, x, newton = at_rest(comm, laid(0.4, [-0.2, -0.2, 0.02], FLOOR, 0.0, {}))
     assert newton <= 60
     assert any("nothing resists 3 motions" in note for note in simulation.notes)
@@ -104,9 +104,7 @@ RADIUS, MU, LENGTH, WIDTH, LONG = 0.05, 0.3, 0.5, 0.02, 80
 
 
 def over_a_rod(comm: MPI.Comm, folder: Path, ratio: float, pressed: float) -> SteppedScene:
-    """A strip that hangs over a rod, ``ratio`` as long on one side as on the other, and begins so far above
-    it, over the gap.
-    """
+    """A strip over a rod, ``ratio`` times as long on one side, which starts ``pressed`` gaps above it."""
     gap = 5e-4
     radius, hangs = RADIUS + pressed * gap, LENGTH - np.pi * RADIUS
     s = np.linspace(0.0, LENGTH, LONG + 1)
@@ -136,10 +134,10 @@ def over_a_rod(comm: MPI.Comm, folder: Path, ratio: float, pressed: float) -> St
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize(("ratio", "pressed"), [(2.0, 0.95), (2.5, 0.4)])
-def test_a_strip_is_held_by_what_its_normal_forces_allow(
+def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     tmp_path: Path, ratio: float, pressed: float
 ) -> None:
-    """Where it is pressed into the barrier at the start, it is so no longer in equilibrium."""
+    """It starts pressed into the barrier, which its equilibrium is not."""
     simulation = over_a_rod(MPI.COMM_SELF, tmp_path, ratio, pressed)
     newton = 0
     while not simulation.finished:
@@ -158,7 +156,7 @@ def test_a_strip_is_held_by_what_its_normal_forces_allow(
 
 
 @pytest.mark.parallel(1)
-def test_that_it_slides_is_told(tmp_path: Path) -> None:
+def test_sliding_off_an_obstacle_is_reported(tmp_path: Path) -> None:
     simulation = over_a_rod(MPI.COMM_SELF, tmp_path, 6.0, 0.4)
 
     def to_the_end() -> None:
@@ -172,8 +170,9 @@ def test_that_it_slides_is_told(tmp_path: Path) -> None:
 
 
 def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
-    """A ball comes up and turns in each load step against a sheet whose ends are held: what touches it sticks
-    to it, or slides by the normal forces that there are at last.
+    """A ball rises and turns in each load step against a sheet with held ends.
+
+    Points that touch it stick, or slide by the normal forces of the equilibrium.
     """
     turned = {"axis": [0.0, 0.0, 1.0], "degrees": 20.0}
     ball = {

@@ -1,4 +1,4 @@
-"""Damping from the stiffness, and the stiffness back from it."""
+"""Damping matrices from the stiffness, and the stiffness from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MATERIAL = {
 
 
 @pytest.mark.parallel(2)
-def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: MPI.Comm) -> None:
+def test_damping_plus_stiffness_is_a_multiple_if_all_factors_are_equal(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
         damping, blocks = system.damping, system.discretisation.rows
@@ -34,7 +34,7 @@ def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: 
         assert not damping.assemble_with_stiffness(x + 1e-9, 0.3, diagonal, found, none)
 
 
-def test_two_factors_are_no_multiple() -> None:
+def test_different_factors_give_no_multiple() -> None:
     scene = {
         "mesh": grid(0.5, 0.4, 4, 3),
         "material": MATERIAL,
@@ -48,7 +48,7 @@ def test_two_factors_are_no_multiple() -> None:
         assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
 
 
-def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> None:
+def test_damping_forces_follow_velocities_and_geometry(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
         v = np.cos(5.0 * system.x)
@@ -62,7 +62,7 @@ def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> 
 
 
 @pytest.mark.parallel(2)
-def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None:
+def test_damping_forces_if_the_matrix_contains_the_damping(comm: MPI.Comm) -> None:
     scene = {
         "mesh": grid(0.5, 0.4, 5, 4),
         "material": MATERIAL,
@@ -89,7 +89,7 @@ def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * scale)
 
 
-def test_rows_that_become_another_matrix_are_let_go() -> None:
+def test_rows_are_released_before_they_hold_another_matrix() -> None:
     scene = {
         "mesh": grid(0.5, 0.4, 5, 4),
         "material": MATERIAL,

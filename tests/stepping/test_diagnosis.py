@@ -1,4 +1,4 @@
-"""A step that cannot be taken: what is said of it, the same on any number of ranks."""
+"""Diagnosis of a failed step, the same on any number of ranks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def failing(
     spoil: Spoil | None = None,
     petsc: Mapping[str, str] = ONE_ATTEMPT,
 ) -> Iterator[tuple[SteppedScene, SolverError, Failure]]:
-    """A simulation whose step fails, and what it says of that."""
+    """A simulation whose step fails, its error and its failure report."""
     direct = direct_solver(comm) | {"ksp_rtol": "1e-12"}
     with stepped(comm, {**SCENE, **scene}, **direct | dict(petsc)) as simulation:
         if spoil is not None:
@@ -66,7 +66,7 @@ def failing(
 
 
 def pushed(vertex: int, value: float) -> Spoil:
-    """Put a force that nothing balances on one vertex of the mesh."""
+    """Adds an unbalanced force to one vertex of the mesh."""
 
     def spoil(simulation: SteppedScene, out: Array) -> None:
         out[simulation.problem.points.mesh_vertices == vertex] = value
@@ -93,7 +93,7 @@ def test_the_vertex_and_triangle_with_the_largest_residual_are_named(comm: MPI.C
         assert comm.allgather(error.details) == [error.details] * comm.size
 
 
-def test_numbers_that_overflow_on_one_rank_are_met_by_all(comm: MPI.Comm) -> None:
+def test_an_overflow_on_one_rank_is_detected_on_all(comm: MPI.Comm) -> None:
     with failing(comm, {}, pushed(23, np.nan)) as (_, error, failure):
         assert failure.kind == "overflow"
         assert failure.diagnosis.not_finite == 1
@@ -102,14 +102,14 @@ def test_numbers_that_overflow_on_one_rank_are_met_by_all(comm: MPI.Comm) -> Non
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-def test_what_overflows_is_told_by_its_key(comm: MPI.Comm) -> None:
+def test_an_overflow_names_the_key_of_its_cause(comm: MPI.Comm) -> None:
     with failing(comm, {"gravity": [0, 0, -1e200]}) as (_, error, failure):
         assert failure.kind == "overflow"
         assert failure.diagnosis.overflowing == ["loads"]
         assert "try smaller numbers where one is absurd, or lost its unit: in gravity and loads" in str(error)
 
 
-def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
+def test_the_worst_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     scene = {"material": STIFF, "solver": {"max_iterations": 3}, "time": {"end": 1.0, "step": 0.04}}
     with failing(MPI.COMM_SELF, scene) as (_, _, alone):
         pass
@@ -131,7 +131,7 @@ def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
         assert "try solver.max_iterations above 3" in str(error)
 
 
-def test_earlier_attempts_are_told(comm: MPI.Comm) -> None:
+def test_earlier_attempts_are_reported(comm: MPI.Comm) -> None:
     time = {"end": 1.0, "step": 0.04}
     scene = {"material": STIFF, "solver": {"max_iterations": 1}, "time": time}
     with failing(comm, scene, petsc={"ts_adapt_dt_min": "0.005"}) as (_, error, failure):
@@ -155,7 +155,7 @@ def test_a_handle_that_jumps_is_named(comm: MPI.Comm) -> None:
         assert "try more time for motions.jump (handles[1] moves 3 m in this step" in told
 
 
-def test_a_linear_solver_that_fails_is_told_apart(comm: MPI.Comm) -> None:
+def test_a_linear_failure_is_distinguished(comm: MPI.Comm) -> None:
     scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}, "material": STIFF}
     iterative = ONE_ATTEMPT | {"pc_type": "jacobi", "ksp_max_it": "2"}
     with failing(comm, scene, petsc=iterative) as (_, error, failure):
@@ -166,7 +166,7 @@ def test_a_linear_solver_that_fails_is_told_apart(comm: MPI.Comm) -> None:
         assert "a direct solver" in " ".join(error.details)
 
 
-def test_a_velocity_that_is_not_finite_stops_the_run_in_words(comm: MPI.Comm) -> None:
+def test_a_velocity_that_is_not_finite_stops_the_run_with_a_message(comm: MPI.Comm) -> None:
     def lost(simulation: SteppedScene, out: Array) -> None:
         out[:] = np.inf
 
@@ -176,7 +176,7 @@ def test_a_velocity_that_is_not_finite_stops_the_run_in_words(comm: MPI.Comm) ->
         assert "overflow" in str(error)
 
 
-def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_load_step(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(equilibrium, "MAX_SOLVES", 2)
     with failing(comm, {"time": {"analysis": "static"}}) as (simulation, error, failure):
         assert "(load factor 0) did not converge even with an increment of" in str(error)
@@ -193,12 +193,12 @@ def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPat
         )
 
 
-def test_without_handles_an_equilibrium_is_not_sought_in_vain(comm: MPI.Comm) -> None:
+def test_a_static_analysis_without_handles_ends_soon(comm: MPI.Comm) -> None:
     with failing(comm, {"time": {"analysis": "static"}, "handles": []}) as (_, error, _):
         assert "try handles (nothing holds the sheet)" in str(error)
 
 
-def test_numbers_are_those_of_the_files(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_vertices_are_named_by_the_numbers_of_their_files(comm: MPI.Comm, shared_tmp: Path) -> None:
     triangles = (
         "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n5\n7 0 0 0\n9 5 5 5\n11 1 0 0\n30 0 1 0\n31 1 1 0\n"
     )
@@ -221,7 +221,7 @@ def test_numbers_are_those_of_the_files(comm: MPI.Comm, shared_tmp: Path) -> Non
         assert "vertex 2 (node 30 of two.msh) around (0, 1, 0) m" in str(error)
 
 
-def test_of_equals_the_smallest_number_is_the_worst(comm: MPI.Comm) -> None:
+def test_of_equal_values_the_smallest_vertex_number_is_reported(comm: MPI.Comm) -> None:
     # ten rows dealt to the ranks backwards; rows 3, 4 and 8 are equal but for round-off
     numbers = np.arange(10)[::-1][comm.rank :: comm.size]
     sizes = np.array([0.0, 1, 2, 7 * (1 - 1e-9), 7, 5, 6, 4, 7 * (1 + 1e-9), 3])[numbers]

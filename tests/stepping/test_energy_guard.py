@@ -1,4 +1,4 @@
-"""No integrator makes energy unseen: steps that do are repeated, and what is lost is told."""
+"""Energy guard: steps that create energy are repeated, and numerical dissipation is reported."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def simulation(
 
 
 def run(one: SteppedScene) -> list[float]:
-    """Energy [J] at the start and after each step."""
+    """Energies [J] at the start and after each step."""
     energies = [one.budget.total]
     while not one.finished:
         one.step()
@@ -64,13 +64,13 @@ def test_a_free_sheet_gains_nothing(integrator: str, comm: MPI.Comm) -> None:
 
 
 def _wringing(side: float) -> list[dict[str, Any]]:
-    """Four turns in 3 s of an end that goes towards the other one."""
+    """A motion by four turns in 3 s that also approaches the other end."""
     turn = {"axis": [1.0, 0.0, 0.0], "degrees": side * 1440.0}
     return [{"time": 0.0}, {"time": 3.0, "rotate": turn, "translate": [-0.14 * side, 0.0, 0.0]}]
 
 
-def test_handles_that_start_gently_are_no_gain() -> None:
-    """What little a damped sheet gains in its first step is judged by what the handles move, too."""
+def test_handles_that_start_slowly_count_in_the_scale() -> None:
+    """The small gain of a damped sheet in its first step is also relative to the handles' energy."""
     content = {
         "mesh": grid(0.6, 0.3, 18, 9, "alternating") | {"transform": {"translate": [-0.3, -0.15, 0.0]}},
         "material": {"cloth": "gray-interlock", "damping": 0.02},
@@ -83,8 +83,8 @@ def test_handles_that_start_gently_are_no_gain() -> None:
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
-def test_heat_of_what_turns_is_of_second_order(integrator: str) -> None:
-    """A damped cloth that swings: by the heat of chords about the end of a step, bdf2 gained 1 %."""
+def test_heat_of_rotating_parts_is_second_order(integrator: str) -> None:
+    """A damped swinging cloth: with the heat of chords about the end of a step, bdf2 gained 1 %."""
     content = {
         "mesh": grid(0.5, 0.5, 6, 6, "alternating"),
         "material": {"cloth": "gray-interlock", "damping": 0.02},
@@ -102,7 +102,7 @@ def test_heat_of_what_turns_is_of_second_order(integrator: str) -> None:
     assert abs(wrong[1]) < abs(wrong[0]) / 3.0
 
 
-def test_what_is_given_back_of_a_loss_passes_out_of_sight_with_it() -> None:
+def test_a_gain_that_compensates_a_loss_leaves_the_recent_sum_with_it() -> None:
     assert _append_gain([-0.2, -0.03], 0.05, 4) == pytest.approx([-0.18, 0.0, 0.0])
     assert _append_gain([-0.2, 0.0, 0.0, 0.0], 0.05, 4) == [-0.2, 0.0, 0.0, 0.0, 0.05]
     assert _append_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
@@ -110,8 +110,8 @@ def test_what_is_given_back_of_a_loss_passes_out_of_sight_with_it() -> None:
     assert _append_gain([0.1], -0.05, 4) == [0.1, -0.05]
 
 
-def test_a_step_that_makes_nothing_stands_whatever_others_made() -> None:
-    """As where contact begins, with less that may be made in all."""
+def test_a_step_without_gain_is_accepted_after_steps_with_gains() -> None:
+    """As at the start of contact, where the bound of the sum is smaller."""
     one = simulation(MPI.COMM_SELF, "alpha2", FREE)
     assert one.guard is not None
     stood = []
@@ -124,8 +124,8 @@ def test_a_step_that_makes_nothing_stands_whatever_others_made() -> None:
 
 
 @pytest.mark.parallel(2)
-def test_after_backward_euler_stiff_damping_makes_no_energy(comm: MPI.Comm) -> None:
-    """Moments curl a plate on a floor and let go of it: velocities jump where it touches."""
+def test_stiff_damping_creates_no_energy_after_backward_euler_steps(comm: MPI.Comm) -> None:
+    """Moments curl a plate on a floor and release it: velocities jump when it touches the floor."""
     content = {
         "mesh": grid(0.4, 0.4, 4, 4, "alternating") | {"transform": {"translate": [-0.2, -0.2, 0.03]}},
         "material": {"young": 1e7, "poisson": 0.3, "thickness": 0.001, "density": 0.3, "damping": 0.005},
@@ -143,7 +143,7 @@ def test_after_backward_euler_stiff_damping_makes_no_energy(comm: MPI.Comm) -> N
     assert rejected < 20
 
 
-def test_a_step_that_was_repeated_is_counted() -> None:
+def test_repeated_steps_are_counted() -> None:
     one = simulation(MPI.COMM_SELF, "bdf2", FREE, 0.05)
     first = one.step()
     assert first.rejected >= 1
@@ -151,7 +151,7 @@ def test_a_step_that_was_repeated_is_counted() -> None:
     one.destroy()
 
 
-def test_what_it_remembers_goes_into_checkpoints() -> None:
+def test_checkpoints_have_the_state_of_the_guard() -> None:
     one, other = (simulation(MPI.COMM_SELF, "alpha2", FREE) for _ in range(2))
     for _ in range(7):
         one.step()
@@ -170,8 +170,8 @@ def test_what_it_remembers_goes_into_checkpoints() -> None:
 
 
 @pytest.mark.parallel(2)
-def test_a_linear_solve_that_is_not_enough_is_repeated_alike_on_all_ranks(comm: MPI.Comm) -> None:
-    """A stiff hung sheet under long steps, which are far from linear: round-off must not grow with them."""
+def test_insufficient_linear_solves_are_repeated_alike_on_all_ranks(comm: MPI.Comm) -> None:
+    """A stiff hanging sheet with long steps, which are far from linear: round-off must not grow."""
     stiff = {key: 1e3 * c for key, c in MEMBRANE.items()}
     content = {
         "mesh": grid(1.0, 1.0, 12, 12, "alternating"),
@@ -200,7 +200,7 @@ STIFF = FREE | {
 
 
 @pytest.mark.parallel(2)
-def test_after_six_halvings_the_run_is_given_up(comm: MPI.Comm) -> None:
+def test_the_run_ends_after_six_halvings(comm: MPI.Comm) -> None:
     one = simulation(comm, "midpoint", STIFF, 0.8, 0.04)
     states: list[tuple[NDArray[np.float64], dict[str, Any]]] = []
 
@@ -241,8 +241,8 @@ DRIVEN: dict[str, Any] = {
 
 
 @pytest.mark.parallel(2)
-def test_work_of_all_kinds_is_accounted_for(comm: MPI.Comm) -> None:
-    """What a scheme that keeps energy gains is the error of the trapezoidal rule: second order."""
+def test_the_balance_includes_work_of_all_kinds(comm: MPI.Comm) -> None:
+    """The gain of an integrator that conserves energy is the second-order error of the trapezoidal rule."""
     gains = []
     for step in (4e-3, 2e-3):
         one = simulation(comm, "midpoint", DRIVEN, 0.2, step)

@@ -1,4 +1,4 @@
-"""Velocities expected from the steps before."""
+"""Extrapolation of velocities from earlier steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHAPE = np.arange(1.0, 13.0).reshape(4, 3)
 
 
 def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
-    """What is expected for the last time, once the steps before are known."""
+    """The extrapolation to the last time from the steps before it."""
     guess = np.empty(0)
     extrapolation = Extrapolation(comm)
     for t0, t1 in pairwise(TIMES):
@@ -28,12 +28,12 @@ def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("motion", [lambda t: 3.0, lambda t: 2.0 - t, lambda t: 1.0 + t - 4.0 * t * t])
-def test_polynomials_are_gone_on_with(motion: Callable[[float], float], comm: MPI.Comm) -> None:
+def test_polynomials_are_extrapolated_exactly(motion: Callable[[float], float], comm: MPI.Comm) -> None:
     np.testing.assert_allclose(expected(comm, motion), motion(TIMES[-1]) * SHAPE, rtol=1e-12)
 
 
 @pytest.mark.parallel(2)
-def test_tangents_and_parabolas_are_gone_on_with(comm: MPI.Comm) -> None:
+def test_tangents_and_parabolas_are_extrapolated_exactly(comm: MPI.Comm) -> None:
     extrapolation = Extrapolation(comm)
     extrapolation.record(0.0, SHAPE)
     (tangent,) = extrapolation.tangent_predictions(0.5, 3.0 * SHAPE)
@@ -45,7 +45,7 @@ def test_tangents_and_parabolas_are_gone_on_with(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
+def test_alternating_values_are_extrapolated_as_constant(comm: MPI.Comm) -> None:
     extrapolation, sign = Extrapolation(comm), 1.0
     for step in range(6):
         v = sign * SHAPE
@@ -54,7 +54,7 @@ def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(guess, v)
 
 
-def test_a_repeated_step_is_no_new_one() -> None:
+def test_a_repeated_step_does_not_count_as_a_new_one() -> None:
     extrapolation = Extrapolation(MPI.COMM_SELF)
     extrapolation.extrapolate(1.0, 0.0, 1.0 * SHAPE)
     extrapolation.extrapolate(2.0, 1.0, 2.0 * SHAPE)
@@ -63,7 +63,7 @@ def test_a_repeated_step_is_no_new_one() -> None:
         np.testing.assert_allclose(extrapolation.extrapolate(2.5, 2.0, 3.0 * SHAPE), 3.5 * SHAPE)
 
 
-def test_weights_are_one_at_their_own_time() -> None:
+def test_lagrange_weights_interpolate() -> None:
     assert lagrange_weights([0.0, 1.0, 3.0], 1.0) == [0.0, 1.0, 0.0]
     assert sum(lagrange_weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
 
@@ -92,7 +92,7 @@ def test_a_falling_sheet_takes_fewer_linear_iterations(
     np.testing.assert_allclose(x, same, rtol=0.0, atol=1e-6)
 
 
-def test_a_resumed_run_expects_the_same() -> None:
+def test_a_resumed_run_extrapolates_the_same() -> None:
     times = [0.0, 0.1, 0.25, 0.3, 0.5]
     whole = Extrapolation(MPI.COMM_SELF)
     for before, after in pairwise(times):
@@ -108,5 +108,5 @@ def test_a_resumed_run_expects_the_same() -> None:
 
 
 def curved(t: float) -> np.ndarray:
-    """Velocities (2, 3) [m/s] that no polynomial hits."""
+    """Velocities (2, 3) [m/s] that no polynomial reproduces."""
     return np.array([[1.0, t, t * t], [np.sin(t), np.exp(t), t**3]])

@@ -1,4 +1,4 @@
-"""Friction within the fabric: loops of bending and shear, lasting folds, energy, ranks, going on."""
+"""Friction within the fabric: hysteresis of bending and shear, permanent folds, energy, ranks, resumption."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATH = [0.0, 50.0, 150.0, 250.0, 150.0, 50.0, 0.0, -50.0, -150.0, -250.0, -150.0
 
 
 def bent(curvature: float) -> dict[str, Any]:
-    """Where the end of a strip stands that is bent to an arc."""
+    """Positions of the end of a strip that is bent to an arc."""
     angle = curvature * LENGTH
     x = math.sin(angle) / curvature if curvature else LENGTH
     z = (1.0 - math.cos(angle)) / curvature if curvature else 0.0
@@ -40,7 +40,7 @@ def bent(curvature: float) -> dict[str, Any]:
     }
 
 
-def test_bending_to_and_fro_shows_the_loop_of_kes() -> None:
+def test_cyclic_bending_has_the_hysteresis_of_kes() -> None:
     share = 1.0 / (len(PATH) - 1)
     content = {
         "mesh": grid(LENGTH, WIDTH, 6, 1, "criss-cross"),
@@ -67,7 +67,7 @@ def test_bending_to_and_fro_shows_the_loop_of_kes() -> None:
     assert heats[13] - heats[1] == pytest.approx(2.0 * MOMENT * (500.0 - 4.0), rel=0.01)
 
 
-def test_a_sheet_keeps_a_fold() -> None:
+def test_a_fold_remains() -> None:
     content = {
         "mesh": grid(0.06, 0.01, 6, 1),
         "material": FABRIC | {"friction_moment": MOMENT},
@@ -87,7 +87,7 @@ def test_a_sheet_keeps_a_fold() -> None:
     assert budget.bending <= 0.55 * MOMENT * 20.0 * 0.06 * 0.01 + MOMENT * 0.06 * 0.01
 
 
-def test_shear_to_and_fro() -> None:
+def test_cyclic_shear_has_the_hysteresis_of_kes() -> None:
     side, path = 0.05, [0.0, 0.02, 0.04, 0.02, 0.0, -0.02, -0.04, -0.02, 0.0, 0.02]
     share = 1.0 / (len(path) - 1)
     content = {
@@ -143,7 +143,7 @@ def test_the_energy_balance_closes(integrator: str) -> None:
 
 
 @pytest.mark.parallel(3)
-def test_a_run_goes_on_with_it_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_run_resumes_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = scene_of(falling("beuler"))
     simulation = SteppedScene(comm, scene)
     while not simulation.finished:

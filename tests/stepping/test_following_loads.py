@@ -1,4 +1,4 @@
-"""Pressures in equilibria: what is linear along their stiffness, and rings that buckle under them."""
+"""Pressures in equilibria: their stiffness, and rings that buckle under them."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def ring(comm: MPI.Comm, part: float, start: float = OVAL) -> tuple[float, int]:
 
 @pytest.mark.parallel
 def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
-    """Before the critical pressure deviations grow by 1 / (1 − p / p_c); beyond, a solution is found, too."""
+    """Deviations grow by 1 / (1 − p / p_c) below the critical pressure; solutions exist beyond it."""
     oval, newton = ring(comm, 0.5)
     assert oval == pytest.approx(OVAL / 0.5, rel=0.02)
     assert newton <= 15  # 30 with pressures that are taken as they were
@@ -100,11 +100,11 @@ def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
 
 
 def test_a_round_ring_leaves_its_unstable_equilibrium() -> None:
-    """Between 3 D/R³ and 4 D/R³, at which it would under forces that keep their directions."""
+    """Between 3 D/R³ and 4 D/R³, the critical value of forces that keep their directions."""
     assert abs(ring(MPI.COMM_SELF, 1.1, start=0.0)[0]) > 0.1
 
 
-def test_a_skew_stiffness_is_solved_with() -> None:
+def test_systems_with_skew_stiffness_are_solved() -> None:
     random = np.random.default_rng(0)
     skew = random.normal(size=(6, 6))
     skew = 3.0 * (skew - skew.T)  # more than the symmetric part: a fixed point would run away
@@ -123,7 +123,7 @@ def test_a_skew_stiffness_is_solved_with() -> None:
 
 
 def curled(comm: MPI.Comm, load: float, step: float) -> tuple[Array, int, str]:
-    """The tip of a cantilever under a pressure of ``load`` B/L³, Newton iterations, and notes."""
+    """Tip of a cantilever under a pressure of ``load`` B/L³, Newton iterations, and notes."""
     thickness, young = 0.002, 1.2e9
     mesh = {"grid": {"width": 1.0, "height": 0.1, "nx": 40, "ny": 4, "pattern": "alternating"}}
     content = scene(
@@ -144,7 +144,7 @@ def curled(comm: MPI.Comm, load: float, step: float) -> tuple[Array, int, str]:
 
 @pytest.mark.parallel
 def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
-    """Beyond half a circle; beside free edges the stiffness of the pressure is not symmetric."""
+    """Beyond half a circle; at free edges the stiffness of the pressure is not symmetric."""
     tip, newton, notes = curled(comm, 30.0, 0.125)
     np.testing.assert_allclose(tip, pressed_tip(30.0), atol=6e-3)
     assert newton <= 90  # 353 where a solve takes what is skew as it was
@@ -159,8 +159,8 @@ def test_long_increments_take_few_iterations(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
-def test_it_curls_on_where_the_symmetric_part_is_indefinite(comm: MPI.Comm) -> None:
-    """From 57 B/L³ on; all of the stiffness is regular, as the rod has one shape at each load."""
+def test_it_curls_further_when_the_symmetric_part_is_indefinite(comm: MPI.Comm) -> None:
+    """From 57 B/L³ on. The whole stiffness is regular: the rod has one shape at each load."""
     tip, newton, notes = curled(comm, 80.0, 0.125)
     np.testing.assert_allclose(tip, pressed_tip(80.0), atol=6e-3)
     assert newton <= 700  # half of them in increments that are too long

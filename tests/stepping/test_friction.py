@@ -1,4 +1,4 @@
-"""A sheet on a slope: it stands below the angle of friction, and slides by Coulomb's law above it."""
+"""Friction on a slope: a sheet sticks below the angle of friction, and slides by Coulomb's law above it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def on_slope(
     integrator: str = "beuler",
     above: float = 0.9,
 ) -> tuple[float, float, Array, float, float]:
-    """Mean way and speed down the slope, force on it, weight and friction's work of a sheet let go."""
+    """Mean slip and speed down the slope, force on it, weight and friction work of a sheet released on it."""
     place = [above * GAP * component for component in NORMAL]
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
     content = {
@@ -64,7 +64,7 @@ def on_slope(
     return way, speed, np.asarray(force), mass * G, work
 
 
-def test_it_slides_by_coulombs_law(comm: MPI.Comm) -> None:
+def test_a_sheet_slides_by_coulombs_law(comm: MPI.Comm) -> None:
     friction, end = 0.5 * math.tan(SLOPE), 0.4
     way, speed, force, weight, work = on_slope(comm, friction, end)
     pull = G * 0.5 * math.sin(SLOPE)
@@ -75,8 +75,8 @@ def test_it_slides_by_coulombs_law(comm: MPI.Comm) -> None:
     assert work == pytest.approx(friction * pressed * way, rel=0.05)
 
 
-def test_a_slope_of_triangles_is_as_a_plane(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """Over whose edges the sheet's vertices, edges and triangles slide."""
+def test_a_slope_of_triangles_acts_as_a_plane(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """The sheet's vertices, edges and triangles slide over the slope's edges."""
     if comm.rank == 0:
         along, across = np.meshgrid([-1.0, -0.13, 0.03, 0.25, 0.41, 0.57, 2.0], [-1.0, 0.11, 0.17, 0.29, 1.0])
         flat = np.column_stack([along.ravel(), across.ravel()])
@@ -92,15 +92,15 @@ def test_a_slope_of_triangles_is_as_a_plane(comm: MPI.Comm, shared_tmp: Path) ->
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * plane[3])
 
 
-def test_it_stands(comm: MPI.Comm) -> None:
+def test_a_sheet_sticks_below_the_angle_of_friction(comm: MPI.Comm) -> None:
     way, speed, force, weight, _ = on_slope(comm, 1.2 * math.tan(SLOPE), 1.0)
     assert abs(speed) < 1e-5
     assert 0.0 < way < 2e-3
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
 
 
-def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
-    """On a plane that turns, also where less friction holds what slides: its border is pressed less."""
+def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> None:
+    """On a tilting plane, also if kinetic friction is smaller: the normal force is smaller at the border."""
     threshold, gap, side = 0.5, 0.005, 0.3
     turned = [
         {"time": 0.0},
@@ -133,8 +133,8 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
-def test_what_is_let_go_where_it_lies_stands_by_friction_at_rest(comm: MPI.Comm, integrator: str) -> None:
-    """Springs of what sticks must not swing beyond what they can hold: by less friction it would slide on."""
+def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, integrator: str) -> None:
+    """Springs of sticking contact must not oscillate beyond their limit, or the sheet would slide."""
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
 
     def let_go(above: float, static: float, kinetic: float, end: float) -> tuple[float, float]:
@@ -163,8 +163,8 @@ def test_what_is_let_go_where_it_lies_stands_by_friction_at_rest(comm: MPI.Comm,
     assert let_go(lies, 0.99 * limit, 0.6 * limit, 0.3)[1] > 5.0 * GAP
 
 
-def test_friction_on_what_tilts_has_a_potential(comm: MPI.Comm) -> None:
-    """Else no line search finds a way: what turns with a plane beside its normal is no way along it."""
+def test_friction_on_a_tilting_plane_has_a_potential(comm: MPI.Comm) -> None:
+    """Otherwise line searches fail: slip excludes the plane's rotation beside its normal."""
     tilted = {"axis": [1.0, 0.0, 0.0], "degrees": 30.0}
     content = {
         "mesh": grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [-0.2, -0.2, 0.95 * GAP]}},
@@ -182,8 +182,8 @@ def test_friction_on_what_tilts_has_a_potential(comm: MPI.Comm) -> None:
     assert rejected == 0
 
 
-def test_what_sticks_turns_with_a_plane(comm: MPI.Comm) -> None:
-    """The elastic part of its way, which holds it against its inertia, turns, too; else it would creep."""
+def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
+    """The elastic part of the slip, which balances inertia, must rotate, too; else the sheet would creep."""
     side, far, quarter = 0.06, 0.4, {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}
     content = {
         "mesh": grid(side, side, 2, 2) | {"transform": {"translate": [far, 0.0, 0.95 * GAP]}},
@@ -208,8 +208,8 @@ def test_what_sticks_turns_with_a_plane(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
-def test_what_an_obstacle_takes_along_has_its_energy_from_there(comm: MPI.Comm, integrator: str) -> None:
-    """A plane that sets out goes many times as far in a step as what sticks may, and works all the same."""
+def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrator: str) -> None:
+    """A plane starts to move by many times the limit of elastic slip in a step."""
     end, far, gap = 0.1, 0.6, 0.003
     away = {"time": 1.0, "translate": [far, 0.0, 0.0]}
     content = {
@@ -233,8 +233,8 @@ def test_what_an_obstacle_takes_along_has_its_energy_from_there(comm: MPI.Comm, 
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2", "semi-implicit"])
-def test_friction_is_that_of_the_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:
-    """What is let go above where it comes to lie; a step later friction would lack g sin α Δt for good."""
+def test_friction_uses_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:
+    """A sheet dropped on the slope: friction that is one step late would lack g sin α Δt permanently."""
     for part in (0.5, 1.01):
         _, speed, *_ = on_slope(comm, part * math.tan(SLOPE), 0.5, integrator=integrator, above=0.97)
         expected = max(1.0 - part, 0.0) * G * math.sin(SLOPE) * 0.5
@@ -251,7 +251,7 @@ INTEGRATORS = [
 
 
 def on_a_sheet(friction: float, integrator: str, end: float) -> dict[str, Any]:
-    """A sheet on a larger one of other triangles, which is held as it lies on the slope."""
+    """A sheet on a larger sheet with another mesh, which is held on the slope."""
     turn, side, low = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}, 0.2, 0.35
     gap = 0.2 * GAP
     place = [0.07 * along + 0.97 * gap * out for along, out in zip(DOWN, NORMAL, strict=True)]
@@ -268,8 +268,8 @@ def on_a_sheet(friction: float, integrator: str, end: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_sheet_stands_on_a_plane_and_on_a_sheet(comm: MPI.Comm, integrator: str) -> None:
-    """At 1.01 of the friction that holds it: it bounces at first, and then does not move."""
+def test_a_sheet_sticks_to_a_plane_and_to_a_sheet(comm: MPI.Comm, integrator: str) -> None:
+    """With 1.01 of the necessary friction it bounces at first, and then does not move."""
     place = [0.96 * GAP * component for component in NORMAL]
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
     friction = 1.01 * math.tan(SLOPE)
@@ -311,8 +311,8 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=6e-3)
 
 
-def test_sheets_that_rub_keep_their_angular_momentum(comm: MPI.Comm) -> None:
-    """Thrown at each other, and spinning against each other, under the midpoint rule."""
+def test_sheets_with_friction_conserve_angular_momentum(comm: MPI.Comm) -> None:
+    """Thrown at each other, and rotating against each other, under the midpoint rule."""
     side, gap, low = 0.2, 0.004, 49
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 40.0}
     upper = {"transform": {"rotate": turn, "translate": [0.02, 0.04, 0.13]}}
@@ -345,9 +345,10 @@ def test_sheets_that_rub_keep_their_angular_momentum(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
-def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
-    """Two sheets lie crosswise on a slope and stick, so heavy that their edges touch; on one rank edges are
-    named in another order.
+def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
+    """Two crossed sheets stick on a slope, so heavy that their edges touch.
+
+    On one rank the edges have another numbering.
     """
     place = [0.9 * GAP * component for component in NORMAL]
     above = [1.85 * GAP * component for component in NORMAL]
@@ -394,8 +395,8 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integ
 
 
 @pytest.mark.parallel(1)
-def test_checkpoints_of_older_versions_owe_nothing() -> None:
-    """They have something else beside the work."""
+def test_checkpoints_of_older_versions_have_no_impulses_left() -> None:
+    """In these an array of the same shape has another meaning."""
     content = {
         "mesh": grid(1.0, 1.0, 1, 1) | {"transform": {"translate": [0.0, 0.0, 5.0]}},
         "contact": {"gap": GAP, "friction": 0.5},

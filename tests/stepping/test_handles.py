@@ -1,4 +1,4 @@
-"""Handles as exact constraints: where held vertices are, whatever the sheet does."""
+"""Handles as exact constraints: positions of held vertices under all motions."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_keyframe_velocity_replaces_the_tangent() -> None:
 
 @pytest.mark.parametrize("degrees", [45.0, -120.0, 200.0, 300.0])
 @pytest.mark.parametrize("kind", ["linear", "hermite"])
-def test_half_way_through_a_turn_is_half_the_angle(degrees: float, kind: str) -> None:
+def test_half_of_a_rotation_is_half_the_angle(degrees: float, kind: str) -> None:
     motion = Motion(keyframes({"time": 0}, {"time": 2, "rotate": turn(degrees, [1, 1, 0])}), kind)
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
     for t, part in ((1.0, 0.5), (2.0, 1.0), (0.0, 0.0)):
@@ -79,7 +79,7 @@ def test_half_way_through_a_turn_is_half_the_angle(degrees: float, kind: str) ->
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), np.linalg.norm(points, axis=1), rtol=1e-13)
 
 
-def test_transform_scales_then_turns_then_translates() -> None:
+def test_a_keyframe_scales_then_rotates_then_translates() -> None:
     rows = keyframes({"time": 0, "scale": [2, 1, 3], "rotate": turn(90), "translate": [0, 0, 1]})
     matrix, offset = Motion(rows, "linear").transform(0.0)
     np.testing.assert_allclose(matrix @ [1, 1, 1] + offset, [-1, 2, 4], atol=1e-15)
@@ -92,7 +92,7 @@ def test_the_length_of_an_axis_does_not_matter(length: float) -> None:
     np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
-def test_a_motion_is_relative_to_the_handles_start() -> None:
+def test_a_motion_is_relative_to_the_start_of_the_handle() -> None:
     motion = Motion(
         keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear"
     )
@@ -104,7 +104,7 @@ def test_a_motion_is_relative_to_the_handles_start() -> None:
 @pytest.mark.parametrize(
     "degrees", [[0, 360], [0, 450], [0, -3600], [10, 3610, -90], [0, 90, 630], [0, 720, 0, 30]]
 )
-def test_angles_mean_what_they_say(degrees: list[float], kind: str) -> None:
+def test_angles_beyond_one_turn_are_kept(degrees: list[float], kind: str) -> None:
     rows = [{"time": i, "rotate": turn(angle, [0, 0, 2])} for i, angle in enumerate(degrees)]
     # the same axis, the other way round, and none
     rows[-1]["rotate"] = turn(-degrees[-1], [0, 0, -1])
@@ -122,7 +122,7 @@ def test_angles_mean_what_they_say(degrees: list[float], kind: str) -> None:
     assert jumps < (0.05 if kind == "hermite" else 3.0)
 
 
-def test_several_turns_twist() -> None:
+def test_several_turns() -> None:
     content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "m"}]}
     content["motions"] = {"m": [{"time": 0}, {"time": 1, "rotate": turn(-360)}]}
     Simulation(content, MPI.COMM_SELF)
@@ -130,7 +130,9 @@ def test_several_turns_twist() -> None:
 
 @pytest.mark.parametrize("kind", ["linear", "hermite"])
 @pytest.mark.parametrize("extra", [[], [turn(30, [0, 1, 0]), turn(750, [0, 1, 0])]])
-def test_between_different_axes_it_goes_the_shortest_way(extra: list[dict[str, Any]], kind: str) -> None:
+def test_rotations_about_different_axes_are_interpolated_by_the_shortest_rotation(
+    extra: list[dict[str, Any]], kind: str
+) -> None:
     turns = [turn(170, [1, 0, 0]), turn(170, [-1, 0.1, 0]), turn(160, [-1, 0.1, 0]), *extra]
     motion = Motion(keyframes(*({"time": i, "rotate": each} for i, each in enumerate(turns))), kind)
     matrices = [motion.transform(t)[0] for t in np.linspace(0, 2, 201)]
@@ -141,7 +143,7 @@ def test_between_different_axes_it_goes_the_shortest_way(extra: list[dict[str, A
     assert np.degrees(sum(ways[100:])) == pytest.approx(10.0, rel=0.05)
 
 
-def test_different_axes_and_more_than_half_a_turn_are_refused() -> None:
+def test_more_than_half_a_turn_between_different_axes_is_refused() -> None:
     rows = keyframes(
         {"time": 0}, {"time": 1, "rotate": turn(90)}, {"time": 2, "rotate": turn(181, [1, 0, 0])}
     )
@@ -165,7 +167,7 @@ def test_two_halves_make_a_full_turn() -> None:
     assert angles[-1] - angles[0] == pytest.approx(2 * np.pi)
 
 
-def test_window_and_fade() -> None:
+def test_from_until_and_fade() -> None:
     window = Window(1.0, 2.0, 0.5)
     assert [window.holds(*step) for step in ((0.9, 1.0), (1.0, 1.1), (1.9, 2.0), (1.95, 2.05))] == [
         False,
@@ -197,7 +199,7 @@ def held_scene(handles: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 @pytest.mark.parametrize("interpolation", ["linear", "hermite"])
-def test_held_vertices_are_where_the_motion_says_at_every_step(
+def test_held_vertices_follow_the_motion_in_every_step(
     comm: MPI.Comm, integrator: str, interpolation: str
 ) -> None:
     nodes = [0, 5, 10, 15, 7]
@@ -217,7 +219,7 @@ def test_held_vertices_are_where_the_motion_says_at_every_step(
 
 
 @pytest.mark.parallel
-def test_one_axis_held_leaves_the_others_free(comm: MPI.Comm) -> None:
+def test_holding_one_axis_leaves_the_others_free(comm: MPI.Comm) -> None:
     with Simulation(held_scene([{"group": "sheet", "axes": ["x", "y"]}]), comm) as simulation:
         before = simulation.x
         fallen = simulation.run(DT, 4) - before
@@ -226,7 +228,7 @@ def test_one_axis_held_leaves_the_others_free(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
-def test_a_handle_starts_late_from_where_the_sheet_is_and_lets_go(comm: MPI.Comm) -> None:
+def test_a_late_handle_starts_from_the_present_position_and_releases(comm: MPI.Comm) -> None:
     handle = {"nodes": [0, 4], "from": 0.1, "until": 0.2}
     with Simulation(held_scene([handle]), comm) as simulation:
         start = simulation.x
@@ -240,7 +242,7 @@ def test_a_handle_starts_late_from_where_the_sheet_is_and_lets_go(comm: MPI.Comm
 
 
 @pytest.mark.parallel
-def test_a_late_moving_handle_goes_the_rest_of_its_way(comm: MPI.Comm) -> None:
+def test_a_late_moving_handle_makes_the_rest_of_its_motion(comm: MPI.Comm) -> None:
     handle = {"nodes": [0, 4], "from": 0.1, "motion": "swing"}
     with Simulation(held_scene([handle], initial={"velocity": [0.5, 0, 0]}), comm) as simulation:
         motion = motion_of(simulation.scene, 0)
@@ -254,7 +256,7 @@ def test_a_late_moving_handle_goes_the_rest_of_its_way(comm: MPI.Comm) -> None:
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_the_later_handle_in_the_scene_counts(comm: MPI.Comm, order: tuple[int, int]) -> None:
+def test_the_last_handle_in_the_scene_wins(comm: MPI.Comm, order: tuple[int, int]) -> None:
     handles = [{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "swing"}]
     with Simulation(held_scene([handles[i] for i in order]), comm) as simulation:
         start = simulation.x
@@ -267,7 +269,7 @@ def test_the_later_handle_in_the_scene_counts(comm: MPI.Comm, order: tuple[int, 
 
 
 @pytest.mark.parallel
-def test_noise_moves_no_held_vertex_and_no_handles_start(comm: MPI.Comm) -> None:
+def test_noise_does_not_move_held_vertices_or_the_start_of_handles(comm: MPI.Comm) -> None:
     content = held_scene([{"nodes": [0, 1]}], initial={"noise": 0.01})
     with Simulation(content, comm) as simulation, Simulation(held_scene([]), comm) as flat:
         np.testing.assert_array_equal(simulation.x[[0, 1]], flat.x[[0, 1]])
@@ -278,7 +280,7 @@ def test_noise_moves_no_held_vertex_and_no_handles_start(comm: MPI.Comm) -> None
 # -- springs and fading --------------------------------------------------------------------------------
 
 
-def test_a_soft_handle_settles_where_springs_carry_the_weight() -> None:
+def test_a_spring_handle_settles_at_its_static_deflection() -> None:
     handle = {"group": "sheet", "stiffness": 50.0, "axes": ["z"]}
     side = {"group": "sheet", "axes": ["x", "y"]}
     stiff_shear = {"c11": 1e-3, "c22": 1e-3, "c12": 0.0, "c33": 1e-3}  # each vertex nearly for itself
@@ -289,7 +291,7 @@ def test_a_soft_handle_settles_where_springs_carry_the_weight() -> None:
         np.testing.assert_allclose(sag[:, 2], simulation.mass * 9.81 / 50.0, rtol=1e-3)
 
 
-def test_a_soft_handle_pulls_towards_the_moving_target() -> None:
+def test_a_spring_handle_pulls_towards_its_moving_target() -> None:
     content = held_scene([{"nodes": [0, 1], "stiffness": 1e7, "motion": "swing"}], gravity=None)
     with Simulation(content, MPI.COMM_SELF) as simulation:
         start = simulation.x[:2]
@@ -300,7 +302,7 @@ def test_a_soft_handle_pulls_towards_the_moving_target() -> None:
 
 
 @pytest.mark.parametrize("soft", [True, False])
-def test_a_fading_handle_weakens_as_the_fourth_power_and_then_is_gone(soft: bool) -> None:
+def test_a_fading_handle_weakens_with_the_fourth_power(soft: bool) -> None:
     handle = {"nodes": [0], "until": 0.1, "fade": 0.2} | ({"stiffness": 400.0} if soft else {})
     with Simulation(held_scene([handle]), MPI.COMM_SELF) as simulation:
         spring = simulation.problem.terms["spring"]
@@ -324,7 +326,7 @@ def test_a_fading_handle_weakens_as_the_fourth_power_and_then_is_gone(soft: bool
 
 
 def tip_deflection(nx: int, clamp: bool, pattern: str = "criss-cross") -> float:
-    """Of a cantilever strip over P L³/(3 B w), P small."""
+    """Deflection of a cantilever strip over P L³/(3 B w), for small P."""
     length, width, b = 1.0, 1.0 / nx, 0.5  # one square cell wide: a wide clamp would stiffen its surroundings
     load = 1e-6
     stiff = {"c11": 1e4, "c22": 1e4, "c12": 0.0, "c33": 5e3}
@@ -346,13 +348,13 @@ def tip_deflection(nx: int, clamp: bool, pattern: str = "criss-cross") -> float:
     ("pattern", "stiffness"), [("criss-cross", 1.0), ("diagonal", 0.8), ("alternating", 0.8)]
 )
 def test_clamped_cantilever_converges_to_the_beam(pattern: str, stiffness: float) -> None:
-    """With the stiffness that a strip with free edges has on each family of meshes, in B."""
+    """With the stiffness of a strip with free edges on each kind of mesh, relative to B."""
     errors = [abs(tip_deflection(nx, clamp=True, pattern=pattern) * stiffness - 1.0) for nx in (10, 20, 40)]
     assert errors[2] < 3e-4
     assert errors[0] > 3.5 * errors[1] > 12.0 * errors[2]
 
 
-def test_without_the_half_hinge_two_held_rows_are_a_worse_clamp() -> None:
+def test_two_held_rows_without_a_half_hinge_are_a_worse_clamp() -> None:
     held_rows = abs(tip_deflection(20, clamp=False) - 1.0)
     assert held_rows > 3.0 * abs(tip_deflection(20, clamp=True) - 1.0)
 
@@ -395,7 +397,9 @@ LIFT = {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}], "same": [{"t
         ([{"nodes": [0, 1]}, {"nodes": [2], "motion": "lift"}], False),
     ],
 )
-def test_handles_that_disagree_are_told(handles: list[dict[str, Any]], told: bool) -> None:
+def test_handles_that_hold_the_same_vertices_elsewhere_are_noted(
+    handles: list[dict[str, Any]], told: bool
+) -> None:
     content = {"mesh": MESH, "handles": handles, "motions": LIFT, "time": {"end": 2.0, "step": 0.1}}
     with Simulation(content, MPI.COMM_SELF) as simulation:
         notes = [note for note in simulation.problem.outline.notes if "different places" in note]

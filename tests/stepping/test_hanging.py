@@ -1,4 +1,4 @@
-"""Hanging strips: the discrete chain, its continuous limit, and the catenary."""
+"""Hanging strips: the discrete chain, its continuum limit, and the catenary."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def strip(nx: int, e: float, **more: Any) -> dict[str, Any]:
 
 
 def elongation(nx: int, e: float) -> float:
-    """Of a strip hanging from its left edge, its weight lumped to the rows."""
+    """Elongation of a strip hanging from its left edge, with its weight lumped to the rows."""
     weight = e * 100.0 * WIDTH
     rows = [{"box": [[i / nx - 1e-6, -1, -1], [i / nx + 1e-6, 1, 1]]} for i in range(nx + 1)]
     shares = np.full(nx + 1, 1.0 / nx)
@@ -43,7 +43,7 @@ def elongation(nx: int, e: float) -> float:
 @pytest.mark.parametrize(
     ("e", "n", "exact"), [row for row in HANGING["chain"]["rows"] if row[1] in (1, 4, 16)]
 )
-def test_strip_is_the_discrete_chain(e: float, n: int, exact: float) -> None:
+def test_a_strip_hangs_as_a_chain_of_bars(e: float, n: int, exact: float) -> None:
     assert elongation(n, e) == pytest.approx(exact, rel=1e-10, abs=1e-12)
 
 
@@ -56,7 +56,7 @@ def test_strip_converges_with_the_square_of_the_element_size(e: float, exact: fl
     assert errors[-1] < 2e-3 * exact
 
 
-def test_strip_under_gravity_itself() -> None:
+def test_a_strip_under_gravity() -> None:
     # lumped masses of a diagonal grid differ at the corners: equal to the chain but for that
     content = strip(
         16, 0.1, gravity=[9.81, 0, 0], handles=[{"group": "left"}, {"group": "sheet", "axes": ["y", "z"]}]
@@ -68,7 +68,7 @@ def test_strip_under_gravity_itself() -> None:
 
 
 def sag(nx: int, e: float, span: float) -> float:
-    """Of a strip whose ends are brought together and left to settle, over its length."""
+    """Sag over the length of a strip whose ends have approached each other."""
     content = strip(
         nx,
         e,

@@ -1,4 +1,4 @@
-"""What meets parts with a tenth of its speed, whatever the integrator is, and comes to rest."""
+"""Parts that collide separate with a tenth of their speed under every integrator, and come to rest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UP = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, SPEED]}]
 
 
 def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]:
-    """A sheet without weight that is thrown at a floor, or that a floor is thrown at."""
+    """A weightless sheet that is thrown at a floor, or hit by a moving floor."""
     meets = {"motion": UP, "interpolation": "linear"} if floor_moves else {}
     return {
         "mesh": grid(0.4, 0.3, 3, 2),
@@ -36,7 +36,9 @@ def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]
 @pytest.mark.parametrize(
     ("integrator", "step"), [("beuler", 5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
 )
-def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float, floor_moves: bool) -> None:
+def test_colliding_parts_hardly_rebound(
+    comm: MPI.Comm, integrator: str, step: float, floor_moves: bool
+) -> None:
     simulation = SteppedScene(comm, scene_of(impact(integrator, step, floor_moves=floor_moves)))
     system, n = simulation.problem.system, simulation.problem.points.n_owned
     before, impulse = simulation.budget.total, 0.0
@@ -58,7 +60,7 @@ def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float,
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
 def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
-    """A sheet falls on a ball by hundreds of gaps a step, and vertices meet it in every one of them."""
+    """A sheet falls on a ball by hundreds of gaps per step, and vertices touch it in each step."""
     ball = {"sphere": {"center": [0.0, 0.0, -0.302], "radius": 0.3}}
     scene = {
         "mesh": grid(0.6, 0.6, 8, 8) | {"transform": {"translate": [-0.3, -0.28, 0.0]}},
@@ -79,7 +81,7 @@ def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
 
 
 @pytest.mark.parallel(alone=False)
-def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_impacts_do_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = scene_of(impact("bdf2", 1e-3, floor_moves=True))
     with finished(comm, scene) as simulation:
         x = shape(simulation)
@@ -89,8 +91,8 @@ def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
-def test_what_is_met_behind_the_stage_has_its_energy_there(integrator: str) -> None:
-    """An automatic step from outside of the gap far into it is found out, not the one after it."""
+def test_contacts_reached_after_the_stage_are_noticed_in_the_same_step(integrator: str) -> None:
+    """In an adaptive step from outside the gap deep into it, not only in the next step."""
     content = {
         "mesh": grid(0.3, 0.3, 8, 8, "alternating") | {"transform": {"translate": [-0.15, -0.15, 0.02]}},
         "material": {"cloth": "gray-interlock", "damping": 0.02},

@@ -1,4 +1,4 @@
-"""Observed order in Δt of every integrator, on a nonlinear sheet with moving handles, wind and damping."""
+"""Observed orders in Δt of all integrators, on a nonlinear sheet with moving handles, wind and damping."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ LYING = MOVING | {
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
-def test_second_order_while_something_touches(integrator: str, comm: MPI.Comm) -> None:
+def test_second_order_during_contact(integrator: str, comm: MPI.Comm) -> None:
     shapes = []
     # longer ones damp bounces, and the first of bdf2 makes energy
     for steps in (80, 160, 320):

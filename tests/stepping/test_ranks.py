@@ -1,4 +1,4 @@
-"""The same scene on any number of ranks gives the same answer."""
+"""A scene gives the same answer on any number of ranks."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def outcome(
 @pytest.mark.parallel(alone=False)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 @pytest.mark.parametrize("content", [SHEET, TWO_SHEETS, TINY], ids=["sheet", "two", "tiny"])
-def test_as_on_one_rank(comm: MPI.Comm, content: dict[str, Any], integrator: str) -> None:
+def test_ranks_agree_with_one_rank(comm: MPI.Comm, content: dict[str, Any], integrator: str) -> None:
     content = content | {"time": {"end": 1.0, "step": 0.01, "integrator": integrator}}
     x, v, budget = outcome(content, comm, 8)
     x1, v1, budget1 = outcome(content, MPI.COMM_SELF, 8)

@@ -26,7 +26,7 @@ SCENE: dict[str, Any] = {
 
 
 def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int] = frozenset()) -> Any:
-    """Positions at the end and rejected steps; attempts of these numbers are made to fail."""
+    """Final positions and number of rejected steps; attempts with these numbers are made to fail."""
     time = {"end": 0.12, "step": step, "integrator": integrator}
     with stepped(comm, SCENE | {"time": time}) as simulation:
         system, attempts = simulation.problem.system, 0
@@ -54,7 +54,7 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"])
-def test_a_failed_step_is_repeated_and_does_no_harm(integrator: str, comm: MPI.Comm) -> None:
+def test_a_failed_step_is_repeated_without_side_effects(integrator: str, comm: MPI.Comm) -> None:
     smooth, none = journey(integrator, 0.004, comm)
     x, rejected = journey(integrator, 0.004, comm, fail=frozenset({1, 7, 8, 20}))
     coarse, _ = journey(integrator, 0.008, comm)
@@ -72,7 +72,7 @@ def test_spectral_radius_by_petsc_option() -> None:
 
 
 @pytest.mark.parallel(2)
-def test_one_note_says_how_often_and_why(comm: MPI.Comm) -> None:
+def test_one_note_reports_number_and_cause_of_repeated_steps(comm: MPI.Comm) -> None:
     PETSc.Options()["snes_max_it"] = 2
     simulation = SteppedScene(comm, scene_of(SCENE | {"time": {"end": 0.12, "step": 0.04}}))
     assert not simulation.note_of_repeats

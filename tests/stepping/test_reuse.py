@@ -1,4 +1,4 @@
-"""Preconditioners that serve several steps of one linear solve."""
+"""Preconditioners that are reused in several steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def equations(c: float = 0.01, mask: object = MASK) -> Any:
     return SimpleNamespace(stage=SimpleNamespace(c=c), prescribed=SimpleNamespace(mask=mask))
 
 
-def test_it_is_kept_until_the_average_would_grow() -> None:
+def test_a_preconditioner_is_kept_until_the_average_cost_would_grow() -> None:
     reuse, kept = Reuse(acts=True), []
     for iterations in (10, 11, 12, 13, 14, 15, 16, 17):
         kept.append(reuse.begin_solve(equations()))
@@ -29,7 +29,7 @@ def test_it_is_kept_until_the_average_would_grow() -> None:
     assert kept == [False, True, True, True, True, False, True, True]
 
 
-def test_another_step_or_other_prescribed_unknowns_need_their_own() -> None:
+def test_another_step_length_or_other_prescribed_unknowns_need_a_new_one() -> None:
     reuse = Reuse(acts=True)
     for other in (equations(), equations(c=0.02), equations(0.02, MASK.copy()), equations(mask=MASK)):
         assert not reuse.begin_solve(other)
@@ -43,7 +43,7 @@ def test_another_step_or_other_prescribed_unknowns_need_their_own() -> None:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("kind", ["", "pbjacobi", "gamg"])
-def test_steps_are_those_of_a_preconditioner_each(comm: MPI.Comm, kind: str) -> None:
+def test_steps_equal_those_with_a_preconditioner_per_step(comm: MPI.Comm, kind: str) -> None:
     scene = {
         "mesh": grid(0.6, 0.4, 6, 5, "alternating"),
         "material": CLOTH | {"bending": 1e-4, "damping": 0.01},

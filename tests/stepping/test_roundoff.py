@@ -1,4 +1,4 @@
-"""Where stiffness leaves nothing but rounding of a residual, steps move all the same, and say so."""
+"""Residuals below round-off: steps are still taken, with a note."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GRAVITY = 9.81
 
 
 def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
-    """Lowest z [m] of a light sheet after one step, and what was noted."""
+    """Lowest z [m] of a light sheet after one step, and the notes."""
     c = 120.0 * stiffness
     scene: dict[str, Any] = {
         "mesh": grid(1.0, 1.0, 8, 8, "alternating"),
@@ -38,14 +38,14 @@ def test_a_sheet_whose_weight_is_below_the_floor_still_falls(comm: MPI.Comm) -> 
     assert "of the loads" in notes[0]
 
 
-def test_soft_sheets_are_solved_and_say_nothing(comm: MPI.Comm) -> None:
+def test_soft_sheets_converge_without_a_note(comm: MPI.Comm) -> None:
     lowest, notes = after_a_step(1.0, comm)
     assert np.isclose(lowest, -GRAVITY * 0.005**2, rtol=0.05)
     assert notes == []
 
 
-def test_what_is_pressed_hard_takes_the_steps_planned(comm: MPI.Comm) -> None:
-    """Forces of contact are then far above all others, and their round-off above the scene's tolerance."""
+def test_a_strongly_pressed_sheet_needs_no_shorter_steps(comm: MPI.Comm) -> None:
+    """Contact forces are far above all others, and their round-off above the scene's tolerance."""
     low, room, gap = -0.0049, 5e-5, 0.005
     plates = {
         "low": {"plane": {"point": [0.0, 0.0, low], "normal": [0.0, 0.0, 1.0]}},

@@ -1,4 +1,4 @@
-"""Time schemes: their weights, what they keep and damp, and handles under all of them."""
+"""Integrators: their weights, what they conserve and damp, and handles under all of them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_bdf2_differentiates_parabolas_exactly(steps: tuple[float, ...]) -> None
     assert sum(scheme.weights(steps[-1])[1]) == pytest.approx(1.0, abs=1e-14)
 
 
-def test_bdf2_goes_on_after_a_restart_with_the_accelerations_it_was_given() -> None:
+def test_bdf2_restarts_with_given_accelerations() -> None:
     scheme, resumed = Bdf2(), Bdf2()
     scheme.set_acceleration(parabola(1.0))
     resumed.restore(*scheme.memory())
@@ -103,7 +103,7 @@ def energy_left(integrator: str, folder: Path, **more: float) -> float:
         return (simulation.energy("membrane") + kinetic) / before
 
 
-def test_midpoint_keeps_energy_and_the_others_damp(tmp_path: Path) -> None:
+def test_midpoint_conserves_energy_and_the_others_damp(tmp_path: Path) -> None:
     kept = {name: energy_left(name, tmp_path) for name in ("beuler", *SECOND_ORDER)}
     assert kept["midpoint"] == pytest.approx(1.0, abs=2e-3)
     assert kept["beuler"] < 0.1 < kept["bdf2"] < kept["alpha2"] < 0.999
@@ -113,7 +113,7 @@ def test_midpoint_keeps_energy_and_the_others_damp(tmp_path: Path) -> None:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_handles_are_where_their_motion_says(integrator: str, comm: MPI.Comm) -> None:
+def test_handles_follow_their_motion_exactly(integrator: str, comm: MPI.Comm) -> None:
     turn = [{"time": 0}, {"time": 1, "rotate": {"axis": [0, 1, 0], "degrees": 90}, "translate": [0, 0, 1]}]
     content: dict[str, Any] = {
         "mesh": grid(1, 1, 3, 3),

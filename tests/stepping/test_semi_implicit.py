@@ -1,4 +1,4 @@
-"""``semi-implicit``: one linear solve a step, against the paper's formula set up with dense matrices."""
+"""``semi-implicit``: one linear solve per step, compared with the paper's formula in dense matrices."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def paper_step(system: StageEquations, dt: float) -> Array:
 
 
 @pytest.mark.parametrize("handles", [{}, SPRINGS, HELD], ids=["free", "springs", "held"])
-def test_steps_are_the_papers_formula(handles: dict[str, Any]) -> None:
+def test_steps_follow_the_papers_formula(handles: dict[str, Any]) -> None:
     with Simulation(SCENE | handles, MPI.COMM_SELF) as simulation:
         system = simulation.system
         for _ in range(5):
@@ -62,7 +62,7 @@ def test_steps_are_the_papers_formula(handles: dict[str, Any]) -> None:
             assert attempt.newton_iterations <= 1
 
 
-def test_one_step_differs_from_backward_euler_by_the_second_order_in_time() -> None:
+def test_one_step_differs_from_backward_euler_by_second_order_in_dt() -> None:
     gaps = []
     for dt in (4e-3, 2e-3, 1e-3):
         ends = []

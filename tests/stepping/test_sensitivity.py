@@ -1,4 +1,4 @@
-"""Derivatives by the tangent equations against differences of whole runs, for every integrator and term."""
+"""Derivatives by tangent equations, compared with differences of runs, for all integrators and terms."""
 
 from __future__ import annotations
 
@@ -147,13 +147,13 @@ def scene(integrator: str, material: Mapping[str, Any] | None = None, **more: An
 
 
 def of_integrator(integrator: str, numbers: Mapping[str, float]) -> dict[str, float]:
-    """Those numbers that there are."""
+    """The parameters that have a meaning with this integrator."""
     gone = ("wind", "material.damping") if integrator == "static" else ()
     return {key: value for key, value in numbers.items() if not key.startswith(gone or "none")}
 
 
 def end(scene: Scene) -> Array:
-    """Positions [m] where a scene ends, of this rank's vertices."""
+    """Final positions [m] of this rank's vertices."""
     with finished(MPI.COMM_WORLD, scene) as simulation:
         points = simulation.problem.points
         x: Array = simulation.problem.system.x[: points.n_vertices].copy()
@@ -162,7 +162,7 @@ def end(scene: Scene) -> Array:
 
 
 def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
-    """Derivatives of `end` times each number."""
+    """Derivatives of `end` with respect to each parameter, times the parameter."""
     simulation = SteppedScene(MPI.COMM_WORLD, scene)
     chosen = [Number(key, value, abs(value)) for key, value in numbers.items()]
     beside = Sensitivities(simulation, chosen, tolerance=1e-11)
@@ -180,7 +180,7 @@ def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
 
 
 def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Array:
-    """Derivative of `end` along relative changes of numbers."""
+    """Derivative of `end` for relative changes of the parameters."""
 
     def at(factor: float) -> Array:
         changes = {key: value * (1.0 + factor * step) for key, value in direction.items()}
@@ -191,7 +191,7 @@ def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Arr
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_each_number(integrator: str) -> None:
+def test_each_parameter(integrator: str) -> None:
     pulled, numbers = scene(integrator), of_integrator(integrator, NUMBERS)
     found = tangents(pulled, numbers)
     for key, value in numbers.items():
@@ -202,7 +202,9 @@ def test_each_number(integrator: str) -> None:
 
 @pytest.mark.parametrize("integrator", ["static", "beuler", "midpoint", "bdf2"])
 @pytest.mark.parametrize(("material", "numbers"), [(SHELL, OF_SHELL), (PLATE, OF_PLATE)])
-def test_directors(integrator: str, material: Mapping[str, Any], numbers: Mapping[str, float]) -> None:
+def test_directors_at_rest(
+    integrator: str, material: Mapping[str, Any], numbers: Mapping[str, float]
+) -> None:
     agree(scene(integrator, material), of_integrator(integrator, numbers))
 
 
@@ -213,20 +215,20 @@ def agree(pulled: Scene, numbers: Mapping[str, float]) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["static", "beuler", "alpha2", "bdf2"])
-def test_directors_that_are_not_at_rest(integrator: str) -> None:
+def test_curved_sheets_with_directors(integrator: str) -> None:
     agree(scene(integrator, CURVED, **TURNED), of_integrator(integrator, OF_CURVED))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint"])
-def test_each_number_of_directors_that_are_not_at_rest(integrator: str) -> None:
+def test_each_parameter_of_curved_sheets_with_directors(integrator: str) -> None:
     pulled = scene(integrator, CURVED, **TURNED)
     for key, value in OF_CURVED.items():
         agree(pulled, {key: value})
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_laws(law: str) -> None:
+def test_membrane_laws(law: str) -> None:
     material, numbers = LAWS[law]
     agree(scene("beuler", {"damping": 0.01} | material), numbers)
 
@@ -248,8 +250,8 @@ def test_any_number_of_ranks() -> None:
     assert norms == pytest.approx([1.6633957, 0.34267864, 0.059317425], rel=1e-6)
 
 
-def test_number_at_its_least() -> None:
-    """Damping may not be less than 0: differences are taken to one side."""
+def test_a_parameter_at_its_lower_bound() -> None:
+    """Damping cannot be negative: differences are one-sided."""
     material = PULLED["material"] | {"damping": 0.0}
     found = tangents(scene("beuler", material), {"material.bending": 1e-3})
     assert np.isfinite(found["material.bending"]).all()
@@ -271,7 +273,7 @@ def test_number_at_its_least() -> None:
     assert np.linalg.norm(slope - expected) < 1e-5 * np.linalg.norm(expected)
 
 
-def test_what_is_no_scene() -> None:
+def test_a_misspelt_parameter_is_refused() -> None:
     simulation = SteppedScene(MPI.COMM_WORLD, scene("beuler"))
     with pytest.raises(InputError, match="bendig"):
         Sensitivities(simulation, [Number("material.bendig", 1.0, 1.0)])

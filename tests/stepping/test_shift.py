@@ -1,4 +1,4 @@
-"""Incomplete factors that would be indefinite are made of a matrix with a larger diagonal."""
+"""Incomplete factors: the diagonal is enlarged where they would be indefinite."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HANGING: dict[str, Any] = {
 
 
 def solver(kind: str) -> tuple[PETSc.KSP, PETSc.Mat]:
-    """Conjugate gradients with incomplete factors of another matrix than that of the system."""
+    """CG, with incomplete factors of a matrix other than that of the system."""
     rows, columns = np.nonzero(KERSHAW)
     mats = []
     for _ in range(2):
@@ -45,7 +45,7 @@ def solver(kind: str) -> tuple[PETSc.KSP, PETSc.Mat]:
     return ksp, mats[1]
 
 
-def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
+def test_the_shift_grows_until_factors_exist_and_decreases_again() -> None:
     ksp, preconditioner = solver("ilu")
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
@@ -73,7 +73,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
 
 
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
-def test_nothing_is_enlarged_where_it_has_no_sense(kind: str, acts: bool) -> None:
+def test_other_preconditioners_have_no_shift(kind: str, acts: bool) -> None:
     ksp, _ = solver(kind)
     idle = DiagonalShift(ksp, acts=acts)
     assert idle.value == 0.0
@@ -94,7 +94,7 @@ def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, l
 
 
 @pytest.mark.parallel(2)
-def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_other_solver_is_needed(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     incomplete = "ilu" if comm.size == 1 else "block-ilu"
     x, notes, preset = journey(comm, "semi-implicit")
     assert (notes, preset) == ([], incomplete)
@@ -108,7 +108,7 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parallel(2)
-def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> None:
+def test_newton_converges_to_the_same_state_as_with_a_direct_solver(comm: MPI.Comm) -> None:
     ends = []
     for kind in ("cholesky", "ilu" if comm.size == 1 else "bjacobi"):
         with options({"pc_type": kind}):
@@ -120,7 +120,7 @@ def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> 
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("lag", [1, 2, None])
-def test_how_often_factors_are_made_of_the_jacobian_itself(comm: MPI.Comm, lag: int | None) -> None:
+def test_factors_are_computed_as_often_as_lagging_allows(comm: MPI.Comm, lag: int | None) -> None:
     scene = HANGING | {"time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"}}
     # SNES decides after the Jacobian whether factors are due
     given = {"snes_lag_preconditioner": f"{lag}", "snes_lag_preconditioner_persists": "true"} if lag else {}

@@ -1,4 +1,4 @@
-"""Equilibria that are unstable are left for stable ones, and how they stand is counted right."""
+"""Unstable equilibria are left for stable ones, and negative pivots are counted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ on a diagonal grid bend with 0.8 B."""
 
 
 def strip(weight: float) -> dict[str, Any]:
-    """An upright strip, clamped below, of so many times its critical weight."""
+    """An upright strip, clamped below, with a multiple of its critical weight."""
     upright = {"transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
     stretch = {"c11": 1e3, "c22": 1e3, "c12": 0.0, "c33": 500.0}
     return {
@@ -36,7 +36,7 @@ def strip(weight: float) -> dict[str, Any]:
     }
 
 
-def test_a_strip_below_its_critical_weight_stands(comm: MPI.Comm) -> None:
+def test_a_strip_below_its_critical_weight_stays_upright(comm: MPI.Comm) -> None:
     with finished(comm, strip(0.95)) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
         assert not simulation.notes
@@ -46,7 +46,7 @@ def test_a_strip_below_its_critical_weight_stands(comm: MPI.Comm) -> None:
 @pytest.mark.parametrize(
     "weight", [1.2, *(pytest.param(w, marks=pytest.mark.parallel(1)) for w in (1.05, 1.5))]
 )
-def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
+def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.Comm) -> None:
     with finished(comm, strip(weight)) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
         assert "its lowest mode was followed once" in simulation.notes[0]
@@ -57,7 +57,9 @@ def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
         assert comm.allreduce(np.abs(free).max(initial=0.0), MPI.MAX) < 1e-6 * weight * CRITICAL
 
 
-def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_equilibrium_that_remains_unstable_is_noted(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     with finished(comm, strip(1.5)) as simulation:
         assert simulation.stability == {"stable": False, "negative_pivots": 1, "neutral_pivots": 0}
@@ -65,7 +67,7 @@ def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: py
         assert "followed 0 times" in simulation.notes[0]
 
 
-def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknowns_on_edges_do_not_change_the_counts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     counts = []
     for terms in (registry.REGISTRY, IN_PLACE_OF_HINGES):
@@ -78,7 +80,9 @@ def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: p
 
 
 @pytest.mark.parallel(1)
-def test_with_unknowns_of_edges_the_strip_falls_over(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_strip_also_falls_over_with_unknowns_on_edges(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with finished(comm, strip(1.2)) as simulation:
         hinges = np.abs(shape(simulation))
     monkeypatch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
@@ -96,7 +100,7 @@ PRESSED = {
 }
 
 
-def test_wrinkles_of_a_sheet_without_bending_are_told_not_followed(comm: MPI.Comm) -> None:
+def test_wrinkles_without_bending_are_noted_and_not_followed(comm: MPI.Comm) -> None:
     with finished(comm, PRESSED) as simulation:
         assert simulation.stability["stable"] is False
         assert simulation.stability["negative_pivots"] == 15  # every free vertex gives way across the sheet
@@ -104,14 +108,14 @@ def test_wrinkles_of_a_sheet_without_bending_are_told_not_followed(comm: MPI.Com
         assert np.abs(shape(simulation)[:, 2]).max() == 0.0
 
 
-def test_what_nothing_resists_is_neutral(comm: MPI.Comm) -> None:
+def test_motions_without_resistance_are_neutral(comm: MPI.Comm) -> None:
     still = PRESSED | {"motions": {"in": [{"time": 0}]}}
     with finished(comm, still) as simulation:
         assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 15}
         assert "nothing resists 15 motions" in simulation.notes[-1]
 
 
-def test_too_many_vertices_are_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_vertices_are_noted(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyra_petsc.stepping.stability.MAX_VERTICES", 10)
     with finished(comm, strip(0.5)) as simulation:
         assert simulation.stability["stable"] is None
@@ -128,8 +132,8 @@ FOLLOWING: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", FOLLOWING)
-def test_the_hessian_is_the_slope_of_all_forces(name: str) -> None:
-    """Its symmetric part where loads follow the shape; by finite differences of forces on free unknowns."""
+def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
+    """Its symmetric part if loads follow the shape; by finite differences on free unknowns."""
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
     system = simulation.problem.system

@@ -36,7 +36,7 @@ def test_spin_is_about_the_centre_of_mass(comm: MPI.Comm) -> None:
         np.testing.assert_allclose((mass * v).sum(axis=0), [0, 1.2, 0], atol=1e-14)
 
 
-def test_noise_goes_along_the_normal_with_the_given_size() -> None:
+def test_noise_is_normal_to_the_sheet_with_the_given_size() -> None:
     content = {
         "mesh": MESH | {"grid": MESH["grid"] | {"nx": 20, "ny": 20}},
         "initial": {"noise": 1e-3, "seed": 1},
@@ -51,7 +51,7 @@ def test_noise_goes_along_the_normal_with_the_given_size() -> None:
     assert abs(np.mean(shift[:, 1])) < 2e-4
 
 
-def test_the_seed_decides() -> None:
+def test_the_seed_determines_the_noise() -> None:
     def shape(seed: int) -> np.ndarray:
         with Simulation(
             {"mesh": MESH, "initial": {"noise": 1e-3, "seed": seed}}, MPI.COMM_SELF
@@ -62,7 +62,7 @@ def test_the_seed_decides() -> None:
     assert np.abs(shape(3) - shape(4)).max() > 1e-4
 
 
-def test_noise_is_no_part_of_the_rest_shape() -> None:
+def test_noise_does_not_change_the_rest_shape() -> None:
     with Simulation({"mesh": MESH, "initial": {"noise": 1e-3}}, MPI.COMM_SELF) as simulation:
         assert simulation.energy("membrane") > 0.0
 
@@ -75,7 +75,7 @@ def test_noise_is_no_part_of_the_rest_shape() -> None:
         ({"mesh": MESH | {"transform": {"translate": [1e12, 0, 0]}}}, "mesh"),
     ],
 )
-def test_what_double_precision_does_not_resolve_is_refused(change: dict[str, Any], key: str) -> None:
+def test_sizes_below_double_precision_are_refused(change: dict[str, Any], key: str) -> None:
     with pytest.raises(InputError) as refused:
         Simulation({"mesh": MESH} | change, MPI.COMM_SELF)
     assert refused.value.key == key

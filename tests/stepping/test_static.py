@@ -1,4 +1,4 @@
-"""Static equilibrium: out of balance by no more than asked, the same as settled motion, under all loads."""
+"""Static equilibria: residual within the tolerance, the end of a damped motion, all loads."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHEET: dict[str, Any] = {
 
 @contextmanager
 def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
-    """A scene's static analysis, done."""
+    """A scene after its static analysis."""
     with motion(comm, **(content | {"time": {"analysis": "static"} | content.get("time", {})})) as simulation:
         while not simulation.finished:
             simulation.step()
@@ -93,7 +93,7 @@ def test_forces_balance(name: str, comm: MPI.Comm) -> None:
         assert simulation.budget.dissipation == 0.0
 
 
-def test_the_answer_is_where_a_damped_motion_settles(comm: MPI.Comm) -> None:
+def test_equilibria_are_the_limits_of_damped_motions(comm: MPI.Comm) -> None:
     with at_rest(comm) as simulation:
         resting = shape(simulation)
     with motion(comm, time={"end": 400.0, "step": 2.0}, output={"every": None}) as simulation:
@@ -146,7 +146,7 @@ def test_work_of_clamps_that_turn_is_the_energy_stored(model: str, comm: MPI.Com
     assert off[0] / off[1] == pytest.approx(4.0, rel=0.1)  # of second order
 
 
-def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
+def test_increments_grow_while_load_steps_are_easy(comm: MPI.Comm) -> None:
     with motion(comm, time={"analysis": "static", "step": 0.05}) as simulation:
         factors = []
         while not simulation.finished:
@@ -157,7 +157,7 @@ def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
     assert len(factors) < 20
 
 
-def test_the_largest_increment_is_petscs_option(comm: MPI.Comm) -> None:
+def test_ts_adapt_dt_max_limits_the_increment(comm: MPI.Comm) -> None:
     time, petsc = {"analysis": "static", "step": 0.05}, {"ts_adapt_dt_max": 0.2}
     with motion(comm, time=time, petsc=petsc) as simulation:
         factors = [0.0]
@@ -167,7 +167,7 @@ def test_the_largest_increment_is_petscs_option(comm: MPI.Comm) -> None:
 
 
 def slit_ring(folder: Path, n: int) -> dict[str, Any]:
-    """The slit annular plate of Sze, Liu and Lo 2004, n cells across, lifted at one side of the slit."""
+    """The slit annular plate of Sze, Liu and Lo 2004, n cells wide, lifted at one side of the slit."""
     around = round(20 * n / 3)
     flat, faces = rectangle(around, n, 2.0 * np.pi, 1.0)
     radius = 6.0 + 4.0 * flat[:, 1]
@@ -188,15 +188,15 @@ def slit_ring(folder: Path, n: int) -> dict[str, Any]:
 
 @pytest.mark.parallel(1)
 def test_a_shell_takes_few_iterations(comm: MPI.Comm, tmp_path: Path) -> None:
-    """Load steps begin where the last ones lead, and the first one without inertia."""
+    """Load steps are extrapolated from the last ones, and the first one is solved without inertia."""
     time, petsc = {"analysis": "static", "step": 1.0 / 15.0}, {"ts_adapt_dt_max": 1.0 / 15.0}
     with at_rest(comm, **slit_ring(tmp_path, 6), time=time, petsc=petsc) as simulation:
         assert simulation.step_number == 15
         assert simulation.totals["newton_iterations"] <= 80  # 79; without either 92
 
 
-def test_the_tangent_tells_where_moving_handles_lead(comm: MPI.Comm) -> None:
-    """Against the difference of two equilibria, of a strip that a clamp lifts under its weight."""
+def test_the_tangent_includes_moving_handles(comm: MPI.Comm) -> None:
+    """Compared with the difference of two equilibria of a strip under its weight that a clamp lifts."""
     x, rate = [], np.empty(0)
     for more in (1.0, 1.01):
         lifted = {"time": 1.0, "translate": [-0.1 * more, 0.0, 0.3 * more]}
@@ -217,8 +217,8 @@ def test_the_tangent_tells_where_moving_handles_lead(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(1)
-def test_a_solve_ends_as_soon_as_it_is_near_enough(comm: MPI.Comm, tmp_path: Path) -> None:
-    """What second solves with the same matrix add tells how near."""
+def test_a_solve_ends_when_its_error_estimate_is_below_the_tolerance(comm: MPI.Comm, tmp_path: Path) -> None:
+    """Second solves with the same matrix give the estimate."""
     found, iterations = [], []
     for tolerance in (1e-6, 1e-10):
         content = {
@@ -240,8 +240,8 @@ def test_a_solve_ends_as_soon_as_it_is_near_enough(comm: MPI.Comm, tmp_path: Pat
 
 
 @pytest.mark.parallel(1)
-def test_the_jacobian_of_directors_is_that_of_their_energy(comm: MPI.Comm) -> None:
-    """What keeps edges without triangles from being loose stiffens no others."""
+def test_the_jacobian_of_directors_is_the_hessian_of_their_energy(comm: MPI.Comm) -> None:
+    """The stiffness that fixes edges without triangles is not added to other edges."""
     with motion(comm, material=SHEET["material"] | {"bending_model": "midedge"}) as simulation:
         system = simulation.problem.system
         system.begin_step(0.0, 0.01)
@@ -274,7 +274,7 @@ NOWHERE: dict[str, tuple[dict[str, Any], str]] = {
         for name in NOWHERE
     ],
 )
-def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> None:
+def test_a_sheet_without_an_equilibrium_fails_soon(name: str, comm: MPI.Comm) -> None:
     content, words = NOWHERE[name]
     time = {"time": {"analysis": "static"}}
     with motion(comm, mesh=grid(1.0, 1.0, 2, 2, "diagonal"), **content, **time) as simulation:
@@ -288,10 +288,10 @@ def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> N
         assert np.array_equal(shape(simulation), start)
 
 
-def test_directors_do_not_make_a_sheet_too_large_to_be_factored(
+def test_the_limit_of_direct_solvers_counts_vertices_not_directors(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The limit is a number of vertices; multigrid finds equilibria of stiff shells slowly or not at all."""
+    """Multigrid finds equilibria of stiff shells slowly or not at all."""
     monkeypatch.setattr(presets, "DIRECT_UNTIL", 60)
     material = SHEET["material"] | {"bending_model": "midedge"}
     with motion(comm, material=material, time={"analysis": "static"}) as simulation:

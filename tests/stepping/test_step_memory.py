@@ -1,4 +1,4 @@
-"""What a step takes besides what is kept between steps."""
+"""Temporary memory of a step."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def end(simulation: SteppedScene) -> None:
         PETSc.Options().delValue(name)
 
 
-def test_parts_of_forces_come_one_after_the_other() -> None:
+def test_parts_of_the_forces_are_computed_one_at_a_time() -> None:
     simulation = hanging(4)
     simulation.step()
     parts = simulation.problem.system.forces_at_stage()
@@ -44,7 +44,7 @@ def test_parts_of_forces_come_one_after_the_other() -> None:
     end(simulation)
 
 
-def test_a_new_state_leaves_the_arrays_of_the_one_before() -> None:
+def test_a_new_state_does_not_overwrite_the_old_arrays() -> None:
     simulation = hanging(2)
     state = simulation.problem.system.state
     x, kept = state.x, state.x.copy()
@@ -54,8 +54,8 @@ def test_a_new_state_leaves_the_arrays_of_the_one_before() -> None:
     end(simulation)
 
 
-def test_forces_at_the_end_of_a_linear_step_serve_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are computed once a step, by frames that have followed, and anew after a step that was refused."""
+def test_forces_at_the_end_of_a_linear_step_are_reused_in_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are computed once per step, with the frames of its end, and again after a rejected step."""
     simulation = hanging(4)
     simulation.step()
     term, system = simulation.problem.terms["midedge"], simulation.problem.system

@@ -1,4 +1,4 @@
-"""What a step still lacks when it counts as solved is what its tolerances allow."""
+"""Remaining error of a step that counts as converged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.parallel(2)
 
 
 def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:
-    """A square that falls from level on two corners in a side wind, 1/8 m between its vertices."""
+    """A level square that falls, held by two corners, in a side wind; 1/8 m between vertices."""
     membrane = {name: stiffness * value for name, value in CLOTH["membrane"].items()}
     return {
         "mesh": grid(1.0, 1.0, 8, 8, "alternating"),
@@ -34,7 +34,7 @@ def state_of(simulation: SteppedScene) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
 @pytest.mark.parametrize(("stiffness", "dt"), [(1.0, 0.01), (1.0, 0.04), (1000.0, 0.01)])
-def test_positions_are_as_near_as_asked(
+def test_errors_of_positions_are_within_the_tolerance(
     stiffness: float, dt: float, tolerance: float, comm: MPI.Comm
 ) -> None:
     asked = SteppedScene(comm, scene_of(sheet(stiffness, dt, tolerance)))

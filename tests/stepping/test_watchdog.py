@@ -1,4 +1,4 @@
-"""When trust in full steps is lost."""
+"""The watchdog: when full steps are no longer accepted without a line search."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lyra_petsc.stepping.globalisation import PATIENCE, Watchdog
 
 
 def seen(energies: Iterable[float]) -> int:
-    """After how many iterates of these energies trust is lost; 0 if it never is."""
+    """Number of iterates with these energies after which full steps end; 0 if they never do."""
     watchdog, u = Watchdog(), PETSc.Vec().createSeq(1)
     watchdog.begin_solve()
     lost = 0
@@ -25,11 +25,11 @@ def seen(energies: Iterable[float]) -> int:
     return lost
 
 
-def test_iterates_that_take_turns_are_not_trusted() -> None:
+def test_cycles_of_iterates_end_full_steps() -> None:
     assert 0 < seen([2.0, 1.0] * 20) <= 2 * PATIENCE
     assert 0 < seen([3.0, 2.0, 1.0] * 20) <= 3 * PATIENCE
 
 
 @pytest.mark.parametrize("energies", [[1.0] * 50, [1.0 / n for n in range(1, 50)], [0.0, 9.0, 4.0, 1.9, 0.9]])
-def test_what_falls_or_stays_is_trusted(energies: list[float]) -> None:
+def test_full_steps_continue_while_the_energy_decreases_or_stays(energies: list[float]) -> None:
     assert seen(energies) == 0
