@@ -1,4 +1,4 @@
-"""Products of block rows, in double and in single precision, against dense ones."""
+"""Products of block rows in double and single precision, compared with dense products."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ N, GHOSTS = 23, 4
 
 
 def dense_rows() -> np.ndarray:
-    """(N, N + GHOSTS, 3, 3) of a symmetric matrix, a third of the blocks not zero."""
+    """Rows (N, N + GHOSTS, 3, 3) of a symmetric matrix, a third of whose blocks are not zero."""
     rng = np.random.default_rng(1)
     rows = rng.standard_normal((N, N + GHOSTS, 3, 3)) * (rng.random((N, N + GHOSTS, 1, 1)) < 0.3)
     for row in range(N):
@@ -23,7 +23,7 @@ def dense_rows() -> np.ndarray:
 
 
 @pytest.mark.parametrize(("kind", "tolerance"), [(np.float64, 1e-13), (np.float32, 1e-5)])
-def test_as_a_dense_product(kind: type, tolerance: float) -> None:
+def test_products_agree_with_dense_ones(kind: type, tolerance: float) -> None:
     rows = dense_rows()
     present = rows.any(axis=(2, 3)) & (np.arange(N + GHOSTS) >= np.arange(N)[:, None])
     np.fill_diagonal(present, True)
@@ -38,7 +38,7 @@ def test_as_a_dense_product(kind: type, tolerance: float) -> None:
     np.testing.assert_allclose(out, np.einsum("rcij,cj->ri", rows, x), rtol=tolerance, atol=20 * tolerance)
 
 
-def test_nothing_of_the_next_block_or_row_gets_in() -> None:
+def test_products_do_not_read_the_next_block_or_row() -> None:
     blocks, out = np.full((3, 9), np.nan), np.empty((1, 3))
     blocks[1], x = 1.0, np.full((3, 3), np.nan)
     x[0] = 1.0
@@ -47,7 +47,7 @@ def test_nothing_of_the_next_block_or_row_gets_in() -> None:
     assert out.tolist() == [[3.0, 3.0, 3.0]]
 
 
-def test_other_arrays_are_refused() -> None:
+def test_arrays_of_other_types_are_refused() -> None:
     blocks, x, sums, out = np.ones((1, 9)), np.ones((1, 3)), np.empty((1, 4)), np.empty((1, 3))
     given = np.array([0, 1]), np.array([1]), np.array([0], dtype=np.int32)
     with pytest.raises(TypingError, match="contiguous arrays of two dimensions and one type"):
@@ -57,7 +57,7 @@ def test_other_arrays_are_refused() -> None:
 
 
 @pytest.mark.parametrize("left_out", [[], [0], [4], [0, 1, 3], [0, 1, 2, 3, 4]])
-def test_squares_without_entries_that_may_be_anything(left_out: list[int]) -> None:
+def test_norms_skip_left_out_entries_of_any_value(left_out: list[int]) -> None:
     vector = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     expected = float(np.sum(np.delete(vector, left_out) ** 2))
     vector[left_out] = 1e200

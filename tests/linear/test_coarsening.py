@@ -1,4 +1,4 @@
-"""Coarse meshes: what stays, what it is interpolated from, and how well."""
+"""Coarse meshes: the vertices that are kept, and the interpolation of the others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lyra_petsc.scene.schema import Grid, MeshSource
 
 
 def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """(n², 3) vertices and (2 (n − 1)², 3) triangles of a square, inner vertices moved at random."""
+    """Vertices (n², 3) and triangles (2 (n − 1)², 3) of a square, inner vertices moved at random."""
     at = np.arange(n * n)
     x = np.column_stack([at % n, at // n, np.zeros(n * n)]).astype(float)
     inner = (x[:, :2] > 0).all(axis=1) & (x[:, :2] < n - 1).all(axis=1)
@@ -27,7 +27,7 @@ def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interpolation(coarse: CoarseMesh) -> np.ndarray:
-    """(N, C) dense."""
+    """The dense matrix (N, C)."""
     n = len(coarse.start) - 1
     matrix = np.zeros((n, len(coarse.vertices)))
     np.add.at(matrix, (np.repeat(np.arange(n), np.diff(coarse.start)), coarse.parents), coarse.weights)
@@ -35,7 +35,7 @@ def interpolation(coarse: CoarseMesh) -> np.ndarray:
 
 
 def levels(x: np.ndarray, triangles: np.ndarray, number: int) -> Iterator[tuple[float, float]]:
-    """Fraction of the vertices that stays, and parents of a vertex, from each of the finest levels."""
+    """Fraction of vertices kept, and coarse vertices per fine vertex, for each level from the finest on."""
     for _ in range(number):
         coarse = coarsen(x, triangles)
         yield len(coarse.vertices) / len(x), len(coarse.parents) / len(x)
@@ -45,7 +45,7 @@ def levels(x: np.ndarray, triangles: np.ndarray, number: int) -> Iterator[tuple[
 @pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
 @pytest.mark.parametrize("cells", [60, 61])
 @pytest.mark.parametrize("numbering", ["along rows", "as distributed"])
-def test_coarse_meshes_of_every_pattern_are_as_small(pattern: Any, cells: int, numbering: str) -> None:
+def test_coarse_meshes_of_all_patterns_are_equally_small(pattern: Any, cells: int, numbering: str) -> None:
     sheet = grid_sheet(Grid(width=1, height=1, nx=cells, ny=cells, pattern=pattern))
     x, triangles = sheet.points, sheet.triangles
     if numbering == "as distributed":
@@ -56,7 +56,7 @@ def test_coarse_meshes_of_every_pattern_are_as_small(pattern: Any, cells: int, n
         assert parents < 4.9
 
 
-def test_irregular_meshes_are_interpolated_from_as_few() -> None:
+def test_vertices_of_irregular_meshes_are_interpolated_from_few_others() -> None:
     for stay, parents in levels(*grid(61, 0.3), 3):
         assert stay < 0.32
         assert parents < 4.3
@@ -69,8 +69,8 @@ Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
 """
 
 
-def test_meshes_of_gmsh_have_coarse_ones_as_small(tmp_path: Path) -> None:
-    """Patches of a regular mesh, which do not fit together."""
+def test_coarse_meshes_of_gmsh_meshes_are_equally_small(tmp_path: Path) -> None:
+    """Meshes of regular patches that do not match at their borders."""
     script = tmp_path / "square.geo"
     script.write_text(f"h = {math.sqrt(2 / math.sqrt(3) / 6000)};{SQUARE}", encoding="ascii")
     mesh = build_mesh([MeshSource(file=script)])
@@ -82,7 +82,7 @@ def test_meshes_of_gmsh_have_coarse_ones_as_small(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
-def test_what_stays_is_independent_and_leaves_nobody_alone(jitter: float) -> None:
+def test_kept_vertices_are_a_maximal_independent_set(jitter: float) -> None:
     x, triangles = grid(17, jitter)
     stays = np.zeros(len(x), dtype=bool)
     stays[coarsen(x, triangles).vertices] = True
@@ -103,7 +103,7 @@ def test_a_grid_is_coarsened_to_one_of_twice_the_spacing() -> None:
 
 
 @pytest.mark.parametrize(("jitter", "most"), [(0.0, 1e-9), (0.3, 0.45)])
-def test_linear_functions_of_a_flat_sheet_are_followed(jitter: float, most: float) -> None:
+def test_linear_functions_on_a_flat_sheet_are_interpolated_exactly(jitter: float, most: float) -> None:
     x, triangles = grid(17, jitter)
     turned = x @ np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     coarse = coarsen(turned, triangles)
@@ -121,7 +121,7 @@ def folds(n: int, values: np.ndarray) -> float:
     return float((np.diff(z, 2, axis=0) ** 2).sum() + (np.diff(z, 2, axis=1) ** 2).sum())
 
 
-def test_what_is_interpolated_bends_as_smooth_functions_do() -> None:
+def test_interpolated_functions_bend_like_smooth_ones() -> None:
     x, triangles = grid(33)
     wave = np.sin(2 * np.pi * x[:, 0] / 32) * np.sin(2 * np.pi * x[:, 1] / 32)
     coarse = coarsen(x, triangles)
@@ -130,7 +130,7 @@ def test_what_is_interpolated_bends_as_smooth_functions_do() -> None:
     assert folds(33, bent) < 1.4 * folds(33, wave)
 
 
-def test_a_curved_sheet_is_followed() -> None:
+def test_a_curved_sheet_is_interpolated() -> None:
     x, triangles = grid(33)
     x[:, 2] = 4.0 * np.sin(x[:, 0] / 8.0)
     coarse = coarsen(x, triangles)
@@ -149,13 +149,13 @@ def test_a_curved_sheet_is_followed() -> None:
     ],
     ids=["empty", "no triangle", "one triangle", "all in one place", "all on a line"],
 )
-def test_every_vertex_gets_something_whatever_the_mesh(x: np.ndarray, triangles: np.ndarray) -> None:
+def test_every_vertex_of_any_mesh_has_interpolation_weights(x: np.ndarray, triangles: np.ndarray) -> None:
     coarse = coarsen(x, triangles)
     assert np.isfinite(coarse.weights).all()
     assert np.allclose(interpolation(coarse).sum(axis=1), 1.0)
 
 
-def test_sheets_that_do_not_hang_together_do_not_mix() -> None:
+def test_separate_sheets_are_interpolated_separately() -> None:
     x, triangles = grid(9)
     both = np.vstack([x, x + [0, 0, 1e-3]])
     coarse = coarsen(both, np.vstack([triangles, triangles + len(x)]))

@@ -1,4 +1,4 @@
-"""Values of edges one by one behind blocks: products, sweeps and constraints against dense ones."""
+"""Edge unknowns stored as single values behind the blocks: products, sweeps and constraints."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_rows_without_edges_have_none() -> None:
     assert BlockPattern({"pair": np.array([[0, 1]], np.int32)}, 2, 2).edge_couplings is None
 
 
-def test_the_product_is_the_dense_one() -> None:
+def test_products_agree_with_dense_ones() -> None:
     pattern, values, dense = mixed_rows()
     x, out = RNG.normal(size=(N_LOCAL, 3)), np.full((N_OWNED, 3), np.nan)
     product = ProductWithEdges(pattern, values)
@@ -59,7 +59,7 @@ def test_the_product_is_the_dense_one() -> None:
         values *= 2.0
 
 
-def test_sums_and_multiples_are_the_dense_ones() -> None:
+def test_sums_and_multiples_agree_with_dense_ones() -> None:
     pattern, values, dense = mixed_rows()
     rows, diagonal = BlockRows(pattern), RNG.normal(size=N_OWNED)
     more = np.zeros_like(dense)
@@ -100,7 +100,7 @@ def test_prescribed_unknowns_are_decoupled() -> None:
     assert set(np.flatnonzero(flat != old)) <= set(constrained.changed)
 
 
-def test_larger_diagonals() -> None:
+def test_enlarged_diagonals() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     BlockRows(pattern).scale_diagonal(values, 1.5)
     found = np.diag(expanded(pattern, values, N_LOCAL).reshape(dense.shape)) / np.diag(dense)
@@ -135,7 +135,7 @@ def sweeps_of(pattern: BlockPattern, values: np.ndarray) -> SweepsWithEdges:
     return sweeps
 
 
-def test_rows_are_copied_into_their_own_place() -> None:
+def test_rows_are_copied_in_place() -> None:
     _, values, _ = mixed_rows()
     memory = values.reshape(-1, 9).copy()
     copy = memory.reshape(-1).view(np.float32)[: values.size].reshape(-1, 9)
@@ -143,7 +143,7 @@ def test_rows_are_copied_into_their_own_place() -> None:
     np.testing.assert_array_equal(copy, values.reshape(-1, 9).astype(np.float32))
 
 
-def test_a_sweep_before_and_one_after() -> None:
+def test_a_sweep_before_and_after_the_coarse_level() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     owned, upper = parts(dense)
     sweeps = sweeps_of(pattern, values)
@@ -217,7 +217,7 @@ def test_more_sweeps_over_the_vertices() -> None:
     np.testing.assert_allclose(x.ravel(), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
+def test_sweeps_invert_the_diagonal_of_edges() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
     rows = np.array([1, N_VERTICES + 1])
@@ -227,7 +227,7 @@ def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
     np.testing.assert_array_equal(edges, np.diag(np.diag(dense)[first : first + 3]))
 
 
-def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
+def test_enlarged_diagonals_and_added_values_are_stored_in_the_right_rows() -> None:
     pattern, values, _ = mixed_rows(definite=True)
     sweeps = sweeps_of(pattern, values)
     b = np.zeros((N_LOCAL, 3), dtype=np.float32)
@@ -247,8 +247,8 @@ def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
     assert sweeps.of_edges[last].tolist() == [5.0, 6.0, 7.0]
 
 
-def test_rows_of_ghosts_alone() -> None:
-    """A rank all of whose elements belong to others' rows but for one vertex."""
+def test_a_rank_with_a_single_owned_vertex() -> None:
+    """All its other rows are ghosts."""
     coupling = MixedStencil(np.array([[0, 2, 3]], np.int32), np.array([[12, 13, 14]], np.int64))
     pattern = BlockPattern({"mixed": coupling}, 1, 5)
     values = RNG.normal(size=(pattern.n_stored, 3, 3))
@@ -259,7 +259,7 @@ def test_rows_of_ghosts_alone() -> None:
     np.testing.assert_allclose(out[0], expected, rtol=1e-13)
 
 
-def test_negligible_entries_are_none() -> None:
+def test_negligible_entries_are_dropped() -> None:
     pattern, values, _ = mixed_rows(definite=True)
     rows = BlockRows(pattern)
     x = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)

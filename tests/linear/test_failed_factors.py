@@ -1,4 +1,4 @@
-"""A factorisation that failed once does not fail for ever."""
+"""Recovery from factorisations that failed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORKSPACE = "mat_mumps_icntl_14"
 
 
 @pytest.mark.parametrize("kind", ["ilu", "bjacobi", "gasm", "cholesky", "redundant", "telescope", "ksp"])
-def test_a_better_matrix_has_factors_again(kind: str) -> None:
+def test_a_regular_matrix_is_factored_after_a_failure(kind: str) -> None:
     mat = PETSc.Mat().createBAIJ(((12, 12), (12, 12)), 3, nnz=4, comm=PETSc.COMM_SELF)
 
     def fill(diagonal: float) -> None:

@@ -1,4 +1,4 @@
-"""Coarse block rows are interpolationᵀ · matrix · interpolation, as PETSc works it out."""
+"""Coarse block rows are interpolationᵀ · matrix · interpolation, compared with PETSc's product."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Interpolation:
         self.mat = PETSc.Mat().createAIJ(sizes, nnz=(width, width), comm=fine.comm)
 
     def set(self, free: np.ndarray) -> None:
-        """Interpolate to coordinates only that are free (n_owned, 3); collective."""
+        """Set the free coordinates (n_owned, 3), to which alone values are interpolated; collective."""
         for row, parent, weight in zip(*self._entries, strict=True):
             for axis in range(3):
                 value = weight * free[row - self._first, axis]
@@ -122,7 +122,7 @@ def test_coarse_meshes_do_not_depend_on_the_partition(
 
 
 @pytest.mark.parallel
-def test_nothing_is_interpolated_to_held_coordinates(comm: MPI.Comm) -> None:
+def test_prescribed_coordinates_are_not_interpolated(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
         points = simulation.problem.points
         between = interpolations(points, simulation.problem.surface, 2)

@@ -1,4 +1,4 @@
-"""The assembled system matrix: against differences of the residual, in every storage format."""
+"""The assembled Jacobian compared with differences of the residual, in every matrix type."""
 
 from __future__ import annotations
 

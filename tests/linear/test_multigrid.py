@@ -1,4 +1,4 @@
-"""Multigrid on our coarse meshes: iterations against mesh, ranks, stiffness."""
+"""Geometric multigrid: iterations for various meshes, ranks and stiffness."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.parallel
 
 @pytest.fixture(params=["python", "mg"])
 def kind(request: pytest.FixtureRequest) -> str:
-    """Value of ``-pc_type``: our cycle goes by both."""
+    """Value of ``-pc_type``; both select the program's cycle."""
     return str(request.param)
 
 
@@ -44,7 +44,7 @@ def hanging(cells: int, **time: Any) -> dict[str, Any]:
 def iterated(
     comm: MPI.Comm, content: dict[str, Any], steps: int, pc_type: str, **petsc: Any
 ) -> tuple[np.ndarray, list[int]]:
-    """Positions in mesh order, and linear iterations of each step, or the mean of its attempts."""
+    """Positions in mesh order, and linear iterations of each step, or their mean over attempts."""
     with stepped(comm, Scene.model_validate(content), pc_type=pc_type, **petsc) as simulation:
         reports = [simulation.step() for _ in range(steps)]
         return shape(simulation), [r.linear_iterations // (1 + r.rejected) for r in reports]
@@ -59,8 +59,8 @@ def test_iterations_hardly_grow_with_the_mesh(kind: str, comm: MPI.Comm) -> None
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize("scheme", ["semi-implicit", "beuler"])
-def test_unknowns_of_edges_cost_few_iterations(scheme: str, clamped: bool, comm: MPI.Comm) -> None:
-    """Coarse levels have none: directors must follow the vertices, or bending is far too stiff on them."""
+def test_unknowns_on_edges_take_few_iterations(scheme: str, clamped: bool, comm: MPI.Comm) -> None:
+    """Coarse levels have none: directors must follow the vertices, or bending is too stiff there."""
     counts = []
     for model in ("hinge", "midedge"):
         content = hanging(75, integrator=scheme)
@@ -77,7 +77,7 @@ def test_stiff_cloth_and_long_steps(kind: str, comm: MPI.Comm) -> None:
     assert max(iterated(comm, content, 3, kind)[1]) <= 30
 
 
-def test_the_answer_is_that_of_a_factorisation(kind: str, comm: MPI.Comm) -> None:
+def test_the_solution_is_that_of_a_direct_solver(kind: str, comm: MPI.Comm) -> None:
     tight = {"ksp_rtol": 1e-11}
     x, _ = iterated(comm, hanging(25), 5, kind, **tight)
     direct, _ = iterated(comm, hanging(25), 5, "cholesky", **tight)
@@ -91,7 +91,7 @@ def test_newton_with_an_exact_hessian(kind: str, comm: MPI.Comm) -> None:
     assert np.abs(x - other).max() < 1e-6
 
 
-def test_handles_that_let_go(kind: str, comm: MPI.Comm) -> None:
+def test_handles_that_are_released(kind: str, comm: MPI.Comm) -> None:
     content = hanging(25)
     content["handles"][0]["until"] = 0.015
     x, counts = iterated(comm, content, 8, kind)
@@ -120,7 +120,7 @@ def test_a_mesh_of_a_few_triangles(kind: str, comm: MPI.Comm) -> None:
     ],
     ids=lambda options: " ".join(options),
 )
-def test_options_reach_it(options: dict[str, Any], kind: str, comm: MPI.Comm) -> None:
+def test_options_are_used(options: dict[str, Any], kind: str, comm: MPI.Comm) -> None:
     if comm.size > 1 and "mg_coarse_pc_type" in options:
         options = {"mg_coarse_redundant_pc_type": "svd"}
     _, counts = iterated(comm, hanging(25), 2, kind, **options)
@@ -136,7 +136,7 @@ def test_levels_visited_twice(comm: MPI.Comm) -> None:
     assert np.abs(once - twice).max() < 1e-6
 
 
-def test_our_cycle_stands_in_the_solvers_view(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
+def test_ksp_view_shows_the_cycle(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
     iterated(comm, hanging(25), 1, "python", ksp_view="")
     if comm.rank == 0:
         assert "cycles=V" in capfd.readouterr().out
@@ -158,7 +158,7 @@ def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
 
 
 @pytest.mark.parametrize(("bending", "sweeps"), [(1.0, 1), (5e3, 2)])
-def test_the_stiffer_bending_the_more_sweeps(
+def test_stiffer_bending_takes_more_sweeps(
     comm: MPI.Comm, capfd: pytest.CaptureFixture[str], bending: float, sweeps: int
 ) -> None:
     content = hanging(12)
@@ -169,7 +169,7 @@ def test_the_stiffer_bending_the_more_sweeps(
         assert [number for number in (2, 3) if f"  {number} of each" in output] == [sweeps] * (sweeps > 1)
 
 
-def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
+def test_a_python_preconditioner_of_the_user_is_kept(comm: MPI.Comm) -> None:
     own = {"pc_python_type": f"{__name__}.Scaling"}
     x, counts = iterated(comm, hanging(8), 2, "python", **own)
     direct, _ = iterated(comm, hanging(8), 2, "cholesky")
@@ -177,7 +177,7 @@ def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
     assert np.abs(x - direct).max() < 1e-6
 
 
-def test_as_a_part_of_another_preconditioner_it_is_refused(comm: MPI.Comm) -> None:
+def test_it_is_refused_as_part_of_another_preconditioner(comm: MPI.Comm) -> None:
     with pytest.raises(InputError, match="main preconditioner only") as caught:
         iterated(comm, hanging(8), 1, "bjacobi", sub_pc_type="python", sub_pc_python_type=PYTHON_TYPE)
     assert caught.value.key == "-sub_pc_python_type"
@@ -195,7 +195,7 @@ def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
 @pytest.mark.parametrize("model", ["hinge", "midedge"])
 @pytest.mark.parametrize("pattern", ["diagonal", "criss-cross"])
 def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm) -> None:
-    """Ranks whose points lie scattered: sweeps alone have an eigenvalue of −0.7 on three of them."""
+    """On ranks with scattered points; sweeps alone have an eigenvalue of −0.7 on three of them."""
     content = hanging(12, step=0.04)
     content["mesh"]["grid"] |= {"ny": 1, "height": 1.0 / 12.0, "pattern": pattern}
     content["handles"] = [{"nodes": [0]}]
@@ -219,14 +219,14 @@ def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm
 
 
 class Scaling:
-    """A preconditioner of somebody's: the identity."""
+    """A user's preconditioner: the identity."""
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = b."""
         b.copy(x)
 
 
-def test_sweeps_that_grow_without_bound_are_negative_curvature(
+def test_unbounded_sweeps_count_as_negative_curvature(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the sixth step the exact Hessian, tried as its own preconditioner, is indefinite."""
@@ -239,10 +239,10 @@ def test_sweeps_that_grow_without_bound_are_negative_curvature(
         assert not simulation.notes
 
 
-def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
+def test_the_matrix_of_the_cycle_can_be_shown_after_its_memory_was_reused(
     comm: MPI.Comm, shared_tmp: Path
 ) -> None:
-    """Its block rows stand where the sweeps keep theirs afterwards, where edges carry unknowns."""
+    """With unknowns on edges, sweeps later store their rows where those of the matrix were."""
     content = hanging(12, integrator="beuler")
     content["material"]["bending_model"] = "midedge"
     with stepped(comm, Scene.model_validate(content), pc_type="python") as simulation:
@@ -264,7 +264,7 @@ def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
     assert 0.0 < after.norm(PETSc.NormType.INFINITY) < 1e-6 * size  # which is single precision
 
 
-def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm) -> None:
+def test_the_operator_is_assembled_on_request_only(comm: MPI.Comm) -> None:
     """PETSc only multiplies by our rows; ``-mat_type`` makes a matrix with entries."""
     for asked, with_entries in (({}, False), ({"mat_type": "aij"}, True)):
         given = asked | {"pc_type": "python", "pc_python_type": PYTHON_TYPE}

@@ -1,4 +1,4 @@
-"""Half storage of block rows against dense sums; indices that pass 32 bits."""
+"""Half storage of block rows compared with dense sums; indices beyond 32 bits."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def dense(stencil: np.ndarray, blocks: np.ndarray) -> np.ndarray:
 
 
 def symmetric(blocks: np.ndarray) -> np.ndarray:
-    """Element blocks (E, n, n, 3, 3) whose transposes are those of the exchanged vertices."""
+    """Element blocks (E, n, n, 3, 3) that are symmetric as matrices."""
     return blocks + blocks.transpose(0, 2, 1, 4, 3)
 
 
@@ -94,7 +94,7 @@ def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
     np.testing.assert_array_equal(values, everywhere)
 
 
-def test_rows_times_columns_pass_32_bits() -> None:
+def test_products_of_rows_and_columns_beyond_32_bits() -> None:
     n = 70_000  # n² > 2³²
     stencil = np.array([[n - 1, n - 2], [0, n - 1]], dtype=np.int32)
     pattern = BlockPattern({"pair": OffDiagonal(stencil)}, n, n)
@@ -114,7 +114,7 @@ def test_the_same_elements_have_one_table_of_offsets() -> None:
     np.testing.assert_array_equal(offsets["other"], offsets["one"][::-1])
 
 
-def test_pairs_are_coupled_whole_or_across_only() -> None:
+def test_pairs_couple_all_points_or_only_both_sides() -> None:
     stencil = np.array([[1, 2], [3, 0]], dtype=np.int32)
     pattern = BlockPattern({"pair": stencil, "across": OffDiagonal(stencil)}, 4, 4)
     assert pattern.offsets["pair"].shape == (2, 3)
@@ -193,7 +193,7 @@ def test_patterns_of_keys() -> None:
 
 @pytest.mark.parallel
 @pytest.mark.parametrize(("largest", "remedy"), [(100, "64-bit indices"), (400, "more ranks")])
-def test_more_than_petsc_can_count(
+def test_sizes_beyond_petscs_integers_are_refused(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, largest: int, remedy: str
 ) -> None:
     class Small:

@@ -1,4 +1,4 @@
-"""Which linear solver a problem starts with, and which follow it."""
+"""The linear solver with which a problem starts, and the next ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ from lyra_petsc.linear.presets import PRESETS, break_even_iterations, candidates
         (200_000, 2, {"static": True}, "multigrid-w"),
     ],
 )
-def test_the_first_fits_the_problem(vertices: int, ranks: int, more: dict[str, float], first: str) -> None:
+def test_the_first_solver_suits_the_problem(
+    vertices: int, ranks: int, more: dict[str, float], first: str
+) -> None:
     chosen = candidates(vertices, ranks, **more)  # type: ignore[arg-type]
     assert chosen[0] == first
     assert len(set(chosen)) == len(chosen) > 1
@@ -58,7 +60,7 @@ def test_iterations_are_limited_only_before_a_factorisation() -> None:
 @pytest.mark.parametrize(
     ("values", "negative"), [([2.0, 1.0, 3.0], 0), ([2.0, -1.0, 3.0], 1), ([-2.0, -1.0, 3.0], 2)]
 )
-def test_pivots_tell_negative_curvature(values: list[float], negative: int) -> None:
+def test_pivots_show_negative_curvature(values: list[float], negative: int) -> None:
     mat = PETSc.Mat().createAIJ((3, 3), nnz=3, comm=PETSc.COMM_SELF)
     rotation = np.linalg.qr(np.arange(9.0).reshape(3, 3) ** 2 + np.eye(3))[0]
     mat.setValues(range(3), range(3), rotation @ np.diag(values) @ rotation.T)
@@ -76,7 +78,7 @@ def test_pivots_tell_negative_curvature(values: list[float], negative: int) -> N
 @pytest.mark.parametrize(
     ("kind", "shows"), [("pbjacobi", True), ("ilu", True), ("lu", False), ("none", True)]
 )
-def test_exact_factors_without_pivots_hide_it(kind: str, shows: bool) -> None:
+def test_without_pivots_exact_factors_hide_negative_curvature(kind: str, shows: bool) -> None:
     pc = PETSc.PC().create(PETSc.COMM_SELF)
     pc.setType(kind)
     assert shows_negative_curvature(pc) is shows

@@ -1,4 +1,4 @@
-"""Element blocks, whole or as sums of outer products, land where the offsets say."""
+"""Element blocks, full or as sums of outer products, are added at the given offsets."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_outer_products_are_added_to_one_block(kind: type, odd: int, count: int)
     np.testing.assert_array_equal(values[[0, 2]], before[[0, 2]])
 
 
-def test_what_others_have_is_left_to_them() -> None:
+def test_blocks_of_other_ranks_are_not_added() -> None:
     values = np.ones((2, 3, 3))
     add_one(values, np.int32(-1), 5.0, (vectors(2),))
     np.testing.assert_array_equal(values, 1.0)
@@ -65,7 +65,7 @@ PLACES = [[0, 3, 4, 6, 9, 10], [2, 5, -1, -1, -1, -1], [-1, 4, 7, 0, -1, 2], [-1
 
 
 def sums_at(places: list[int], blocks: np.ndarray) -> np.ndarray:
-    """Zeros (6, 3, 3) to which the blocks are added, transposed at odd places."""
+    """Zeros (6, 3, 3) to which the blocks are added, transposed at odd offsets."""
     out = np.zeros((6, 3, 3))
     for place, block in zip(places, blocks, strict=True):
         if place >= 0:
@@ -84,7 +84,7 @@ def test_six_blocks_of_a_triangle(places: list[int], kind: type) -> None:
 
 
 @pytest.mark.parametrize("places", PLACES)
-def test_their_vectors_may_be_sums(places: list[int]) -> None:
+def test_outer_products_of_sums_of_vectors(places: list[int]) -> None:
     n, a, b, c = vectors(4)
     right, left = ((2.0, a), (-0.5, b)), ((3.0, c),)
     block = np.outer(n, 2.0 * np.array(a) - 0.5 * np.array(b)) + np.outer(3.0 * np.array(c), n)
@@ -95,7 +95,7 @@ def test_their_vectors_may_be_sums(places: list[int]) -> None:
 
 @pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
-def test_three_blocks_of_a_triangle_make_the_others(places: list[int], kind: type) -> None:
+def test_three_blocks_of_a_triangle_determine_the_others(places: list[int], kind: type) -> None:
     f, rows = vectors(2), RNG.normal(size=(3, 5))
     rows[::2, 2] = rows[::2, 1]  # (1, 1) and (2, 2) are symmetric
     factors = tuple(tuple(float(number) for number in row) for row in rows)
@@ -111,7 +111,7 @@ def test_three_blocks_of_a_triangle_make_the_others(places: list[int], kind: typ
 
 @pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
-def test_three_blocks_of_corners_make_the_others(places: list[int], kind: type) -> None:
+def test_three_blocks_of_corners_determine_the_others(places: list[int], kind: type) -> None:
     b11, b12, b22 = blocks = RNG.normal(size=(3, 3, 3))
     b11 += b11.T.copy()
     b22 += b22.T.copy()
@@ -123,7 +123,7 @@ def test_three_blocks_of_corners_make_the_others(places: list[int], kind: type) 
     np.testing.assert_allclose(values, expected, atol=1e-13)
 
 
-def test_whole_elements_go_the_same_way() -> None:
+def test_full_element_matrices_are_added() -> None:
     blocks = RNG.normal(size=(AHEAD + 3, 2, 2, 3, 3))
     offsets = np.array([[0, 3, 4]] * (AHEAD + 2) + [[0, 2, -1]], dtype=np.int32)
     values = np.zeros((3, 3, 3))
@@ -135,7 +135,7 @@ def test_whole_elements_go_the_same_way() -> None:
     np.testing.assert_allclose(values[2], weighted[:-1, 1, 1].sum(axis=0), atol=1e-13)
 
 
-def test_fetching_changes_nothing() -> None:
+def test_prefetching_changes_nothing() -> None:
     values = np.arange(18.0).reshape(2, 3, 3)
     before = values.copy()
     offsets = np.array([[-1, 2, 10**6]], dtype=np.int32)  # another rank's, ours, and nobody's

@@ -1,4 +1,4 @@
-"""The matrix has an entry for what the active terms couple, and for nothing else."""
+"""The matrix has entries for the couplings of the active terms only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NX, NY = 6, 5
 
 
 def couplings(mesh: dict[str, Any], comm: MPI.Comm, **more: Any) -> set[tuple[int, int]]:
-    """Coupled vertex pairs (mesh numbers) of a scene's matrix, its own with itself too, on every rank."""
+    """Coupled vertex pairs (mesh numbers) of a scene's matrix, including the diagonal, on every rank."""
     with Simulation({"mesh": mesh} | more, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         mesh_number = np.empty(points.n_global, dtype=np.int64)
@@ -109,7 +109,7 @@ HEAVY = ("gmsh", "h5py", "ruamel.yaml", "rich")
 
 
 def imported(**more: Any) -> set[str]:
-    """Modules that are loaded after a step of a scene, in a fresh interpreter."""
+    """Modules that are loaded after one step of a scene, in a new interpreter."""
     scene = {
         "mesh": grid(1, 1, 2, 2),
         "material": CLOTH,
@@ -155,7 +155,7 @@ def test_a_membrane_scene_imports_and_compiles_no_other_term(of_membrane: set[st
 
 
 @pytest.mark.slow
-def test_each_key_of_a_scene_brings_its_own_term_and_no_more(of_membrane: set[str]) -> None:
+def test_each_key_of_a_scene_imports_its_own_term_only(of_membrane: set[str]) -> None:
     without = {m for m in of_membrane if ".terms." in m}
     added = {
         "wind": {"wind": {"velocity": [0, 0, 1], "density": 1.0}},

@@ -1,4 +1,4 @@
-"""Values written into PETSc's arrays are those that MatSetValues would put there."""
+"""Values written directly into PETSc's arrays are those that MatSetValues would set."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Co
 
 
 @pytest.mark.parallel
-def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> None:
+def test_products_of_block_rows_agree_with_petscs(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
@@ -99,7 +99,7 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
 
 
 @pytest.mark.parallel
-def test_a_matrix_keeps_nothing_alive_of_which_it_tells(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_viewed_matrix_keeps_no_objects_alive(comm: MPI.Comm, shared_tmp: Path) -> None:
     # PETSc would free it at the end, when MPI is gone
     class Teller:
         def lines(self) -> list[str]:
@@ -125,7 +125,7 @@ def test_a_matrix_keeps_nothing_alive_of_which_it_tells(comm: MPI.Comm, shared_t
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "aij", "sbaij"])
-def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> None:
+def test_an_enlarged_diagonal_is_that_of_the_enlarged_rows(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
@@ -146,7 +146,7 @@ def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> 
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "aij"])
-def test_of_a_diagonal_matrix_other_blocks_are_left_out(kind: str, comm: MPI.Comm) -> None:
+def test_a_diagonal_matrix_stores_diagonal_blocks_only(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
@@ -178,7 +178,7 @@ for destroy in (True, False):
 
 @pytest.mark.parametrize("kind", ["gamg", "mg"])
 def test_a_program_may_end_before_its_solvers_are_freed(kind: str) -> None:
-    """PETSc frees them when Python is gone, which matrices of type python would call."""
+    """PETSc frees them after Python has ended, and must not call matrices of type python then."""
     scene = {"mesh": grid(1, 1, 8, 8), "material": CLOTH, "time": {"end": 1, "step": 0.01}}
     script = SCRIPT.format(kind=kind, scene=scene)
     done = subprocess.run(

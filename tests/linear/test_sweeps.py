@@ -1,4 +1,4 @@
-"""Sweeps over half-stored symmetric rows: they solve the triangles they claim to, in single precision."""
+"""Gauss-Seidel sweeps over half-stored symmetric rows solve triangular systems, in single precision."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ N, GHOSTS = 40, 6
 
 
 def system() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Stored rows (indptr, columns, blocks (n, 3, 3)), and all of the matrix (3 N, 3 (N + GHOSTS))."""
+    """Stored rows (indptr, columns, blocks (n, 3, 3)), and the full matrix (3 N, 3 (N + GHOSTS))."""
     rng = np.random.default_rng(4)
     indptr, columns, blocks = [0], [], []
     dense = np.zeros((3 * N, 3 * (N + GHOSTS)))
@@ -31,7 +31,7 @@ def system() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def triangle(whole: np.ndarray, upper: bool) -> np.ndarray:
-    """Blocks on and above, or below, the diagonal of the owned part."""
+    """Upper or lower triangle of the owned part, with its diagonal blocks."""
     out = np.zeros((3 * N, 3 * N))
     for i in range(N):
         for j in range(N):
@@ -40,7 +40,7 @@ def triangle(whole: np.ndarray, upper: bool) -> np.ndarray:
     return out
 
 
-def test_a_sweep_before_and_one_after() -> None:
+def test_a_sweep_before_and_after_the_coarse_level() -> None:
     indptr, columns, blocks, dense = system()
     ends = indptr[1:] - np.add.reduceat(columns >= N, indptr[:-1])
     owned, beyond = dense[:, : 3 * N], dense[:, 3 * N :]
@@ -105,13 +105,13 @@ def test_couplings_to_other_ranks_are_bounded() -> None:
         assert sum(norms) - 1e-6 <= sums[row] <= 3.0**0.25 * sum(norms) + 1e-6
 
 
-def test_directions_without_stiffness_have_no_root() -> None:
+def test_inverse_roots_of_directions_without_stiffness_are_zero() -> None:
     values, roots = np.diag([4.0, 0.0, -1.0]).reshape(1, 9), np.ones((1, 6), dtype=np.float32)
     sweeps.invert_roots(np.array([0]), values, roots)
     assert roots.ravel().tolist() == [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
-def test_singular_diagonal_blocks_are_inverted_where_they_can_be() -> None:
+def test_singular_diagonal_blocks_are_inverted_as_far_as_possible() -> None:
     values = np.zeros((2, 9))
     values[0, [0, 4, 1, 3]] = 4.0  # of rank one
     inverse = np.empty((2, 9), dtype=np.float32)
@@ -135,7 +135,7 @@ def test_restriction_is_the_transpose_of_interpolation() -> None:
     assert up[3, 1] != 0.0
 
 
-def test_more_sweeps_before() -> None:
+def test_several_sweeps_before_the_coarse_level() -> None:
     indptr, columns, blocks, dense = system()
     couplings = [(row, k) for row in range(N) for k in range(indptr[row], indptr[row + 1])]
     keys = np.array([row * (N + GHOSTS) + columns[k] for row, k in couplings])

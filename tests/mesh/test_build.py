@@ -65,7 +65,7 @@ def test_rotation_keeps_lengths_and_turns_right_handed() -> None:
     assert np.allclose(mesh.positions[1], [np.cos(np.pi / 6), 0.5, 0])
 
 
-def test_inconsistent_triangles_are_turned_over(tmp_path: Path) -> None:
+def test_inconsistently_oriented_triangles_are_reversed(tmp_path: Path) -> None:
     text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 0 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt 2 0\n"
     mesh = obj_mesh(tmp_path, text + "f 1/1 2/2 3/3\nf 1/1 4/4 3/3\nf 2/2 5/5 3/3\n")
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 2]]
@@ -73,7 +73,7 @@ def test_inconsistent_triangles_are_turned_over(tmp_path: Path) -> None:
     assert mesh.notes == ["mesh.obj: 1 of 3 triangles reversed for a consistent orientation"]
 
 
-def test_random_orientations_are_repaired_piece_by_piece(tmp_path: Path) -> None:
+def test_random_orientations_are_repaired_for_each_part(tmp_path: Path) -> None:
     random = np.random.default_rng(7)
     grid = grid_mesh(nx=6, ny=5, pattern="criss-cross")
     faces = np.concatenate([grid.triangles, grid.triangles + grid.n_vertices])
@@ -88,7 +88,7 @@ def test_random_orientations_are_repaired_piece_by_piece(tmp_path: Path) -> None
 
 
 def strip(n: int, twist: float) -> str:
-    """A closed band of n quads that is twisted by ``twist`` times 180°."""
+    """A closed band of n quadrangles, twisted by ``twist`` times 180°."""
     points = []
     for i in range(n):
         around, tilt = 2 * np.pi * i / n, np.pi * twist * i / n
@@ -148,7 +148,7 @@ def test_degenerate_meshes_are_refused(tmp_path: Path, text: str, message: str) 
 
 @pytest.mark.parametrize("aspect", [1e3, 1e6])
 @pytest.mark.parametrize("offset", [0.0, 10.0])
-def test_slivers_and_small_triangles_pass(tmp_path: Path, aspect: float, offset: float) -> None:
+def test_slivers_and_small_triangles_are_accepted(tmp_path: Path, aspect: float, offset: float) -> None:
     text = obj([(offset, 0, 0), (offset + 1, 0, 0), (offset + 0.5, 1 / aspect, 0)], [(0, 1, 2)])
     assert rest_areas(obj_mesh(tmp_path, text))[0] == pytest.approx(0.5 / aspect)
     assert rest_areas(obj_mesh(tmp_path, text, Transform(scale=1e-6)))[0] == pytest.approx(0.5e-12 / aspect)
@@ -161,7 +161,7 @@ def test_slivers_and_small_triangles_pass(tmp_path: Path, aspect: float, offset:
         (MeshSource(grid=grid(), transform=Transform(translate=(1e200, 0, 0))), "start shape"),
     ],
 )
-def test_sources_refused(source: MeshSource, message: str) -> None:
+def test_invalid_sources_are_refused(source: MeshSource, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         build_mesh([source], file="scene.yaml")
     assert caught.value.file is not None

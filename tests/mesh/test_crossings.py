@@ -1,4 +1,4 @@
-"""Triangles that cross, against rational arithmetic and by hand."""
+"""Crossing triangles, compared with rational arithmetic and with examples."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def brute(points: np.ndarray, triangles: np.ndarray) -> list[list[int]]:
 
 
 def soup(seed: int, size: int, vertices: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles between vertices on integers, many of them in one plane, on one line or in one place."""
+    """Random triangles between vertices on integers, many of them coplanar, collinear or coincident."""
     rng = np.random.default_rng(seed)
     points = rng.integers(-size, size + 1, (vertices, 3)).astype(float)
     return points, np.array([rng.choice(vertices, 3, replace=False) for _ in range(count)])
@@ -94,7 +94,7 @@ def crosses(*corners: list[float]) -> bool:
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 9])
-def test_soups_of_triangles_on_integers(size: int) -> None:
+def test_random_triangles_with_integer_coordinates(size: int) -> None:
     found = 0
     for seed in range(8):
         points, triangles = soup(seed, size, 10, 25)
@@ -105,7 +105,7 @@ def test_soups_of_triangles_on_integers(size: int) -> None:
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
-def test_soups_of_triangles_within_rounding_of_where_they_touch(offset: float) -> None:
+def test_random_triangles_within_rounding_of_touching(offset: float) -> None:
     found = 0
     for seed in range(10):
         points, triangles = soup(seed, 2, 12, 25)
@@ -117,7 +117,7 @@ def test_soups_of_triangles_within_rounding_of_where_they_touch(offset: float) -
     assert found > 200
 
 
-def test_more_triangles_than_a_leaf_and_more_pairs_than_room_at_first() -> None:
+def test_more_triangles_than_a_leaf_and_more_pairs_than_the_first_capacity() -> None:
     points, triangles = soup(1, 12, 300, 110)
     expected = brute(points, triangles)
     assert len(expected) > 64
@@ -153,7 +153,7 @@ def test_sides_of_points_within_rounding_of_a_plane(offset: float) -> None:
     assert {-1, 1} <= set(signs)
 
 
-def test_sides_that_only_expansions_or_rational_numbers_tell() -> None:
+def test_sides_that_need_expansions_or_rational_numbers() -> None:
     # (x + ε) (x − ε) − x²: the last bit of products of 53 bits
     x, e = 1.0, 2.0**-52
     points = np.array([[0, 0, 0], [x + e, x, 0], [x, x - e, 0], [0.1, 0.3, 1.0]])
@@ -193,13 +193,13 @@ def test_a_triangle_through_another_crosses() -> None:
         [[1, 1, 1], [1, 1, 1], [1, 1, 1]],
     ],
 )
-def test_what_touches_does_not_cross(other: list[list[float]]) -> None:
+def test_touching_triangles_do_not_cross(other: list[list[float]]) -> None:
     assert not crosses(*FLOOR, *other)
     assert not crosses(*(np.array([*FLOOR, *other]) @ [[0, 2, 0], [0, 0, 2], [2, 0, 0]]).tolist())
 
 
 @pytest.mark.quick
-def test_interiors_that_meet_at_the_corner_or_the_edge_of_a_plane_cross() -> None:
+def test_interiors_that_meet_at_a_corner_or_an_edge_cross() -> None:
     # a corner lies in the floor's interior, and the triangle goes through there on both sides
     assert crosses(*FLOOR, [1, 1, 0], [2, 1, -1], [2, 1, 1])
     # an edge of either lies on the common line's end, as the intervals are one
@@ -209,7 +209,7 @@ def test_interiors_that_meet_at_the_corner_or_the_edge_of_a_plane_cross() -> Non
 
 @pytest.mark.quick
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e6])
-def test_one_ulp_decides(offset: float) -> None:
+def test_one_unit_in_the_last_place_decides(offset: float) -> None:
     floor = (np.array(FLOOR) + offset).tolist()
     corner = np.array([1.0, 1.0, 0.0]) + offset
     above = [[1 + offset, 1 + offset, 1 + offset], [2 + offset, 1 + offset, 1 + offset]]
@@ -265,7 +265,7 @@ def test_sheets_that_are_flat_curved_folded_or_stacked_do_not_cross() -> None:
     assert len(self_crossings(upon, stacked)) == 0
 
 
-def test_a_sheet_through_itself_is_counted_the_same_in_any_order_and_place() -> None:
+def test_self_crossings_do_not_depend_on_order_and_place() -> None:
     flat, triangles = grid(10)
     x, y, _ = flat.T
     s = 8.0 * (x - 0.47)
@@ -282,7 +282,7 @@ def test_a_sheet_through_itself_is_counted_the_same_in_any_order_and_place() -> 
 
 
 @pytest.mark.quick
-def test_pairs_with_a_common_vertex_are_told_apart() -> None:
+def test_pairs_with_a_common_vertex_are_counted_separately() -> None:
     points = np.array(
         [[0, 0, 0], [2, 1, 0], [2, -1, 0], [2, 0, 1], [2, 0, -1], [1, 0, 5], [1, 0.1, -5], [1, -0.1, -5.0]]
     )

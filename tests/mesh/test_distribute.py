@@ -1,4 +1,4 @@
-"""Distribution: each vertex has one owner; each element is on all ranks that need it, and counted on one."""
+"""Distribution: every vertex has one owner; elements are on all ranks that need them, and counted on one."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def test_points_in_any_order_are_exchanged(comm: MPI.Comm) -> None:
     points.destroy()
 
 
-def test_a_constant_that_is_one_number_takes_no_memory() -> None:
+def test_a_constant_with_one_value_takes_no_memory() -> None:
     stencil = np.arange(12).reshape(4, 3)
     data = {"same": np.full(4, 0.3), "other": np.arange(4.0), "wide": np.ones((4, 2))}
     elements = Elements(stencil, data)

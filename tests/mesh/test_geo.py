@@ -136,7 +136,7 @@ def test_surfaces_that_face_each_other_are_oriented_alike(script: Path) -> None:
         ("a = {;\n", "gmsh: line 1: syntax error"),
     ],
 )
-def test_refused(script: Path, text: str, message: str) -> None:
+def test_invalid_scripts_are_refused(script: Path, text: str, message: str) -> None:
     script.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=message) as caught:
         mesh_of(script)
@@ -144,7 +144,7 @@ def test_refused(script: Path, text: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_quiet_and_without_traces(script: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_gmsh_prints_nothing_and_leaves_no_files(script: Path, capfd: pytest.CaptureFixture[str]) -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)]
     script.write_text(SQUARE)
     mesh_of(script)

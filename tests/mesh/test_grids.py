@@ -63,7 +63,7 @@ def test_groups() -> None:
         ({"nx": 30000, "ny": 30000, "pattern": "criss-cross"}, "mesh.grid", "1800060001 vertices take"),
     ],
 )
-def test_refused(options: dict[str, object], key: str, message: str) -> None:
+def test_invalid_grids_are_refused(options: dict[str, object], key: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         grid_mesh(**options)
     assert caught.value.key == key

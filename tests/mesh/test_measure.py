@@ -16,7 +16,7 @@ from lyra_petsc.mesh.measures import (
 )
 
 
-def test_lengths() -> None:
+def test_diagonal_and_mean_edge_length() -> None:
     mesh = grid_mesh(Transform(rotate=turn((1, 2, 3), 40)), width=3.0, height=4.0, nx=1, ny=1)
     assert bounding_diagonal(mesh.rest) == pytest.approx(5.0)
     assert mean_edge_length(mesh) == pytest.approx((3 + 4 + 5) / 3)

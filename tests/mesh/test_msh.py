@@ -1,4 +1,4 @@
-"""The .msh reader: both formats, ASCII and binary, with files of gmsh and handwritten ones."""
+"""The .msh reader: both versions, ASCII and binary, files by gmsh and by hand."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_equal_names_of_one_dimension_are_one_group(tmp_path: Path) -> None:
         ("", "empty"),
     ],
 )
-def test_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.msh"
     file.write_text(text)
     with pytest.raises(InputError, match=message) as caught:

@@ -1,4 +1,4 @@
-"""Pairs of near boxes against a comparison of all with all."""
+"""Pairs of near boxes, compared with a search over all pairs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def as_set(pairs: NDArray[np.int64]) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize("n", [1, 50, 300])
 @pytest.mark.parametrize("size", SIZES)
-def test_against_brute_force(n: int, size: str) -> None:
+def test_pairs_agree_with_brute_force(n: int, size: str) -> None:
     rng = np.random.default_rng(n)
     low, high = boxes(rng, n, SIZES[size])
     others = boxes(rng, n + 7, SIZES[size])
@@ -49,7 +49,7 @@ def test_against_brute_force(n: int, size: str) -> None:
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
-def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
+def test_boxes_in_one_plane_up_to_rounding(thickness: float) -> None:
     """Cells are then so thin that their numbers exceed the range of integers."""
     rng = np.random.default_rng(5)
     low = rng.random((400, 3)) * [1.0, 1.0, thickness]
@@ -66,7 +66,7 @@ def test_one_box_among_many_is_far_away() -> None:
     assert as_set(near_pairs((low, high))) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
 
 
-def test_what_touches_overlaps() -> None:
+def test_touching_boxes_overlap() -> None:
     low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
     assert near_pairs((low, high)).tolist() == [[0, 1]]
 
@@ -77,13 +77,13 @@ def test_more_pairs_than_the_first_capacity() -> None:
 
 
 @pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
-def test_none(n: tuple[int, int]) -> None:
+def test_no_boxes(n: tuple[int, int]) -> None:
     mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
     assert near_pairs((mine, mine), (others, others)).shape == (0, 2)
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.05, 0.4])
-def test_boxes_within_reach(radius: float) -> None:
+def test_boxes_within_a_radius(radius: float) -> None:
     rng = np.random.default_rng(3)
     low, high = boxes(rng, 80, 1.0)
     other_low, other_high = boxes(rng, 90, 0.8)

@@ -129,7 +129,7 @@ def test_windows_line_ends_byte_order_mark_and_latin_comments(tmp_path: Path) ->
         ("  \n", "empty"),
     ],
 )
-def test_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         obj_mesh(tmp_path, text)
     assert caught.value.file == str(tmp_path / "mesh.obj")

@@ -1,4 +1,4 @@
-"""Obstacles: their shapes, their motions, and that they are the same on all ranks."""
+"""Obstacles: shapes and motions, and agreement of all ranks."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_plane_has_a_unit_normal(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(plane.normals, [[0, 0.6, 0.8]], rtol=0, atol=1e-15)
 
 
-def test_friction_of_an_obstacle_wins(comm: MPI.Comm) -> None:
+def test_friction_of_an_obstacle_overrides_that_of_contact(comm: MPI.Comm) -> None:
     assert built(comm, BOX).friction == (0.4, 0.3)
     assert built(comm, {**BOX, "friction": 0.7}).friction == (0.7, 0.7)
     assert built(comm, {**BOX, "friction": {"static": 0.2, "kinetic": 0.1}}).friction == (0.2, 0.1)
@@ -135,8 +135,8 @@ def test_friction_of_an_obstacle_wins(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_a_motion_carries_what_starts_where_the_scene_says(comm: MPI.Comm, named: bool) -> None:
-    """By T(t) T(0)⁻¹, as handles: against rotations and translations made by hand."""
+def test_a_motion_is_relative_to_the_placement_in_the_scene(comm: MPI.Comm, named: bool) -> None:
+    """T(t) T(0)⁻¹, as for handles, compared with explicit rotations and translations."""
     moves = {"motion": "roll" if named else ROLL, "interpolation": "linear"}
     rod, plane = (
         built(comm, {**shape, **moves}, motions={"roll": ROLL} if named else {}) for shape in (CAPSULE, PLANE)
@@ -160,7 +160,7 @@ def test_a_motion_carries_what_starts_where_the_scene_says(comm: MPI.Comm, named
     assert np.linalg.norm(moved[1] - moved[0]) == pytest.approx(2.0, abs=1e-13)  # rigid
 
 
-def test_what_stands_still_stays(comm: MPI.Comm) -> None:
+def test_obstacles_without_motion_stay(comm: MPI.Comm) -> None:
     plane = built(comm, PLANE)
     assert isinstance(plane, Container)
     assert plane.positions(7.0) is plane.points
@@ -226,7 +226,7 @@ def test_many_obstacles_are_in_the_order_of_the_scene(comm: MPI.Comm) -> None:
     )
 
 
-def test_a_motion_that_cannot_be_is_refused(comm: MPI.Comm) -> None:
+def test_invalid_motions_are_refused(comm: MPI.Comm) -> None:
     frames = [{"time": 0}, {"time": 1e-9, "translate": [1, 0, 0]}]
     with pytest.raises(InputError, match=r"obstacles\.one\.motion: goes at 1e\+09 m/s"):
         built(comm, {**BOX, "motion": frames})

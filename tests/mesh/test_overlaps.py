@@ -26,7 +26,7 @@ def rotation() -> np.ndarray:
 
 
 def cloud(triangle: np.ndarray, n: int = 40) -> np.ndarray:
-    """Points of a triangle on a lattice, including its edges and corners."""
+    """Lattice points of a triangle, including its edges and corners."""
     i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     i, j = i[i + j <= n] / n, j[i + j <= n] / n
     return np.asarray(

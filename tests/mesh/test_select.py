@@ -42,7 +42,7 @@ def test_triangles_of_surface_groups() -> None:
         (Selector(box=[[2, 2, 2], [3, 3, 3]]), "handles[0].box", r"spans \[0, 0, 0\] to \[1, 1, 0\]"),
     ],
 )
-def test_refused(selector: Selector, key: str, message: str) -> None:
+def test_invalid_selections_are_refused(selector: Selector, key: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         select_vertices(grid_mesh(), selector, key="handles[0]", file="scene.yaml")
     assert (caught.value.key, caught.value.file) == (key, "scene.yaml")

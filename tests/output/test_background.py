@@ -1,4 +1,4 @@
-"""What rank 0 does beside the steps: done when it is asked for, and its failures told to all."""
+"""Work that rank 0 does in the background: waiting for it, and reporting its failures on all ranks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def fail() -> None:
     raise OutputError("a.h5: cannot be written: No space left on device")
 
 
-def test_it_goes_on_meanwhile_and_is_waited_for(comm: MPI.Comm) -> None:
+def test_work_continues_in_the_background_and_is_waited_for(comm: MPI.Comm) -> None:
     background, go, done = Background(comm), threading.Event(), []
 
     def work() -> None:
@@ -34,7 +34,7 @@ def test_it_goes_on_meanwhile_and_is_waited_for(comm: MPI.Comm) -> None:
     background.close()
 
 
-def test_failures_are_told_once_and_to_every_rank(comm: MPI.Comm) -> None:
+def test_failures_are_reported_once_on_every_rank(comm: MPI.Comm) -> None:
     background = Background(comm)
     background.submit(fail)
     with pytest.raises(OutputError, match="No space left"):
@@ -43,7 +43,7 @@ def test_failures_are_told_once_and_to_every_rank(comm: MPI.Comm) -> None:
     background.close()
 
 
-def test_mistakes_are_not_hidden(comm: MPI.Comm) -> None:
+def test_programming_errors_are_not_hidden(comm: MPI.Comm) -> None:
     background = Background(comm)
     background.submit(lambda: [][0])
     if comm.rank == 0:
@@ -52,7 +52,7 @@ def test_mistakes_are_not_hidden(comm: MPI.Comm) -> None:
     background.close()
 
 
-def test_files_have_their_names_when_it_has_settled(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_files_are_renamed_when_waiting_is_over(comm: MPI.Comm, shared_tmp: Path) -> None:
     background, go, row = Background(comm), threading.Event(), {"x": np.full(3, float(comm.rank))}
 
     def last_word() -> None:

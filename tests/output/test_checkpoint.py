@@ -1,3 +1,5 @@
+"""Checkpoints: written, read by other partitions, kept twice, refused."""
+
 import math
 
 import numpy as np
@@ -53,7 +55,7 @@ def flip(path):
     path.write_bytes(content)
 
 
-def test_read_back_by_other_owners(comm, shared_tmp):
+def test_checkpoints_are_read_with_another_partition(comm, shared_tmp):
     write(comm, shared_tmp)
     mine = np.arange(N)[::-1] if comm.rank == comm.size - 1 else np.arange(0)
     found = read_checkpoint(shared_tmp, FileOrder(comm, mine, N))
@@ -65,7 +67,7 @@ def test_read_back_by_other_owners(comm, shared_tmp):
     assert (found.file.name, found.note) == (CHECKPOINT, None)
 
 
-def test_the_newest_counts_and_the_one_before_is_kept(comm, shared_tmp):
+def test_the_newest_is_read_and_the_previous_one_is_kept(comm, shared_tmp):
     for step in (1, 2, 3):
         write(comm, shared_tmp, factor=step, step=step)
     order = FileOrder(comm, dealt(comm), N)
@@ -79,7 +81,7 @@ def test_the_newest_counts_and_the_one_before_is_kept(comm, shared_tmp):
 @pytest.mark.parametrize(
     "damage", [cut, flip, lambda path: path.write_bytes(b"")], ids=["cut", "flip", "empty"]
 )
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(comm, shared_tmp, damage):
+def test_a_damaged_checkpoint_is_replaced_by_the_previous_one(comm, shared_tmp, damage):
     write(comm, shared_tmp, step=1)
     write(comm, shared_tmp, step=2)
     order = FileOrder(comm, dealt(comm), N)
@@ -102,7 +104,7 @@ def test_a_kill_between_the_two_renamings_loses_nothing(comm, shared_tmp):
     assert read_checkpoint(shared_tmp, FileOrder(comm, dealt(comm), N)).scalars["step"] == 2
 
 
-def test_of_another_mesh_or_none_at_all(comm, shared_tmp):
+def test_checkpoints_of_another_mesh_or_missing_ones_are_refused(comm, shared_tmp):
     order = FileOrder(comm, np.arange(comm.rank, N + 1, comm.size), N + 1)
     with pytest.raises(InputError, match="holds no checkpoint"):
         read_checkpoint(shared_tmp, order)

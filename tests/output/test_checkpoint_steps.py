@@ -53,7 +53,7 @@ def test_checkpoints_by_steps(
 
 
 def written(comm: MPI.Comm, folder: Path) -> int:
-    """The step of the newest checkpoint."""
+    """Step of the newest checkpoint."""
     step = None
     if comm.rank == 0:
         with import_h5py().File(folder / "checkpoint.h5", "r") as file:
@@ -61,7 +61,7 @@ def written(comm: MPI.Comm, folder: Path) -> int:
     return int(comm.bcast(step))
 
 
-def test_the_scene_as_understood_keeps_them(tmp_path: Path) -> None:
+def test_the_written_scene_has_their_intervals(tmp_path: Path) -> None:
     text = "mesh: {grid: {width: 1, height: 1, nx: 1, ny: 1}}\nmaterial: {cloth: gray-interlock}\n"
     text += "time: {end: 1, step: 0.1}\noutput: {checkpoint: {steps: 7}}\n"
     (tmp_path / "scene.yaml").write_text(text)

@@ -1,4 +1,4 @@
-"""Damaged files of a run: one line that names the file, whatever is read, never another exception."""
+"""Damaged files of a run give one line that names the file, and no other exception."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def run(whole, tmp_path):
 
 
 def read_all(folder):
-    """All that a run's folder holds; numbers that are read are those that were written."""
+    """Read all of a run's folder, and check that the values are those that were written."""
     run = StoredRun(folder)
     for i in range(len(run)):
         run.positions[i]
@@ -62,7 +62,7 @@ def one_line(caught):
     return text
 
 
-def test_a_whole_one_is_read(run):
+def test_an_undamaged_folder_is_read(run):
     found = read_all(run)
     np.testing.assert_array_equal(found.positions[2], position(2))
     assert read_checkpoint(run, ORDER).scalars["step"] == 7
@@ -75,8 +75,7 @@ def states_file(folder):
 @pytest.mark.parametrize(
     "name", ["mesh.h5", "states", "states.xdmf", "history.csv", "summary.json", "scene.yaml"]
 )
-def test_flipped_bits(run, name):
-    """Wherever a bit is flipped the file is read, or refused in one line."""
+def test_a_file_with_a_flipped_bit_is_read_or_refused_in_one_line(run, name):
     path = states_file(run) if name == "states" else run / name
     content = path.read_bytes()
     random = np.random.default_rng(len(content))
@@ -94,8 +93,8 @@ def test_flipped_bits(run, name):
     assert not any("\n" in text for text in said)
 
 
-def test_flipped_bits_of_numbers_are_seen(run):
-    """In a sheet's positions and triangles none goes unseen."""
+def test_flipped_bits_of_arrays_are_detected(run):
+    """In positions and triangles all of them are."""
     mesh = run / "mesh.h5"
     for path, array in ((states_file(run), position(1)), (mesh, TRIANGLES), (mesh, REST)):
         content = path.read_bytes()
@@ -110,7 +109,7 @@ def test_flipped_bits_of_numbers_are_seen(run):
         path.write_bytes(content)
 
 
-def test_flipped_bits_of_a_checkpoint_fall_back(run):
+def test_a_checkpoint_with_a_flipped_bit_is_replaced_by_the_previous_one(run):
     path = run / CHECKPOINT
     content = path.read_bytes()
     for place in np.random.default_rng(3).integers(0, 8 * len(content), 100):
@@ -129,8 +128,8 @@ def test_flipped_bits_of_a_checkpoint_fall_back(run):
     "scalars",
     ['{"step": 7, "time": -1.0, "works": {"wind": -1.5}}', "[" * 100000, "7", '{"step"', "{}", 3.0, None],
 )
-def test_changed_scalars_of_a_checkpoint(run, scalars):
-    """Whoever changes them with h5py, as the attribute alone has no check sum in the file."""
+def test_changed_scalars_of_a_checkpoint_are_detected(run, scalars):
+    """They are an attribute, for which HDF5 has no check sum."""
     with import_h5py().File(run / CHECKPOINT, "a") as file:
         del file.attrs["scalars"]
         if scalars is not None:
@@ -142,7 +141,7 @@ def test_changed_scalars_of_a_checkpoint(run, scalars):
 
 
 def test_a_checkpoint_of_an_older_version(run):
-    """Without a check sum of the scalars; what cannot be a run's is refused all the same."""
+    """Without a check sum of its scalars; impossible values are refused nevertheless."""
     for name in (CHECKPOINT, PREVIOUS):
         with import_h5py().File(run / name, "a") as file:
             del file.attrs["digest"]
@@ -236,7 +235,7 @@ def test_mistyped_summaries(run, text):
 @pytest.mark.parametrize(
     "text", ["", "\n", "{header}\n", "{header}\n1,2\n", "step,time\n0,0\n", "{header}\nx{row}\n"]
 )
-def test_tables_cut_short(run, text):
+def test_truncated_tables(run, text):
     path = run / "history.csv"
     header, row, *_ = path.read_text(encoding="utf-8").splitlines()
     path.write_text(text.format(header=header, row=row), encoding="utf-8")
@@ -245,7 +244,7 @@ def test_tables_cut_short(run, text):
     assert "history.csv" in one_line(caught)
 
 
-def test_a_table_of_other_numbers(run):
+def test_a_table_with_invalid_numbers(run):
     path = run / "history.csv"
     text = path.read_text(encoding="utf-8")
     for new in ("nan", "inf", "99999999999999999999999", ""):

@@ -1,4 +1,4 @@
-"""failure.xdmf, failure.h5 and failure.txt, as ParaView would read them."""
+"""failure.xdmf, failure.h5 and failure.txt, read as by ParaView."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write(comm: MPI.Comm, folder: Path) -> None:
     write_failure(folder, FileOrder(comm, owned, 5), 3, 7, (before, failing), "why\n")
 
 
-def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_both_states_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: Path) -> None:
     write(comm, shared_tmp)
 
     def check() -> None:
@@ -56,7 +56,7 @@ def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: P
     on_first(comm, check)
 
 
-def test_a_new_run_removes_them(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_new_run_removes_files_of_a_failure(comm: MPI.Comm, shared_tmp: Path) -> None:
     write(comm, shared_tmp)
     assert all(RESULT.fullmatch(name) for name in (FAILURE_XDMF, FAILURE_DATA, FAILURE_TEXT))
 
@@ -69,7 +69,7 @@ def test_a_new_run_removes_them(comm: MPI.Comm, shared_tmp: Path) -> None:
     on_first(comm, check)
 
 
-def test_a_folder_that_is_gone_is_told_on_all_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_missing_folder_is_reported_on_all_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     owned = np.arange(5)[comm.rank :: comm.size]
     moment = FailureState(0.0, REST[owned], {})
     with pytest.raises(OutputError, match=r"failure\.txt: cannot be written"):

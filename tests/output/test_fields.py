@@ -1,4 +1,4 @@
-"""Fields on request: their values on shapes where these are known."""
+"""Optional fields of the states: values on shapes for which they are known."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_strain_and_stress_of_a_stretch() -> None:
     np.testing.assert_allclose(stress, np.tile([10.5, 0.0, 0.0, 2.1, 0.0, 0.0], (len(stress), 1)), atol=1e-10)
 
 
-def test_displacement_is_from_the_disturbed_start() -> None:
+def test_displacement_is_relative_to_the_disturbed_start() -> None:
     moved = [0.1, -0.2, 0.3]
     with Simulation(ALL | {"initial": {"noise": 0.01}}, MPI.COMM_SELF) as simulation:
         assert not value(simulation, "displacement").any()
@@ -82,7 +82,7 @@ def test_displacement_is_from_the_disturbed_start() -> None:
     np.testing.assert_allclose(found, np.tile(moved, (len(found), 1)), atol=1e-14)
 
 
-def test_a_scene_that_does_not_name_it_keeps_no_start() -> None:
+def test_without_the_field_the_start_is_not_stored() -> None:
     with Simulation(ALL | {"output": {}}, MPI.COMM_SELF) as simulation:
         assert simulation.problem.start is None
         with pytest.raises(InputError, match=r"displacement.*output.fields"):

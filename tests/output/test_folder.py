@@ -1,3 +1,5 @@
+"""The folder of a run: its name, --force, --resume, and locks."""
+
 import os
 from pathlib import Path
 
@@ -11,7 +13,7 @@ pytestmark = pytest.mark.parallel(3)
 
 @pytest.fixture
 def here(comm, shared_tmp, monkeypatch):
-    """Working directory of every rank; ``make`` puts files there before any rank goes on."""
+    """Working directory of every rank, in which ``make`` creates files before any rank continues."""
     monkeypatch.chdir(shared_tmp)
 
     def make(*names, age=0):
@@ -27,7 +29,7 @@ def here(comm, shared_tmp, monkeypatch):
 
 
 def create(comm, choice, *names):
-    """The folder of a run that begins, leaves files of these names, and ends."""
+    """Create the folder of a run, write files with these names, and close it."""
     with RunDirectory(comm, choice) as directory:
         directory.clean()
         if comm.rank == 0:
@@ -113,7 +115,7 @@ def test_what_cannot_be_resumed(comm, here):
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_names_that_cannot_be_folders(comm, here, force):
+def test_invalid_names_are_refused(comm, here, force):
     here("file")
     for name, words in {
         "file": "is a file",
@@ -127,8 +129,8 @@ def test_names_that_cannot_be_folders(comm, here, force):
         assert "\n" not in str(caught.value)
 
 
-def test_no_permission(comm, here, monkeypatch):
-    """Root may write everywhere, so the answer of the system is given here."""
+def test_a_folder_without_permission_is_refused(comm, here, monkeypatch):
+    """Root may write everywhere, so the system's answer is simulated."""
     here("closed/file")
     closed = Path("closed").absolute()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != closed)
@@ -179,19 +181,19 @@ def test_two_runs_without_a_name_get_two_folders(comm, here):
         assert (first.path.name, second.path.name) == ("flag", "flag-2")
 
 
-def test_what_a_kill_during_the_set_up_left_is_no_obstacle(comm, here):
+def test_leftovers_of_a_kill_during_the_set_up_are_ignored(comm, here):
     here(f"out/{LOCK_FILE}")
     path = create(comm, choose_folder(comm, "flag", "out"), "history.csv")
     assert os.listdir(path) == ["history.csv"]
 
 
-def test_a_lock_file_left_behind_locks_nothing(comm, here):
+def test_a_lock_file_without_a_process_does_not_lock(comm, here):
     here(f"out/{LOCK_FILE}", "out/checkpoint.h5")
     assert create(comm, choose_folder(comm, "flag", "out", resume=True)) == Path("out")
     assert os.listdir("out") == ["checkpoint.h5"]
 
 
-def test_a_file_system_without_locks_is_said(comm, here, monkeypatch):
+def test_a_file_system_without_locks_is_noted(comm, here, monkeypatch):
     def refuse(descriptor, operation):
         raise OSError(95, "Operation not supported")
 
@@ -201,7 +203,7 @@ def test_a_file_system_without_locks_is_said(comm, here, monkeypatch):
     comm.Barrier()
 
 
-def test_the_lock_is_that_of_the_file_others_find(comm, tmp_path):
+def test_releasing_a_lock_leaves_a_newer_lock_file_alone(comm, tmp_path):
     first = FolderLock(tmp_path)
     with pytest.raises(FolderLocked, match=f"process {os.getpid()} on "):
         FolderLock(tmp_path)

@@ -1,3 +1,5 @@
+"""Collective writing of HDF5 files by every method, reading of slabs, and failures."""
+
 import errno
 import resource
 
@@ -21,7 +23,7 @@ WAYS = {"one machine": "_write_serial", "MPI-IO": "_write_with_mpi_io", "in turn
 
 @pytest.fixture(params=WAYS)
 def way(request, monkeypatch):
-    """How slabs are written, with the name of the function that does it."""
+    """A method of writing slabs, with the name of its function."""
     monkeypatch.setattr(hdf5, "on_one_machine", lambda comm: request.param == "one machine")
     monkeypatch.setenv(hdf5.TURNS_VARIABLE, "1" if request.param == "in turn" else "0")
     return WAYS[request.param]
@@ -43,7 +45,7 @@ def everything(path):
         return found
 
 
-def test_the_way_under_test_is_the_one_taken(comm, shared_tmp, way, monkeypatch):
+def test_the_method_under_test_is_used(comm, shared_tmp, way, monkeypatch):
     taken = set()
     for name in WAYS.values():
         work = getattr(hdf5, name)
@@ -71,7 +73,7 @@ def test_ranks_take_turns_where_mpi_io_opens_nothing(comm, shared_tmp, monkeypat
 
 
 @pytest.mark.parametrize("n", [1, 2, 1001])
-def test_slabs_become_one_array(comm, shared_tmp, way, n):
+def test_slabs_of_all_ranks_become_one_array(comm, shared_tmp, way, n):
     x, owner = whole(n), np.arange(n, dtype=np.int32)
     attributes = {"states/000000": {"time": 0.1, "step": 3}, "states/000000/x": {"unit": "m"}}
     path = shared_tmp / "a.h5"
@@ -95,7 +97,7 @@ def test_ranks_without_rows(comm, shared_tmp, way):
     np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
 
 
-def test_read_on_another_cut_of_rows(comm, shared_tmp, way):
+def test_reading_with_another_partition_of_rows(comm, shared_tmp, way):
     x = whole(50)
     write_collective([NewFile(shared_tmp / "a.h5", {"x": x if comm.rank == 0 else x[:0]}, {})], comm)
     mine = np.arange(comm.rank, 50, comm.size)[::-1]
@@ -115,7 +117,7 @@ def still_there(comm, path, x):
 
 
 def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
-    """A limit on the size of files stands for the full disk."""
+    """A limit on the size of files simulates a full disk."""
     path = shared_tmp / "a.h5"
     write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -1,3 +1,5 @@
+"""history.csv: columns, rows, resumption, failures."""
+
 import math
 
 import pytest
@@ -9,7 +11,7 @@ pytestmark = pytest.mark.parallel(3)
 
 
 def written(comm, path):
-    """The file's text, read before any rank writes on."""
+    """Text of the file, read before any rank continues."""
     text = path.read_text()
     comm.Barrier()
     return text
@@ -34,7 +36,7 @@ def test_rows_are_on_disk_at_once_and_exact(comm, shared_tmp):
     )
 
 
-def test_resume_cuts_after_the_step_and_drops_a_torn_row(comm, shared_tmp):
+def test_resume_removes_rows_after_the_checkpoint_and_incomplete_ones(comm, shared_tmp):
     path = shared_tmp / "history.csv"
     if comm.rank == 0:
         path.write_text("step,time\n0,0.0\n1,0.1\n2,0.2\n3,0.3\n4,0.")
@@ -48,7 +50,7 @@ def test_resume_cuts_after_the_step_and_drops_a_torn_row(comm, shared_tmp):
     assert written(comm, path) == "step,time\n0,0.0\n1,0.1\n2,0.2\n3,0.35\n"
 
 
-def test_resume_drops_a_torn_last_row_even_when_it_is_early_enough(comm, shared_tmp):
+def test_resume_removes_an_incomplete_last_row_of_an_early_step(comm, shared_tmp):
     path = shared_tmp / "history.csv"
     if comm.rank == 0:
         path.write_bytes(b"step,time\n0,0.0\n1,0.1\n2,\xff")
@@ -57,7 +59,7 @@ def test_resume_drops_a_torn_last_row_even_when_it_is_early_enough(comm, shared_
     assert written(comm, path) == "step,time\n0,0.0\n1,0.1\n"
 
 
-def test_resume_with_other_columns_is_refused_and_leaves_the_file(comm, shared_tmp):
+def test_resume_with_other_columns_is_refused_without_changes(comm, shared_tmp):
     path = shared_tmp / "probes.csv"
     if comm.rank == 0:
         path.write_text("step,time,tip_x\n0,0.0,1.0\n")
@@ -68,12 +70,12 @@ def test_resume_with_other_columns_is_refused_and_leaves_the_file(comm, shared_t
     assert [entry.name for entry in shared_tmp.iterdir()] == ["probes.csv"]
 
 
-def test_resume_without_a_file_begins_anew(comm, shared_tmp):
+def test_resume_without_a_file_starts_a_new_one(comm, shared_tmp):
     History(shared_tmp / "history.csv", ("step", "time"), comm, resume_after=5).close()
     assert written(comm, shared_tmp / "history.csv") == "step,time\n"
 
 
-def test_what_cannot_be_written_is_an_output_error_on_every_rank(comm, shared_tmp):
+def test_write_failures_are_output_errors_on_every_rank(comm, shared_tmp):
     with pytest.raises(OutputError, match=r"missing.history\.csv"):
         History(shared_tmp / "missing" / "history.csv", ("step", "time"), comm)
 

@@ -1,4 +1,4 @@
-"""Files that are laid out hold what is written at their places, and their attributes."""
+"""Files whose layout is created first, and whose data are then written at the given offsets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lyra_petsc.output.stored import text_attribute
 
 
 def check(path: Path, rows: dict[str, int], attributes: Attributes, columns: int = 3) -> int:
-    """Lay a file out, fill its places, and read all back; its size."""
+    """Create the layout of a file, write its data, and read everything back; returns its size."""
     slabs = {name: np.random.default_rng(n).random((n, columns)) for name, n in rows.items()}
     places = preallocate(path, slabs, list(rows.values()), attributes)
     with open(path, "r+b") as file:
@@ -34,7 +34,7 @@ def check(path: Path, rows: dict[str, int], attributes: Attributes, columns: int
     return path.stat().st_size
 
 
-def test_a_state(tmp_path: Path) -> None:
+def test_datasets_of_a_state(tmp_path: Path) -> None:
     group = "states/010000"
     attributes: Attributes = {
         group: {"time": 0.1, "step": 3},

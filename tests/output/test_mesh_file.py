@@ -1,4 +1,4 @@
-"""What a resumed run compares its mesh with."""
+"""Comparison of the mesh of a resumed run with mesh.h5."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def with_group(name, group):
 POST = TriangleSurface(10.0 * REST, TRIANGLES)
 
 
-def test_obstacles_are_kept_by_their_names(comm, shared_tmp):
+def test_obstacles_are_stored_by_name(comm, shared_tmp):
     wall = TriangleSurface(REST[:3] + np.pi, TRIANGLES[:1])
     with_them = replace(strip(), obstacles={"a/b": POST, "wall": wall})
     write_mesh(shared_tmp, with_them if comm.rank == 0 else None, comm)
@@ -76,7 +76,7 @@ def test_obstacles_are_kept_by_their_names(comm, shared_tmp):
             check_same_mesh(shared_tmp, mesh, (), comm)
 
 
-def test_the_same_mesh(compare):
+def test_an_equal_mesh_is_accepted(compare):
     compare(strip())
     # another machine's rounding of a rotation
     compare(replace(strip(), positions=strip().positions * (1 + 1e-15), rest=REST * (1 + 1e-15)))

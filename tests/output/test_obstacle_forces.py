@@ -1,4 +1,4 @@
-"""obstacles.csv and contact_pressure: what a sheet at rest weighs, whatever the number of ranks."""
+"""obstacles.csv and contact_pressure of a sheet at rest, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SCENE: dict[str, Any] = {
 }
 
 
-def test_a_sheet_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_forces_on_obstacles_equal_the_weight_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
     journey(comm, SCENE, shared_tmp / "run", None)
     if comm.rank > 0:
         return
@@ -48,8 +48,8 @@ def test_a_sheet_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
     np.testing.assert_allclose(run.field("contact_pressure")[-1], WEIGHT, rtol=5e-5)
 
 
-def test_pressure_is_uniform_whatever_the_triangles(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """Their sizes and shapes differ, and stiff ones would carry the weight from one to the other."""
+def test_pressure_is_uniform_on_irregular_meshes(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Triangles of various sizes and shapes, so stiff that they could carry each other's weight."""
     n = 8
     if comm.rank == 0:
         along = np.linspace(0.0, 1.0, n + 1) ** 2
@@ -68,7 +68,7 @@ def test_pressure_is_uniform_whatever_the_triangles(comm: MPI.Comm, shared_tmp: 
 
 
 @pytest.mark.parallel(2)
-def test_rows_are_cut_on_resume(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_resume_removes_later_rows(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = SCENE | {"time": {"end": 0.1, "step": 0.01}}
     journey(comm, scene, shared_tmp / "whole", None)
     journey(comm, scene, shared_tmp / "parts", 4)

@@ -1,3 +1,5 @@
+"""Exchange of rows between the ranks' order and the order of files."""
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ pytestmark = pytest.mark.parallel(3)
 
 
 def shuffled(comm, n_global, owners):
-    """Rows of a shuffled file, dealt to the given ranks only."""
+    """Shuffled row numbers of a file, distributed to the given ranks only."""
     order = np.random.default_rng(7).permutation(n_global)
     owners = [rank for rank in owners if rank < comm.size] or [0]
     return np.array_split(order, len(owners))[owners.index(comm.rank)] if comm.rank in owners else order[:0]
@@ -18,7 +20,7 @@ def shuffled(comm, n_global, owners):
 @pytest.mark.parametrize(
     ("shape", "dtype"), [((), np.int64), ((3,), np.float64), ((3, 2), np.float32), ((3,), np.int32)]
 )
-def test_there_and_back(comm, owners, n_global, shape, dtype):
+def test_to_the_order_of_files_and_back(comm, owners, n_global, shape, dtype):
     original = shuffled(comm, n_global, owners)
     plan = FileOrder(comm, original, n_global)
     whole = np.arange(n_global * int(np.prod(shape)), dtype=dtype).reshape(n_global, *shape)

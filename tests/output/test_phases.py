@@ -1,3 +1,5 @@
+"""Wall times of the phases of a run."""
+
 import pytest
 
 from lyra_petsc.phases import Phases
@@ -11,7 +13,7 @@ class Clock:
         return self.now
 
 
-def test_nested_phases_take_their_time_out_of_the_outer_one():
+def test_time_of_a_nested_phase_is_not_counted_in_the_outer_one():
     clock = Clock()
     phases = Phases(clock)
     clock.now += 1
@@ -25,7 +27,7 @@ def test_nested_phases_take_their_time_out_of_the_outer_one():
     assert sum(phases.seconds().values()) == phases.total == 31.0
 
 
-def test_the_open_phase_is_counted_and_a_phase_adds_up():
+def test_the_current_phase_is_included_and_phases_accumulate():
     clock = Clock()
     phases = Phases(clock)
     for _ in range(3):
@@ -36,7 +38,7 @@ def test_the_open_phase_is_counted_and_a_phase_adds_up():
         assert phases.seconds() == {"output": 3.0, "solve": 5.0, "other": 0.0}
 
 
-def test_an_exception_closes_its_phase():
+def test_an_exception_ends_its_phase():
     clock = Clock()
     phases = Phases(clock)
     with pytest.raises(RuntimeError):

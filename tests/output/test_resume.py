@@ -1,4 +1,4 @@
-"""A run that stops and goes on from its checkpoint takes the same way, whatever steps it takes."""
+"""A resumed run equals an uninterrupted one, with every integrator and kind of steps."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def scene_with(way: str) -> dict[str, Any]:
 def journey(
     comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
 ) -> tuple[int, float]:
-    """A run (up to step ``stop``) with a direct solver and files in ``folder``: step number and time."""
+    """Run up to step ``stop`` with a direct solver; returns step number and time."""
     asked = itertools.count(last(folder)[0] if resume else 0)  # before the first step, and after each
     with suppress(Interrupted), options(direct_solver(comm) | {"ksp_rtol": "1e-12"}):
         simulate(
@@ -99,7 +99,7 @@ def last(folder: Path) -> tuple[int, float]:
 
 
 def kept(folder: Path) -> dict[str, Array]:
-    """Positions, velocities and what the integrator remembers, in the order of the mesh."""
+    """Positions, velocities and state of the integrator, in the order of the mesh."""
     with import_h5py().File(folder / "checkpoint.h5", "r") as file:
         return {name: np.array(data) for name, data in file["vertices"].items()}
 
@@ -120,7 +120,7 @@ OF_EACH_RUN = ("versions", "wall_seconds", "resumed", "steps_of_this_run", "rank
 
 
 def flat(numbers: dict[str, Any], above: str = "") -> dict[str, float]:
-    """Numbers of nested mappings by their path."""
+    """Numbers of nested mappings, by path."""
     found: dict[str, float] = {}
     for name, value in numbers.items():
         path = f"{above}/{name}"
@@ -129,9 +129,9 @@ def flat(numbers: dict[str, Any], above: str = "") -> dict[str, float]:
 
 
 def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool = True) -> None:
-    """Same end, no row or state missing or doubled, the same numbers in every column.
+    """Check that both folders have the same end, rows and states, and equal numbers in every column.
 
-    ``exact`` where each sum is made in the same order, and the solver does the same to the last digit.
+    With ``exact``, every sum is computed in the same order, and the solver gives equal digits.
     """
     mine, other = kept(resumed), kept(straight)
     assert mine.keys() == other.keys()
@@ -168,7 +168,7 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The folder of a run that nobody stops."""
+    """The folder of an uninterrupted run."""
 
     @cache
     def ran(way: str) -> Path:
@@ -184,8 +184,10 @@ STOPS = [(way, stop) for way in WAYS for stop in ([2] if "static" in way else [1
 
 
 @pytest.mark.parametrize(("way", "stop"), STOPS)
-def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]) -> None:
-    """To round-off, on the same ranks with a direct solver."""
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    way: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]
+) -> None:
+    """Up to round-off, on the same ranks with a direct solver."""
     scene = scene_with(way)
     straight, halted = unbroken(way), tmp_path / "halted"
     end = last(straight)
@@ -204,7 +206,7 @@ def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path, unbroken: Call
         pytest.param("static, directors", marks=pytest.mark.parallel(2, alone=False)),
     ],
 )
-def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
+def test_resumed_runs_agree_on_other_numbers_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
     scene = scene_with(way)
     if "static" not in way:
         scene["time"] = WAYS[way] | {"end": 0.06}
@@ -230,7 +232,7 @@ def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, sh
         same_files(alone, straight, 1e-5 if "adaptive" in way else 1e-7, exact=False)
 
 
-def test_resuming_twice_at_every_step(tmp_path: Path) -> None:
+def test_resuming_after_every_step_and_twice(tmp_path: Path) -> None:
     scene = SCENE | {"time": {"end": 0.04, "step": 0.004, "integrator": "bdf2"}}
     journey(MPI.COMM_SELF, scene, tmp_path / "straight", None)
     journey(MPI.COMM_SELF, scene, tmp_path / "halted", 1)
@@ -240,8 +242,8 @@ def test_resuming_twice_at_every_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel
-def test_displacement_is_from_the_first_state_also_after_resuming(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """Whatever start the scene says by then."""
+def test_displacement_is_relative_to_the_first_state_after_resuming(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Even if the scene has another start by then."""
     scene = SCENE | {
         "time": {"end": 0.02, "step": 0.004},
         "output": {"every": 0.004, "fields": ["displacement"]},

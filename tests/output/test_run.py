@@ -1,3 +1,5 @@
+"""Reading the results of a run from Python."""
+
 import subprocess
 import sys
 
@@ -28,7 +30,7 @@ def test_states_are_read_as_they_were_written(tmp_path):
     assert run.name == "run"
 
 
-def test_a_slice_of_states_reads_nothing_yet(tmp_path):
+def test_a_slice_of_states_is_lazy(tmp_path):
     run = StoredRun(written(tmp_path, states=6))
     chosen = run.positions[1:-1:3]
     (tmp_path / "states-0004.h5").unlink()
@@ -62,7 +64,7 @@ def test_texture_coordinates(tmp_path, vt):
         np.testing.assert_array_equal(run.corner_uv, expected)
 
 
-def test_a_run_that_goes_on(tmp_path):
+def test_a_run_that_continues(tmp_path):
     writer = Writer(tmp_path)
     with pytest.raises(InputError, match="is not the folder of a run"):
         StoredRun(tmp_path)
@@ -89,7 +91,7 @@ def test_a_run_that_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("pandas", [True, False])
-def test_history_is_a_frame_where_pandas_is(tmp_path, monkeypatch, pandas):
+def test_history_is_a_pandas_frame_if_pandas_is_installed(tmp_path, monkeypatch, pandas):
     if pandas:
         pytest.importorskip("pandas")
     else:
@@ -125,7 +127,7 @@ def test_units_of_all_fields(tmp_path):
     assert all(run.field_units(name) for name in FIELDS)
 
 
-def test_scene_of_a_run_whose_mesh_file_is_gone(tmp_path):
+def test_the_scene_is_read_without_its_mesh_file(tmp_path):
     folder = written(tmp_path)
     text = (folder / "scene.yaml").read_text()
     start, end = text.index("- grid"), text.index("material:")
@@ -133,7 +135,7 @@ def test_scene_of_a_run_whose_mesh_file_is_gone(tmp_path):
     assert str(StoredRun(folder).scene.mesh[0].file) == "/nowhere/flag.geo"
 
 
-def test_what_is_no_run(tmp_path):
+def test_folders_that_are_no_runs_are_refused(tmp_path):
     folder = written(tmp_path / "a")
     file = tmp_path / "file"
     file.touch()

@@ -1,4 +1,4 @@
-"""Run folders that lead out of themselves: no reader follows."""
+"""Files of a run that refer to data outside its folder are refused by all readers."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ WAYS = {
 
 
 def attacked(folder: Path, way: str) -> Path:
-    """A run's folder that leads to a file beside it."""
+    """A run's folder with a reference to a file outside."""
     run = written(folder / "run")
     with h5py.File(folder / "secret.h5", "w") as file:
         file["secret"] = np.ones((8, 3))
@@ -98,7 +98,7 @@ def attacked(folder: Path, way: str) -> Path:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_states_elsewhere_are_refused(tmp_path: Path, way: str) -> None:
+def test_references_to_states_elsewhere_are_refused(tmp_path: Path, way: str) -> None:
     folder = attacked(tmp_path, way)
     with pytest.raises(InputError) as caught:
         _ = StoredRun(folder).positions[1]
@@ -161,7 +161,7 @@ def test_links_in_the_mesh_are_refused_by_all_that_read_it(tmp_path: Path) -> No
             read()
 
 
-def test_groups_that_hold_themselves_are_refused(tmp_path: Path) -> None:
+def test_groups_that_contain_themselves_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["a/b"] = 1.0
         file["a/c"] = file["a"]
@@ -169,7 +169,7 @@ def test_groups_that_hold_themselves_are_refused(tmp_path: Path) -> None:
         pass
 
 
-def test_few_groups_that_look_like_very_many_are_refused_at_once(tmp_path: Path) -> None:
+def test_groups_with_exponentially_many_paths_are_refused_at_once(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         groups = [file.create_group(f"g{number}") for number in range(7)]
         for above, below in pairwise(groups):
@@ -179,7 +179,7 @@ def test_few_groups_that_look_like_very_many_are_refused_at_once(tmp_path: Path)
         pass
 
 
-def test_a_file_that_changes_is_looked_at_again(tmp_path: Path) -> None:
+def test_a_changed_file_is_checked_again(tmp_path: Path) -> None:
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
         file["a"] = np.zeros(3)

@@ -1,3 +1,5 @@
+"""The time series of states: files, announcement, resumption, older folders."""
+
 import os
 import xml.etree.ElementTree as ElementTree
 
@@ -29,7 +31,7 @@ def strip(seam: float = 0.0) -> Mesh:
 
 
 class Run:
-    """A writer for the strip, its vertices and triangles dealt to the ranks."""
+    """A writer for the strip, whose vertices and triangles are distributed to the ranks."""
 
     def __init__(self, comm, folder, resume_after=None):
         self.vertices = np.arange(5)[::-1][comm.rank :: comm.size]
@@ -72,7 +74,7 @@ def strain(step):
 
 
 def announced(folder, series=XDMF_FILE):
-    """Every state of the XDMF file as an independent reader sees it: time and meshio's mesh."""
+    """Every state of the XDMF file as read by meshio: time and mesh."""
     document = ElementTree.parse(folder / series)
     states = []
     for grid in document.iterfind("Domain/Grid/Grid"):
@@ -89,7 +91,7 @@ def announced(folder, series=XDMF_FILE):
 
 
 def on_first(comm, check):
-    """Look at files on rank 0 while the others wait."""
+    """Read files on rank 0 while the other ranks wait."""
     comm.Barrier()
     try:
         if comm.rank == 0:
@@ -153,7 +155,7 @@ def test_vtk_reads_the_time_series(comm, shared_tmp, run):
     on_first(comm, check)
 
 
-def test_a_state_cut_short_is_never_announced(comm, shared_tmp, run, monkeypatch):
+def test_an_incomplete_state_is_never_listed(comm, shared_tmp, run, monkeypatch):
     run.write(0)
     write_rows = hdf5._write_rows
 
@@ -174,7 +176,7 @@ def assert_times(folder, times):
     assert [time for time, _ in announced(folder)] == pytest.approx(times)
 
 
-def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp, run):
+def test_resume_keeps_earlier_states_and_continues(comm, shared_tmp, run):
     for step in (0, 3, 6, 9):
         run.write(step)
     comm.Barrier()
@@ -191,7 +193,7 @@ def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp, run):
     on_first(comm, lambda: np.testing.assert_array_equal(announced(shared_tmp)[1][1].points, position(3)))
 
 
-def test_resume_passes_over_a_damaged_file(comm, shared_tmp, run):
+def test_resume_skips_a_damaged_file(comm, shared_tmp, run):
     for step in range(11):
         run.write(step)
     assert sorted(path.name for path in shared_tmp.glob("states-*.h5")) == [
@@ -208,7 +210,7 @@ def test_resume_passes_over_a_damaged_file(comm, shared_tmp, run):
 
 
 def old_file(folder, number, step):
-    """A state as older versions wrote it: in a file of its own."""
+    """A state in a file of its own, as written by older versions."""
     with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
         group = file.create_group(f"states/{number:06d}")
         group.attrs.update({"time": 0.1 * step, "step": step})
@@ -221,7 +223,7 @@ def old_file(folder, number, step):
             group[name].attrs["on"] = on
 
 
-def test_an_older_folder_goes_on(comm, shared_tmp):
+def test_a_folder_of_an_older_version_is_resumed(comm, shared_tmp):
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     on_first(comm, lambda: [old_file(shared_tmp, i, 3 * i) for i in range(4)])
     resumed = Run(comm, shared_tmp, resume_after=6)
@@ -237,8 +239,8 @@ def test_an_older_folder_goes_on(comm, shared_tmp):
     on_first(comm, check)
 
 
-def test_few_files_and_a_document_that_grows(comm, shared_tmp, run, monkeypatch):
-    """Files double; the document is copied now and then only, and is whole after every write to it."""
+def test_the_number_of_files_stays_small_and_the_xdmf_file_grows_in_place(comm, shared_tmp, run, monkeypatch):
+    """Sizes of files double; the XDMF file is seldom copied, and complete after every write."""
     copies, whole = [], []
     make, pwrite = xdmf.GrowingXdmf._write_document, os.pwrite
 
@@ -265,7 +267,7 @@ def test_few_files_and_a_document_that_grows(comm, shared_tmp, run, monkeypatch)
     assert [state.step for state in stored_states(shared_tmp)] == list(range(90))
 
 
-def test_a_document_that_was_removed_is_made_anew(comm, shared_tmp, run):
+def test_a_removed_xdmf_file_is_written_again(comm, shared_tmp, run):
     for step in range(3):
         run.write(step)
     on_first(comm, (shared_tmp / XDMF_FILE).unlink)

@@ -1,3 +1,5 @@
+"""summary.json."""
+
 import json
 import sys
 
@@ -10,7 +12,7 @@ from lyra_petsc.output.summary import library_versions, write_summary
 pytestmark = pytest.mark.parallel(3)
 
 
-def test_anything_a_run_collects_becomes_plain_json(comm, shared_tmp):
+def test_numpy_values_and_paths_become_plain_json(comm, shared_tmp):
     path = shared_tmp / "summary.json"
     write_summary(path, {"outcome": "running"}, comm)
     content = {
@@ -41,7 +43,7 @@ def test_a_summary_that_cannot_be_written_is_an_output_error_on_every_rank(comm,
         write_summary(shared_tmp / "missing" / "summary.json", {}, comm)
 
 
-def test_versions_name_what_takes_part(monkeypatch):
+def test_versions_of_all_libraries_are_listed(monkeypatch):
     from petsc4py import PETSc
 
     monkeypatch.delitem(sys.modules, "numba", raising=False)

@@ -1,4 +1,4 @@
-"""Stress and strain as symmetric tensors of six components, in each reader's own order; older folders."""
+"""Stress and strain as symmetric tensors of six components, in each reader's order; older folders."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from lyra_petsc.show.render.colour_quantities import quantity
 NUMBERED = np.arange(6.0)[None]
 
 
-def test_orders() -> None:
+def test_orders_of_components() -> None:
     np.testing.assert_array_equal(in_vtk_order(NUMBERED), [[0, 3, 5, 1, 4, 2]])
     np.testing.assert_array_equal(six_components(np.array([[1.0, 2.0, 3.0]])), [[1, 3, 0, 2, 0, 0]])
     np.testing.assert_array_equal(plane_components(NUMBERED), [[0, 3, 1]])
     np.testing.assert_array_equal(plane_components(stress(1)), stress(1))
 
 
-def test_readers_take_both_forms(tmp_path: Path) -> None:
+def test_readers_accept_three_and_six_components(tmp_path: Path) -> None:
     older, now = StoredRun(written(tmp_path / "older")), StoredRun(written(tmp_path / "now", six=True))
     np.testing.assert_array_equal(older.field("stress"), [stress(i) for i in range(3)])
     np.testing.assert_array_equal(now.field("stress"), [tensor(i) for i in range(3)])
     np.testing.assert_array_equal(quantity(now, "stress").values(2), quantity(older, "stress").values(2))
 
 
-def test_a_tensor_of_another_width_is_damage(tmp_path: Path) -> None:
+def test_another_number_of_components_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "run", six=True) / XDMF_FILE
     path.write_text(path.read_text().replace('Dimensions="8 6"', 'Dimensions="8 5"'))
     with pytest.raises(InputError, match="damaged"):
         StoredRun(tmp_path / "run")
 
 
-def test_xdmf_is_a_tensor_to_vtk(tmp_path: Path) -> None:
+def test_vtk_reads_tensors_from_xdmf(tmp_path: Path) -> None:
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
@@ -59,7 +59,7 @@ def test_xdmf_is_a_tensor_to_vtk(tmp_path: Path) -> None:
     assert not found[:, :, 2].any()
 
 
-def test_exports(tmp_path: Path) -> None:
+def test_exported_tensors(tmp_path: Path) -> None:
     run = written(tmp_path / "run", six=True)
     found = np.load(export_run(run, "npz").folder / "run.npz")
     np.testing.assert_array_equal(found["stress"], [tensor(i) for i in range(3)])
@@ -103,7 +103,7 @@ def run(comm: MPI.Comm, folder: Path, end: float, *, resume: bool = False) -> No
 
 
 @pytest.mark.parallel(2)
-def test_an_older_folder_goes_on_with_three_components(
+def test_an_older_folder_is_resumed_with_three_components(
     comm: MPI.Comm, shared_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run(comm, shared_tmp / "now", 0.04)

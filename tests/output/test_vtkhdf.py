@@ -1,4 +1,4 @@
-"""What VTK's reader finds in states.vtkhdf: every time, position and field, as they were written."""
+"""states.vtkhdf as read by VTK: times, positions and fields are those that were written."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.parallel(3)
 
 
 class Writer:
-    """A writer for the ring, its vertices and triangles dealt to the ranks."""
+    """A writer for the ring, whose vertices and triangles are distributed to the ranks."""
 
     def __init__(self, comm, folder, resume_after=None, vtkhdf=True):
         self.vertices = np.arange(len(REST))[::-1][comm.rank :: comm.size]
@@ -63,21 +63,21 @@ def check(path, numbers):
 
 
 def on_rank_0(comm, work):
-    """Run what only reads on one rank, so that a failure is seen on all."""
+    """Call a function that only reads on rank 0; a failure is raised on all ranks."""
     comm.barrier()
     if comm.rank == 0:
         work()
     comm.barrier()
 
 
-def test_every_time_and_field_at_every_moment(folder, comm):
+def test_all_times_and_fields_are_readable_after_every_state(folder, comm):
     writer = Writer(comm, folder)
     for i in range(4):
         writer.write(i)
         on_rank_0(comm, lambda i=i: check(folder / VTKHDF_FILE, range(i + 1)))
 
 
-def test_resumed_without_a_gap_or_a_double(folder, comm):
+def test_resuming_leaves_no_gap_and_no_duplicate(folder, comm):
     writer = Writer(comm, folder)
     for i in range(5):
         writer.write(i)
@@ -87,7 +87,7 @@ def test_resumed_without_a_gap_or_a_double(folder, comm):
     on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1, 2, 3]))
 
 
-def test_resumed_with_and_without_it(folder, comm):
+def test_resuming_with_and_without_vtkhdf(folder, comm):
     Writer(comm, folder, vtkhdf=False).write(0)
     assert not (folder / VTKHDF_FILE).exists()
     assert not (folder / CELLS_FILE).exists()
@@ -97,7 +97,7 @@ def test_resumed_with_and_without_it(folder, comm):
     assert not (folder / VTKHDF_FILE).exists()
 
 
-def test_a_field_that_some_states_lack(folder, comm):
+def test_a_field_missing_in_some_states(folder, comm):
     Writer(comm, folder).write(0, fields=False)
     Writer(comm, folder, resume_after=0).write(1)
 
@@ -110,7 +110,7 @@ def test_a_field_that_some_states_lack(folder, comm):
     on_rank_0(comm, compare)
 
 
-def test_a_disk_that_fails_leaves_the_states_before(folder, comm, monkeypatch):
+def test_a_full_disk_leaves_the_earlier_states(folder, comm, monkeypatch):
     writer = Writer(comm, folder)
     writer.write(0)
     writer.write(1)
@@ -138,7 +138,7 @@ def test_the_folder_may_be_moved(folder, comm, tmp_path_factory):
     on_rank_0(comm, move)
 
 
-def test_thousand_states_are_announced_quickly(folder, comm):
+def test_a_thousand_states_are_listed_quickly(folder, comm):
     if comm.size > 1:
         pytest.skip("one rank is enough")
     writer = Writer(comm, folder)

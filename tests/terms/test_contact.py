@@ -1,4 +1,4 @@
-"""Contact in motion: momentum, resting loads, and that nothing ever crosses, on any number of ranks."""
+"""Contact in motion on any number of ranks: momentum, resting loads, and no crossings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ INTEGRATORS = ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"]
 
 
 class Watched:
-    """A scene that runs, every state of which is looked at for crossings on rank 0."""
+    """A scene whose states are all checked for crossings, on rank 0."""
 
     def __init__(self, comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> None:
         self._options = petsc
@@ -70,7 +70,7 @@ class Watched:
 
     @property
     def x(self) -> Array:
-        """(V, 3) in mesh order."""
+        """Positions (V, 3) in mesh order."""
         return gathered(self.system.points, self.system.x)
 
     @property
@@ -78,7 +78,7 @@ class Watched:
         return gathered(self.system.points, self.system.v)
 
     def throw(self, v: Callable[[Array], Array]) -> None:
-        """Let velocities be those of positions."""
+        """Set velocities as a function of the positions."""
         n = self.system.points.n_owned
         x = self.system.x[:n].copy()
         vertices = np.arange(n)[:, None] < self.system.points.n_vertices
@@ -87,7 +87,7 @@ class Watched:
         self.simulation.stepper.start(0.0, 0)
 
     def look(self) -> None:
-        """Nothing crosses; collective."""
+        """Check that nothing crosses; collective."""
         x = self.x
         found = [len(self_crossings(x, self.triangles))]
         for obstacle in self.term.obstacles.each:
@@ -107,7 +107,7 @@ class Watched:
         return len(mutual_crossings(x, self.triangles, at, obstacle.triangles))
 
     def run(self, watch: Watch = lambda simulation: None, steps: int | None = None) -> Watched:
-        """To the end, or so many steps."""
+        """Run to the end, or for a number of steps."""
         while not self.simulation.finished and steps != 0:
             self.simulation.step()
             self.look()
@@ -116,7 +116,7 @@ class Watched:
         return self
 
     def forces(self, x: Array | None = None) -> tuple[Array, float]:
-        """Total of the contact forces on the sheets [N], and the largest part, at the last stage."""
+        """Sum of the contact forces on the sheets [N], and the largest of them, at the last stage."""
         system = self.system
         x = system.stage_positions if x is None else x
         force = np.zeros((system.points.n_local, 3))
@@ -170,7 +170,7 @@ def test_sheets_thrown_at_each_other(comm: MPI.Comm, integrator: str) -> None:
 
 
 def height_under(point: Array, triangles: Array) -> float:
-    """Largest z at which the vertical through a point meets triangles (n, 3, 3); -inf beside them."""
+    """Largest z at which the vertical line through a point hits triangles (n, 3, 3), or -inf."""
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     area, w = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0], point - a
     s = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
@@ -196,7 +196,7 @@ def test_sheets_thrown_fast_with_large_steps(comm: MPI.Comm, speed: float) -> No
 
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
 def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: str) -> None:
-    """All vertices at once; formulas whose stage is before the end find no way, BDF2 does."""
+    """All vertices at once; integrators whose stage is before the end fail, BDF2 does not."""
     scene = {
         "mesh": grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.05]}},
         "material": CLOTH | {"bending": 1e-5, "damping": 0.01},
@@ -215,8 +215,8 @@ def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: 
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "alpha2"])
-def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
-    """Two sheets that a third hits; nothing else works on them, and none dampens."""
+def test_impacts_create_no_energy(comm: MPI.Comm, integrator: str) -> None:
+    """Two sheets that are hit by a third one, without other forces or damping."""
     third = grid(0.3, 0.3, 3, 3) | {"transform": {"translate": [0.1, 0.05, 0.1]}}
     time = {"end": 0.08, "step": 0.002, "integrator": integrator}
     scene = {"mesh": [LOWER, UPPER, third], "material": MATERIAL | {"damping": 0.0}, "time": time}
@@ -246,7 +246,7 @@ def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(end(comm), single, rtol=0.0, atol=1e-7 * 0.7)
 
 
-def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_run_resumes_on_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     sheet = grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.03]}}
     scene = {
         "mesh": sheet,
@@ -263,8 +263,8 @@ def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> Non
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
 
 
-def test_forces_balance_wherever_ranks_meet(comm: MPI.Comm) -> None:
-    """Triangles reach out of the box of a rank's own vertices."""
+def test_forces_balance_at_boundaries_between_ranks(comm: MPI.Comm) -> None:
+    """Triangles extend beyond the bounding box of a rank's own vertices."""
     upper = grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [0.23, 0.21, 0.015]}}
     scene = {"mesh": [grid(0.9, 0.9, 2, 2), upper], "contact": {"gap": 0.02}}
 
@@ -312,7 +312,7 @@ def dropped(shape: str, **more: Any) -> dict[str, Any]:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("shape", OBSTACLES)
-def test_a_sheet_falls_on(comm: MPI.Comm, shape: str) -> None:
+def test_a_sheet_falls_on_an_obstacle(comm: MPI.Comm, shape: str) -> None:
     with Watched(comm, dropped(shape)) as run:
         most = 0.0
 
@@ -326,7 +326,7 @@ def test_a_sheet_falls_on(comm: MPI.Comm, shape: str) -> None:
 
 
 def test_a_sheet_falls_on_a_mesh(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """An open one with a sharp corner."""
+    """An open mesh with a sharp corner."""
     if comm.rank == 0:
         corners = [(-0.1, -0.1, -0.05), (0.12, -0.1, -0.05), (0.0, 0.13, -0.05), (0.01, 0.0, 0.01)]
         sides = [(0, 1, 3), (1, 2, 3), (2, 0, 3)]
@@ -340,7 +340,7 @@ def test_a_sheet_falls_on_a_mesh(comm: MPI.Comm, shared_tmp: Path) -> None:
 
 @pytest.mark.parametrize("gap", [1e-3, pytest.param(1e-5, marks=pytest.mark.parallel(1))])
 def test_small_gaps_take_few_iterations(comm: MPI.Comm, gap: float) -> None:
-    """Half a millimetre above a sphere at first, which one pair after another meets."""
+    """A sheet that starts half a millimetre above a sphere, and touches it pair by pair."""
     mesh = SHEET | {"transform": {"translate": [-0.3, -0.29, 0.0005]}}
     ball = {"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}
     scene = {"mesh": mesh, "contact": {"gap": gap}, "obstacles": {"it": ball}, "solver": {}}
@@ -353,8 +353,8 @@ def test_small_gaps_take_few_iterations(comm: MPI.Comm, gap: float) -> None:
         assert np.median(steps) <= 12
 
 
-def test_weight_at_rest(comm: MPI.Comm) -> None:
-    """Statics: a plane carries the sheet's weight."""
+def test_a_plane_carries_the_weight_at_rest(comm: MPI.Comm) -> None:
+    """In a static analysis."""
     with Watched(comm, dropped("plane", time={"analysis": "static", "step": 1.0})) as run:
         run.run()
         total, _ = run.forces(run.system.x)
@@ -367,7 +367,7 @@ def test_weight_at_rest(comm: MPI.Comm) -> None:
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 @pytest.mark.parametrize("shape", ["plane", "sphere", "box"])
-def test_obstacles_that_move_carry_the_sheet(comm: MPI.Comm, shape: str, integrator: str) -> None:
+def test_moving_obstacles_carry_the_sheet(comm: MPI.Comm, shape: str, integrator: str) -> None:
     """Upwards at 1 m/s, while they turn."""
     motion = [
         {"time": 0.0},
@@ -381,8 +381,8 @@ def test_obstacles_that_move_carry_the_sheet(comm: MPI.Comm, shape: str, integra
 
 
 @pytest.mark.parametrize("speed", [10.0, 100.0])
-def test_pulled_through_another_sheet(comm: MPI.Comm, speed: float) -> None:
-    """Handles pull a sheet against one whose corners are held: no state crosses, whatever happens."""
+def test_a_sheet_pulled_against_another_never_crosses_it(comm: MPI.Comm, speed: float) -> None:
+    """Handles pull a sheet against one with held corners."""
     held = grid(0.6, 0.6, 4, 4) | {"transform": {"translate": [-0.3, -0.3, 0.0]}}
     pulled = grid(0.2, 0.2, 2, 2) | {"transform": {"translate": [-0.1, -0.1, 0.05]}}
     end = 0.2 / speed
@@ -407,8 +407,8 @@ def test_pulled_through_another_sheet(comm: MPI.Comm, speed: float) -> None:
 
 
 @pytest.mark.parametrize("handled", [True, False])
-def test_what_moves_far_in_a_step_is_not_held_up(comm: MPI.Comm, handled: bool) -> None:
-    """A handle, ten times the gap in a step; a plate that comes with the sheet that flies before it."""
+def test_common_motions_of_many_gaps_per_step_are_free(comm: MPI.Comm, handled: bool) -> None:
+    """A handle moves by ten gaps in a step; a plate moves with a sheet that flies in front of it."""
     up = {"rise": [{"time": 0.0}, {"time": 0.1, "translate": [0.0, 0.0, 2.0]}]}
     moving = {"motions": up, "time": {"end": 0.1, "step": 0.01}}
     plate = {"box": {"min": [-1.0, -1.0, -0.2], "max": [2.0, 2.0, -0.01]}, "motion": "rise"}

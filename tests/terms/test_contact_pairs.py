@@ -43,14 +43,14 @@ class Pairs:
 
     @property
     def places(self) -> Array:
-        """(n, 4, 3)"""
+        """Positions (n, 4, 3) of the points of the pairs."""
         at = self.points
         if not len(self.obstacle_x):
             return np.asarray(self.x[at])
         return np.where((at >= 0)[:, :, None], self.x[np.maximum(at, 0)], self.obstacle_x[np.maximum(~at, 0)])
 
     def part(self, at: NDArray[np.bool_] | slice) -> Pairs:
-        """Some of them."""
+        """A subset of the pairs."""
         return replace(self, kind=self.kind[at], points=self.points[at], offset=self.offset[at])
 
     def distances(self, x: Array | None = None, obstacle_x: Array | None = None) -> Array:
@@ -60,7 +60,7 @@ class Pairs:
         return out
 
     def find_active(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which of them are nearer than the gap; β and the energy of all, 0 of the rest."""
+        """Find pairs nearer than the gap; returns β and energy of all, which are 0 for other pairs."""
         n = len(self)
         numbers = self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel, np.zeros((n, 6))
         found = found_active(x, self.obstacle_x, self.kind, self.points, *numbers, counted=n)
@@ -74,7 +74,7 @@ class Pairs:
         return self.find_active(x, parallel)[2]
 
     def _active(self, x: Array, parallel: float) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """What the kernels take of pairs and of what is active."""
+        """Arguments of the kernels about pairs, and about active pairs."""
         n = len(self)
         of = self.kind, self.points, self.offset, np.full(n, GAP), np.full(n, STIFFNESS), parallel
         found = found_active(x, self.obstacle_x, *of, np.zeros((n, 6)), counted=n)
@@ -87,7 +87,7 @@ class Pairs:
         return out, obstacle_gradient
 
     def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
-        """(n, 12, 12)"""
+        """Hessians (n, 12, 12) of the pairs."""
         of, active = self._active(self.x, parallel)
         each = blocks_of(self.x, self.obstacle_x, of, active, blend)
         return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
@@ -145,7 +145,7 @@ def among_sheets(kind: int, n: int, seed: int = 1) -> Pairs:
 
 
 def nearly_parallel(n: int) -> Pairs:
-    """Edges side by side, whose directions differ by 1e-1 to 1e-4."""
+    """Nearly parallel edges, whose directions differ by 1e-1 to 1e-4."""
     rng = np.random.default_rng(7)
     u, v, along = units(rng, n), units(rng, n), rng.uniform(-0.9, 0.9, size=n)
     turned = u + 10.0 ** rng.uniform(-4.0, -1.0, size=n)[:, None] * v
@@ -193,7 +193,7 @@ KINDS: dict[str, tuple[Callable[[], Pairs], float]] = {
 
 
 def sampled_distance(kind: int, p: Array) -> float:
-    """Smallest distance of points of both simplices on a grid."""
+    """Smallest distance between sampled points of both simplices."""
     s = np.linspace(0.0, 1.0, 61)
     if kind == VERTEX_TRIANGLE:
         u, v = (c[np.add.outer(s, s) <= 1.0 + 1e-12] for c in np.meshgrid(s, s))
@@ -482,7 +482,7 @@ def test_planes_that_turn() -> None:
 
 
 def two_layers(noise: float) -> Pairs:
-    """All pairs of two squares of 3 × 3 vertices, those of one above those of the other."""
+    """All pairs between two parallel squares of 3 × 3 vertices."""
     rng = np.random.default_rng(5)
     flat = np.array([(i, j, 0.0) for j in range(3) for i in range(3)])
     x = np.concatenate([flat, flat + [0.0, 0.0, 0.5]]) + noise * rng.normal(size=(18, 3))

@@ -78,7 +78,7 @@ def moved(name: str, corners: Array, triangles: Ints, rng: np.random.Generator) 
 
 
 def brute(x: Array, dx: Array, triangles: Ints) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
-    """All pairs without common vertices, and those that are within `RADIUS` anywhere on the displacements."""
+    """All pairs without common vertices, and those within `RADIUS` at any point of the displacements."""
     edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     v, t = (each.ravel() for each in np.indices((len(x), len(triangles))))
     rows = np.column_stack([v, triangles[t]])

@@ -35,7 +35,7 @@ def test_they_keep_momentum_and_take_energy(stiffness: float) -> None:
     assert np.sum(mass[:, None] * after**2) < np.sum(mass[:, None] * v**2)
 
 
-def test_a_pair_is_of_the_rank_of_one_vertex() -> None:
+def test_a_pair_belongs_to_the_rank_of_one_vertex() -> None:
     points = np.array([[0, 5, 6, 7], [0, 5, 6, 7], [5, 0, -3, -4], [1, 2, 3, 4]])
     beta = np.array([[1, -0.5, -0.5, 0], [0, -0.5, -0.5, 0], [-1, 0.5, 0.5, 0], [0.5, 0.5, -1, 0]])
     vertex, number = np.array([0, -1, 5, -1]), np.array([9, 3, 8, 2, 1, 7, 6, 5])

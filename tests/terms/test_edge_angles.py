@@ -1,4 +1,4 @@
-"""Unknowns on edges, by a term that lives in the tests: in equilibrium it is a plain hinge."""
+"""Unknowns on edges, with a term of the tests that equals a plain hinge in equilibrium."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ INTEGRATORS = ("beuler", "midpoint", "bdf2", "alpha2")
 
 @pytest.fixture
 def on_edges(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Scenes bend by the term of the tests from here on."""
+    """Use the term of the tests for bending."""
     with monkeypatch.context() as patch:
         patch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
         yield
@@ -49,7 +49,7 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array,
 
 
 def compare(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, scene: dict[str, Any], **petsc: Any) -> None:
-    """A run with unknowns on edges is the one with plain hinges."""
+    """Compare a run with unknowns on edges to one with plain hinges."""
     x, energies, reactions, edges = outcome(comm, scene)
     assert edges == 0
     with monkeypatch.context() as patch:
@@ -82,7 +82,7 @@ def test_one_linear_solve_a_step(comm: MPI.Comm, on_edges: None) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "alpha2"])
-def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adaptive_steps(comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     time = {"end": 0.05, "step": "auto", "tolerance": 5e-3, "integrator": integrator}
     compare(comm, monkeypatch, {"time": time})
 
@@ -91,7 +91,7 @@ ALL_SOLVERS = SOLVERS | {"assembled operator": {"pc_type": "pbjacobi", "mat_type
 
 
 @pytest.mark.parametrize("name", ALL_SOLVERS)
-def test_every_linear_solver(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_linear_solver_works(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     compare(comm, monkeypatch, {"time": STEPS | {"end": 0.03}}, ksp_rtol=1e-8, **ALL_SOLVERS[name])
 
 
@@ -122,7 +122,7 @@ def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> No
     simulation.destroy()
 
 
-def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
+def test_derivatives_agree_with_finite_differences(comm: MPI.Comm, on_edges: None) -> None:
     """Gradient and Hessian against differences, with both kinds of unknowns, in the assembled matrix."""
     simulation = SteppedScene(comm, scene_of(SCENE | {"time": STEPS}))
     system, layout = simulation.problem.system, simulation.problem.points
@@ -175,7 +175,7 @@ def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_run_goes_on_with_other_ranks(
+def test_a_run_resumes_on_other_ranks(
     comm: MPI.Comm, integrator: str, on_edges: None, shared_tmp: Path
 ) -> None:
     scene = SCENE | {"time": STEPS | {"integrator": integrator}, "solver": TIGHT}
@@ -185,7 +185,7 @@ def test_a_run_goes_on_with_other_ranks(
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=2e-8)
 
 
-def test_without_it_there_are_no_unknowns_but_the_vertices(comm: MPI.Comm) -> None:
+def test_without_the_term_only_vertices_have_unknowns(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SCENE))
     layout = simulation.problem.points
     assert layout.n_owned == layout.n_vertices == len(layout.mesh_vertices)

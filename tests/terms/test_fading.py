@@ -1,4 +1,4 @@
-"""Hinges of collapsed triangles: the energy fades out smoothly, and nothing is left that is no number."""
+"""Hinges of collapsed triangles: the energy fades out smoothly, and results are finite."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ FULL = np.array([[0.3, 0.8, 0.1], [0.6, -0.7, 0.3]])
 
 
 def areas(x: Array) -> Array:
-    """Of the hinge's two triangles [m²]."""
+    """Areas [m²] of the hinge's two triangles."""
     e = x[1] - x[0]
     return 0.5 * np.array([np.linalg.norm(np.cross(e, x[k] - x[0])) for k in (2, 3)])
 
 
 def hinge(*left: float) -> Array:
-    """Points (4, 3) whose two triangles have these parts of their rest areas."""
+    """Points (4, 3) whose two triangles have given fractions of their rest areas."""
     x = np.vstack([EDGE, FULL])
     e = x[1] - x[0]
     for row, part in zip((2, 3), left, strict=True):
@@ -71,14 +71,14 @@ def clamp() -> Clamp:
 
 
 def turned() -> Array:
-    """Where the clamp sets out from."""
+    """Start position of the clamp."""
     x = hinge(1.0, 1.0)
     x[2] += [0.1, 0.0, 0.5]
     return x
 
 
 def frozen(term: Elastic, start: Array | None = None) -> Any:
-    """What a clamp that sets out from ``start`` freezes; nothing of a hinge."""
+    """Frozen data of a clamp that starts at ``start``; None for a hinge."""
     x = turned() if start is None else start
     return term.freeze(UpcomingStep(0.0, 1.0, 1.0, x, lambda time, rows: x[rows]))
 
@@ -92,7 +92,7 @@ def gradient(term: Elastic, x: Array, start: Array | None = None) -> Array:
 
 
 def hessian(term: Elastic, x: Array, blend: float = 0.0, start: Array | None = None) -> Array:
-    """(3 n, 3 n) of the single element."""
+    """Hessian (3 n, 3 n) of the single element."""
     n = 3 * term.stencil.shape[1]
     whole = hessian_of(term, x, frozen(term, start), blend).reshape(x.size, x.size)
     assert not whole[n:].any()
@@ -101,7 +101,7 @@ def hessian(term: Elastic, x: Array, blend: float = 0.0, start: Array | None = N
 
 
 def differences(f: Callable[[Array], Array | float], x: Array, n: int, h: float) -> Array:
-    """Derivative of f with respect to the first n points, fourth-order central differences, (3 n, …)."""
+    """Derivative (3 n, …) of f with respect to the first n points, by fourth-order central differences."""
     rows = []
     for index in np.ndindex(n, 3):
         d = np.zeros_like(x)
@@ -111,7 +111,7 @@ def differences(f: Callable[[Array], Array | float], x: Array, n: int, h: float)
 
 
 def part(a: float) -> float:
-    """Part of the rest area at which a triangle has come down to a."""
+    """Fraction of the rest area: √a times that at which fading starts."""
     return FADES_BELOW * float(np.sqrt(a))
 
 
@@ -130,7 +130,7 @@ every_case = pytest.mark.parametrize("left", CASES.values(), ids=CASES)
 
 @both_terms
 @every_case
-def test_derivatives_while_it_fades(make: Callable[[], Elastic], left: tuple[float, float]) -> None:
+def test_derivatives_of_a_fading_hinge(make: Callable[[], Elastic], left: tuple[float, float]) -> None:
     term, x = make(), hinge(*left)
     n, h = term.stencil.shape[1], 1e-4 * min(left)
     force = gradient(term, x)
@@ -145,7 +145,9 @@ def test_derivatives_while_it_fades(make: Callable[[], Elastic], left: tuple[flo
 
 @both_terms
 @every_case
-def test_regularised_hessian_while_it_fades(make: Callable[[], Elastic], left: tuple[float, float]) -> None:
+def test_regularised_hessian_of_a_fading_hinge(
+    make: Callable[[], Elastic], left: tuple[float, float]
+) -> None:
     term, x = make(), hinge(*left)
     exact, regularised, mixed = (hessian(term, x, blend) for blend in (0.0, 1.0, 0.3))
     np.testing.assert_allclose(mixed, 0.7 * exact + 0.3 * regularised, atol=1e-12 * np.abs(exact).max())
@@ -158,13 +160,13 @@ def test_regularised_hessian_while_it_fades(make: Callable[[], Elastic], left: t
 
 @every_case
 @pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
-def test_hessian_is_that_of_four_points(left: tuple[float, float], blend: float) -> None:
+def test_hessian_agrees_with_that_of_four_points(left: tuple[float, float], blend: float) -> None:
     term, x = bending(), hinge(*left)
     plain = summed(term.stencil, bending_blocks(term, x, blend), 4).reshape(12, 12)
     np.testing.assert_allclose(hessian(term, x, blend), plain, rtol=0.0, atol=1e-13 * np.abs(plain).max())
 
 
-def test_the_energy_is_the_angle_s_times_what_is_left() -> None:
+def test_energy_is_that_of_the_angle_times_the_fading_factor() -> None:
     term = bending()
     k, rest = 0.7, -0.4
     for left in CASES.values():
@@ -177,7 +179,7 @@ def test_the_energy_is_the_angle_s_times_what_is_left() -> None:
 
 
 @both_terms
-def test_two_derivatives_are_continuous_where_it_begins(make: Callable[[], Elastic]) -> None:
+def test_two_derivatives_are_continuous_where_fading_starts(make: Callable[[], Elastic]) -> None:
     term = make()
     just_below, just_above = hinge(part(1.0 - 1e-7), 1.0), hinge(part(1.0 + 1e-7), 1.0)
     for of in (total(term), lambda x: gradient(term, x), lambda x: hessian(term, x)):
@@ -186,7 +188,7 @@ def test_two_derivatives_are_continuous_where_it_begins(make: Callable[[], Elast
 
 
 @pytest.mark.parametrize("left", [1.0, part(1.001)])
-def test_nothing_fades_before(left: float) -> None:
+def test_nothing_fades_above_the_limit(left: float) -> None:
     term, x = bending(), hinge(left, 0.5)
     full = bending(0.0)
     assert term.weights(x)[0] == 1.0
@@ -197,7 +199,7 @@ def test_nothing_fades_before(left: float) -> None:
 
 
 def flattened() -> dict[str, Array]:
-    """Shapes of which at least the first triangle has no area, or next to none."""
+    """Shapes whose first triangle at least has no area, or nearly none."""
     shapes = {
         "no height": hinge(0.0, 1.0),
         "both": hinge(0.0, 0.0),
@@ -215,7 +217,7 @@ def flattened() -> dict[str, Array]:
 
 @both_terms
 @pytest.mark.parametrize("a", [1e-29, 1e-20, 1e-10])
-def test_what_is_nearly_gone_is_a_number(make: Callable[[], Elastic], a: float) -> None:
+def test_nearly_collapsed_triangles_give_finite_numbers(make: Callable[[], Elastic], a: float) -> None:
     term, x = make(), hinge(part(a), 1.0)
     assert 0.0 < total(term)(x) < 1e-25
     force = gradient(term, x)
@@ -240,14 +242,14 @@ def test_a_triangle_without_area_has_no_energy_and_no_force(make: Callable[[], E
         assert term.weights(x)[0] == 0.0
 
 
-def test_what_is_no_number_stays_none() -> None:
+def test_nan_is_not_hidden() -> None:
     x = hinge(1.0, 1.0)
     x[2, 1] = np.nan
     assert np.isnan(total(bending())(x))
     assert np.isnan(gradient(bending(), x)).any()
 
 
-def test_a_pressed_triangle_pushes_less_and_less() -> None:
+def test_the_force_of_a_compressed_triangle_decreases() -> None:
     # the angle's own gradient grows like one over the height
     term = bending()
     pushes = [np.abs(gradient(term, hinge(left, 1.0))).max() for left in np.geomspace(0.05, 1e-5, 20)]
@@ -263,7 +265,7 @@ def test_forces_of_a_fading_hinge_balance() -> None:
     np.testing.assert_allclose(np.cross(x, force).sum(axis=0), 0.0, atol=1e-12 * largest)
 
 
-def test_a_clamp_may_set_out_from_an_edge_without_length() -> None:
+def test_a_clamp_may_start_with_an_edge_without_length() -> None:
     term, x = clamp(), flattened()["no edge"]
     assert total(term, x)(x) == 0.0
     assert not gradient(term, x, x).any()

@@ -52,7 +52,7 @@ class Pairs(NamedTuple):
 
 @pytest.fixture
 def pairs(x: Array) -> Pairs:
-    """About half of them slide; some are between sheets."""
+    """Pairs of which about half slide; some are between sheets."""
     random = np.random.default_rng(1)
     stencil = np.arange(4 * N, dtype=np.int32).reshape(N, 4)
     beta = random.normal(size=(N, 4))

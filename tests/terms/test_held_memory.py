@@ -1,4 +1,4 @@
-"""Handles that together hold more vertices than there is memory for."""
+"""Handles that together hold more vertices than fit into memory."""
 
 from __future__ import annotations
 

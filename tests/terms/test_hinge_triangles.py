@@ -1,4 +1,4 @@
-"""Triangles found from hinges: what is put together triangle by triangle is what the hinges have."""
+"""Triangles found from hinges: sums over triangles equal sums over hinges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lyra_petsc.terms.registry import registration_of
 
 
 def strip(n: int, *, twisted: bool) -> Ints:
-    """A closed band of 2 n triangles about n + n vertices; a Möbius band where twisted."""
+    """A closed band of 2 n triangles with n + n vertices; with ``twisted`` a Möbius band."""
     low, high = np.arange(n), n + np.arange(n)
     low_next, high_next = np.roll(low, -1), np.roll(high, -1)
     if twisted:
@@ -27,13 +27,13 @@ def strip(n: int, *, twisted: bool) -> Ints:
 
 
 def octahedron() -> Ints:
-    """Closed, every vertex in four triangles."""
+    """A closed surface with every vertex in four triangles."""
     upper = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1)]
     return np.array(upper + [(5, c, b) for _, b, c in upper])
 
 
 def turned(triangles: Ints) -> Ints:
-    """Every third triangle the other way round."""
+    """The triangles, every third with the opposite orientation."""
     out = triangles.copy()
     out[::3] = out[::3, ::-1]
     return out
@@ -89,7 +89,7 @@ def made(elements: Elements) -> Bending:
 
 
 def alone(name: str, limit: float = 0.0) -> list[Bending]:
-    """A term for each hinge of ``bending``."""
+    """One term for each hinge of ``bending``."""
     (stencil, opposite), data = SHEETS[name], bending(name, limit).elements.data
     found = []
     for row, points in enumerate(stencil):
@@ -103,7 +103,7 @@ def alone(name: str, limit: float = 0.0) -> list[Bending]:
 
 
 @every_sheet
-def test_sides_and_hinges_name_each_other(name: str) -> None:
+def test_sides_and_hinges_refer_to_each_other(name: str) -> None:
     stencil, opposite = SHEETS[name]
     corners, sides, found = triangles_of(stencil.astype(np.int32), opposite)
     n = len(stencil)
@@ -124,7 +124,7 @@ def count(name: str) -> int:
     return len(triangles_of(stencil.astype(np.int32), opposite).corners)
 
 
-def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> None:
+def test_consistently_oriented_triangles_are_found_once() -> None:
     assert count("octahedron") == 8
     assert count("band") == 14
     assert count("Möbius band") > 14
@@ -132,7 +132,7 @@ def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> Non
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("most", [14, 100_000])  # the square of the numbers passes 32 bits
-def test_triangles_are_those_of_the_mesh_whatever_their_points_are_called(seed: int, most: int) -> None:
+def test_triangles_do_not_depend_on_the_numbering(seed: int, most: int) -> None:
     names = np.random.default_rng(seed).choice(most, 14, replace=False)
     mesh = strip(7, twisted=False)
     stencil, opposite = hinges_of(mesh)
@@ -189,8 +189,8 @@ def test_block_rows_are_those_of_the_element_hessians(
     assert whole.indptr.tolist() == pattern.indptr.tolist()
 
 
-def test_points_without_a_place_do_no_harm() -> None:
-    """Two points in one place: an edge without a length, triangles without an area."""
+def test_coincident_points_give_finite_results() -> None:
+    """Two points at one position: an edge without length, triangles without area."""
     stencil, _ = SHEETS["band"]
     term, x = bending("band", 1e-12), shape(14)
     x[stencil[0, 1]] = x[stencil[0, 0]]

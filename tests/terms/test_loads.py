@@ -1,4 +1,4 @@
-"""Loads: total forces, their sharing, and the time window; the wind's law."""
+"""Loads: total forces, their distribution over vertices, the time window; the law of the wind."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def wind_on(simulation: Simulation, v: Array) -> Array:
     return -gradient(term, v, frozen_by(term, simulation.system))
 
 
-def test_wind_force_of_a_tilted_sheet_is_the_stated_law() -> None:
+def test_wind_force_of_a_tilted_sheet_follows_the_law() -> None:
     wind, density, drag = np.array([2.0, -1.0, 3.0]), 1.3, 0.7
     block = {"velocity": wind.tolist(), "density": density, "drag": drag}
     tilt = rotation([1.0, 0.2, 0.3], 0.6)

@@ -1,4 +1,4 @@
-"""Every law of the membrane: its derivatives, its tangent at rest, convexity, and strips pushed together."""
+"""Membrane laws: derivatives, tangent at rest, convexity, and compressed strips."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_every_law_is_tested() -> None:
 
 
 @every_law
-def test_stress_and_tangent_are_the_derivatives(keys: dict[str, Any]) -> None:
+def test_stress_and_tangent_are_derivatives_of_the_energy(keys: dict[str, Any]) -> None:
     law = Law(shell_of(keys))
     for e in STRAINS:
         h = 1e-5
@@ -89,7 +89,7 @@ def test_stress_and_tangent_are_the_derivatives(keys: dict[str, Any]) -> None:
 
 
 @every_law
-def test_at_rest_it_is_the_library(keys: dict[str, Any]) -> None:
+def test_tangent_at_rest_is_that_of_the_library(keys: dict[str, Any]) -> None:
     shell, zero = shell_of(keys), np.zeros(3)
     law = Law(shell)
     rest = [[shell.c11, shell.c12, 0.0], [shell.c12, shell.c22, 0.0], [0.0, 0.0, shell.c33]]
@@ -102,7 +102,7 @@ def test_at_rest_it_is_the_library(keys: dict[str, Any]) -> None:
 
 
 @every_law
-def test_its_tangent_is_positive_semidefinite(keys: dict[str, Any]) -> None:
+def test_tangent_is_positive_semidefinite(keys: dict[str, Any]) -> None:
     law = Law(shell_of(keys))
     for e in STRAINS:
         values = np.linalg.eigvalsh(law.tangent(e))
@@ -111,7 +111,7 @@ def test_its_tangent_is_positive_semidefinite(keys: dict[str, Any]) -> None:
 
 @stable
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0, 90.0])
-def test_a_strip_pushed_together_never_gives_way(keys: dict[str, Any], degrees: float) -> None:
+def test_a_compressed_strip_does_not_soften(keys: dict[str, Any], degrees: float) -> None:
     # held on both sides: the force λ S along the strip grows with compression, where St. Venant-
     # Kirchhoff's turns round at λ = 1/√3
     law, c, s = Law(shell_of(keys)), np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -128,7 +128,7 @@ def test_a_strip_pushed_together_never_gives_way(keys: dict[str, Any], degrees: 
     assert (np.diff(forces) < 0.0).all()
 
 
-def test_st_venant_kirchhoff_gives_way() -> None:
+def test_st_venant_kirchhoff_softens() -> None:
     # what the test above is to see
     law = Law(shell_of({"cloth": "gray-interlock"}))
     forces = [x * law.stress(np.array([0.5 * (x * x - 1.0), 0.0, 0.0]))[0] for x in (0.6, 0.577, 0.5)]
@@ -136,7 +136,7 @@ def test_st_venant_kirchhoff_gives_way() -> None:
     assert forces[1] < forces[2]
 
 
-def test_incompressible_sheet_is_pulled_as_theory_says() -> None:
+def test_extension_of_an_incompressible_sheet_follows_theory() -> None:
     # Treloar: a strip of thickness h with ν = ½ is pulled with E h/3 (λ − 1/λ²)
     law = Law(shell_of(SHEET | {"poisson": 0.5, "law": "neo-hookean"}))
     for stretch in (0.5, 0.9, 1.5, 3.0):
@@ -147,7 +147,7 @@ def test_incompressible_sheet_is_pulled_as_theory_says() -> None:
         assert force == pytest.approx(2.0e3 / 3.0 * (stretch - stretch**-2), rel=1e-9)
 
 
-def test_curves_are_met_at_their_points() -> None:
+def test_curves_are_interpolated_at_their_points() -> None:
     law = Law(shell_of({"density": 0.2, "law": CURVES}))
     for x, force in [*CURVES["warp"], [0.2, 60.0 + 0.1 * 50.0 / 0.07]]:
         e = 0.5 * ((1.0 + x) ** 2 - 1.0)
@@ -164,7 +164,7 @@ def test_strains_that_may_be_percent_are_noted() -> None:
         assert [words in note for words, note in zip(told, notes, strict=True)] == [True] * len(told)
 
 
-def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
+def test_curves_from_files_are_stored_in_the_scene(tmp_path: Path) -> None:
     (tmp_path / "curves").mkdir()
     text = '\ufeff"strain"; "N/m"\n# KES\n"0.01"; 2\n\n0.03;10\n'
     (tmp_path / "curves" / "warp.csv").write_text(text, encoding="utf-8")
@@ -200,7 +200,7 @@ def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
         (None, "no such file"),
     ],
 )
-def test_curves_that_are_none_are_refused(text: str | None, words: str, tmp_path: Path) -> None:
+def test_invalid_curves_are_refused(text: str | None, words: str, tmp_path: Path) -> None:
     if text is not None:
         (tmp_path / "shear.csv").write_text(text)
     law = CURVES | {"shear": "shear.csv"}
@@ -211,7 +211,7 @@ def test_curves_that_are_none_are_refused(text: str | None, words: str, tmp_path
     assert words in str(refused.value)
 
 
-def test_fitted_cloths_are_nearer_to_their_tables() -> None:
+def test_fitted_laws_approximate_the_tables_better() -> None:
     errors = fit_errors()
     assert set(errors) == set(measured_names())
     for fitted, of_stvk in errors.values():
@@ -252,7 +252,7 @@ def test_forces_of_a_sheet_are_the_derivatives_of_its_energy(cloth: str, tmp_pat
         ({"cloth": "gray-interlock", "law": "ogden"}, "must be one of stvk, measured, neo-hookean"),
     ],
 )
-def test_laws_of_other_materials_are_refused(material: dict[str, Any], words: str) -> None:
+def test_laws_that_do_not_fit_the_material_are_refused(material: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=r"material\.law") as refused:
         scene_of(SCENE | {"mesh": {"grid": GRID}, "material": material})
     assert words in str(refused.value)

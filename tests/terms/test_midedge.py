@@ -149,7 +149,7 @@ def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
         assert np.linalg.eigvalsh(regularised)[0] > -1e-12 * np.abs(regularised).max()
 
 
-def test_energy_is_continuous_all_the_way_round() -> None:
+def test_energy_is_continuous_at_all_angles() -> None:
     """It grows up to 180° on either side, to the same value for flat sheets."""
     with Simulation({"mesh": grid(1.0, 1.0, 1, 1), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, x = midedge_of(simulation), simulation.system.x.copy()
@@ -165,7 +165,7 @@ def test_energy_is_continuous_all_the_way_round() -> None:
         assert (np.diff(values) > 0.0).all()
 
 
-def test_triangles_that_are_computed_together_do_not_mix() -> None:
+def test_triangles_of_one_batch_do_not_affect_each_other() -> None:
     """With any triangles of a batch folded beyond 45° or fading, and for any size of the last batch."""
     with Simulation(SHEET, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
@@ -388,7 +388,7 @@ def test_order_with_damping(scheme: str) -> None:
     assert np.log2(moved[0] / moved[1]) > 1.8
 
 
-def test_a_clamp_turns_the_sheet_with_it() -> None:
+def test_a_clamp_rotates_the_sheet() -> None:
     """A weightless sheet that is slowly rotated about its clamped edge moves as a rigid body."""
     degrees = 400.0
     keyframes = [{"time": 0.0}, {"time": 200.0, "rotate": {"axis": [0, 1, 0], "degrees": degrees}}]
@@ -449,7 +449,7 @@ def test_clamps_that_cannot_slide_are_refused(
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["beuler", "alpha2"])
-def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp: Path) -> None:
+def test_a_run_resumes_on_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp: Path) -> None:
     scene = TURN | {"time": STEPS | {"integrator": scheme}}
     whole = outcome(comm, scene)[0]
     x = end_on_one_rank(comm, scene_of(SHEET | scene), shared_tmp / "run", steps=4)
@@ -528,8 +528,8 @@ def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
 def test_a_tape_spring_is_bistable(twist: float, rolled: bool, tmp_path: Path) -> None:
     """With rest curvature κ across it is also stable rolled up by d12 κ / d11 along, if stiff in twist.
 
-    At the start its chords are as much shorter as to fold it, were they let go little by little. S. D. Guest,
-    S. Pellegrino, Proceedings of the Royal Society A 462 (2006) 839-854.
+    The chords of the start are so much shorter that it would fold if the forces that hold it were released
+    step by step. S. D. Guest, S. Pellegrino, Proceedings of the Royal Society A 462 (2006) 839-854.
     """
     bent, coupling, stiffness = 50.0, 0.7, 0.02
     flat, faces = rectangle(16, 8, 0.12, 0.06, alternating=True)
@@ -617,7 +617,7 @@ def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) ->
     assert stiffness[0] == pytest.approx(stiffness[1])
 
 
-def test_curvature_that_no_edge_can_turn_is_refused() -> None:
+def test_rest_curvature_beyond_180_degrees_per_edge_is_refused() -> None:
     """Triangles of cells of 0.1 m have the tangent T = κ / 20 m, which is 1 + 3π/2 at 180°."""
     sheet = {"mesh": {"grid": {"width": 0.5, "height": 0.2, "nx": 5, "ny": 2}}}
     material = STIFF | {"bending_model": "midedge"}
@@ -848,7 +848,7 @@ def test_a_part_with_symmetry_planes_moves_as_the_whole(
         np.testing.assert_allclose(results[name][1], whole[1], rtol=1e-5, atol=1e-9)
 
 
-def test_a_symmetry_plane_is_one(tmp_path: Path) -> None:
+def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> None:
     mesh, _ = mirrored(tmp_path / "vault.obj", "")
     for handle, material, words in (
         ({"box": [[-1, -1, -1], [0.5, 2, 1]], "symmetry": "x"}, {}, "beside the plane x = "),
@@ -928,7 +928,7 @@ def test_moments_do_not_depend_on_ranks(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(energies, alone[1], rtol=1e-6, atol=1e-6)
 
 
-def test_a_moment_works_through_the_turn_of_directors() -> None:
+def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
     """Against differences of directors, far from the frames' directions, where the frames rotate, too."""
     scene = {"mesh": grid(1.0, 1.0, 2, 3), "material": STIFF, "loads": [{"group": "top", "moment": 0.7}]}
     with Simulation(scene, MPI.COMM_SELF) as simulation:
@@ -958,7 +958,7 @@ def test_a_moment_works_through_the_turn_of_directors() -> None:
         assert np.sum(force * way) == pytest.approx(expected, rel=1e-7)
 
 
-def test_moments_need_an_edge_that_has_them() -> None:
+def test_moments_are_refused_where_edges_carry_none() -> None:
     flat = {"mesh": grid(1.0, 1.0, 2, 2), "material": STIFF}
     load = {"group": "right", "moment": 1.0}
     for change, words in (
@@ -1006,7 +1006,7 @@ def test_before_the_first_step_a_clamp_has_no_moment(comm: MPI.Comm, shared_tmp:
 
 
 @pytest.mark.parallel
-def test_what_two_handles_hold_one_of_them_bears(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_the_load_of_a_corner_in_two_handles_counts_for_one(comm: MPI.Comm, shared_tmp: Path) -> None:
     """A clamp and a symmetry plane that hold the same corner: the clamp bears the weight, the plane nothing
     within itself.
     """
@@ -1108,7 +1108,7 @@ SCHEMES = ["beuler", "semi-implicit", "alpha2"]
     [(kind, scheme) for kind in ("spin", "noise") for scheme in SCHEMES]
     + [("pressed", scheme) for scheme in ("beuler", "alpha2")],  # one linear solve a step is not enough
 )
-def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
+def test_extreme_cases_give_finite_results(kind: str, scheme: str) -> None:
     """Finite results for edges turning by 230° in a step, a crumpled start, edges pressed together."""
     scene: dict[str, Any] = {
         "mesh": grid(0.4, 0.4, 6, 6, "alternating"),
@@ -1177,7 +1177,7 @@ def test_a_plate_stands_on_another(tmp_path: Path, comm: MPI.Comm) -> None:
     np.testing.assert_allclose(2.0 * fine - coarse, exact, rtol=0.01)  # extrapolated from first order
 
 
-def test_hinges_are_refused_there(tmp_path: Path) -> None:
+def test_hinges_are_refused_where_three_plates_meet(tmp_path: Path) -> None:
     content = {"mesh": t_frame(tmp_path / "frame.obj", 2), "material": CLOTH | {"bending": 1e-4}}
     with pytest.raises(InputError, match=r"more than two triangles: vertices \d+-\d+ in .* midedge"):
         Run(MPI.COMM_SELF, scene_of(content))

@@ -16,7 +16,7 @@ from lyra_petsc.terms.midedge import NO_FRICTION
 from lyra_petsc.terms.remembered import Remembered, unwritable
 
 
-def test_a_function_is_called_where_it_was_not_called_last() -> None:
+def test_a_function_is_called_again_for_other_arguments_only() -> None:
     calls = []
 
     def double(x: np.ndarray) -> np.ndarray:

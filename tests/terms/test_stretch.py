@@ -1,4 +1,4 @@
-"""Principal stretches against the singular values of the deformation gradients."""
+"""Principal stretches compared with singular values of deformation gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def singular_values(x: np.ndarray, stencil: np.ndarray, inverse: np.ndarray) -> 
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_as_numpys_singular_values(seed: int) -> None:
+def test_stretches_are_singular_values(seed: int) -> None:
     random = np.random.default_rng(seed)
     x = random.standard_normal((60, 3))
     stencil = np.array([random.choice(60, 3, replace=False) for _ in range(200)], dtype=np.int32)
@@ -45,7 +45,7 @@ def test_rotations_and_uniform_stretches() -> None:
     np.testing.assert_allclose(principal_stretches(x, stencil, np.eye(2)[None], 1), [[0.5, 2.0]])
 
 
-def test_the_model_softens_where_its_stress_turns() -> None:
+def test_softening_starts_at_the_maximum_of_the_compressive_stress() -> None:
     stretch = np.linspace(0.5, 0.65, 150_001)
     stress = stretch * (stretch**2 - 1.0)
     assert stretch[np.argmin(stress)] == pytest.approx(SOFTENS_BELOW, abs=1e-6)
