@@ -230,7 +230,7 @@ class EnergyGuard:
         for term in system.active.pushing:
             for x, time in ((x0, system.t0), (x1, system.t1)):
                 work += 0.5 * term.work(x, time, system.t0, system.t1)
-        turning = [term for term in self._targets if term not in system.active.pushing]
+        turning = [t for t in self._targets if t.n_elements and t not in system.active.pushing]
         first = self._frozen(turning, system.t0, x0)
         last = self._frozen(turning, system.t1, x1)
         for term in turning:

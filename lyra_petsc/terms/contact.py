@@ -242,9 +242,14 @@ class Obstacles:
         self.moving = any(obstacle.motion is not None for obstacle in obstacles)
         self._first = np.array(begins, dtype=np.int64)
         self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
+        self._fixed_positions: Array | None = None
+        if not self.moving:
+            self._fixed_positions = self.positions(0.0)
 
     def positions(self, time: float) -> Array:
         """Points and normals (m, 3) at a time [s]."""
+        if self._fixed_positions is not None:
+            return self._fixed_positions
         rows = [np.empty((0, 3))]
         for obstacle in self.each:
             rows.append(obstacle.positions(time))
