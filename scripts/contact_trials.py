@@ -281,7 +281,7 @@ def measure(scene: Scene) -> dict[str, float]:
     try:
         while not simulation.finished:
             simulation.step()
-            gap = min(gap, simulation.ledger.columns()["smallest_gap"])
+            gap = min(gap, simulation.energy_balance.columns()["smallest_gap"])
             if simulation.time < MEASURE_FROM * scene.time.end * (1.0 + 1e-9):
                 late = system.x.copy(), system.v.copy()
     except SolverError as trouble:

@@ -158,13 +158,13 @@ class Simulation:
         self.comm = comm
         self.problem: Problem = build_problem(comm, self.scene, Phases())
         self.system = self.problem.system
-        outline = self.problem.outline
+        whole = self.problem.whole
         self.stepper = Stepper(
             self.scene,
             self.system,
             self.problem.surface,
-            outline.spacing,
-            residual_roundoff(self.system, outline.largest_coordinate),
+            whole.spacing,
+            residual_roundoff(self.system, whole.largest_coordinate),
         )
         self.stepper.start(0.0, 0)
         self.time = 0.0

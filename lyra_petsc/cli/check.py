@@ -58,7 +58,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
 
 def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     problem, scene, control = simulation.problem, simulation.scene, simulation.control
-    outline = problem.outline
+    whole = problem.whole
     blocks = int(ranks[:, 2].sum())
     time = scene.time
     if time.static:
@@ -80,9 +80,9 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
         ("scene", one_line(f"{path}" + (f" ({scene.title})" if scene.title else ""))),
-        ("mesh", f"{outline.n_vertices} vertices, {outline.n_triangles} triangles"),
-        ("mean edge", f"{outline.spacing:.4g} m"),
-        ("active terms", ", ".join(outline.terms)),
+        ("mesh", f"{whole.n_vertices} vertices, {whole.n_triangles} triangles"),
+        ("mean edge", f"{whole.spacing:.4g} m"),
+        ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
         *_contact(scene),
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),

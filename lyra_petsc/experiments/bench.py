@@ -137,7 +137,7 @@ class Trial:
                 problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
                 problem.system.active.refreeze({term: term.frames})
-        self.simulation.ledger.measure()  # the next step compares its energies with these
+        self.simulation.energy_balance.measure()  # the next step compares its energies with these
 
     def sum_over_ranks(self, owned: Array) -> float:
         """Sum over all ranks of this rank's values; collective."""

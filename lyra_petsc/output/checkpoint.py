@@ -78,7 +78,7 @@ def checkpoint_file(
     order : FileOrder
         File order of the vertices that each rank owns; collective over its ranks.
     arrays : mapping of str to (n_owned, ...) array of float64 or int64
-        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's memory.
+        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
     edge_order : FileOrder or None
         File order of the edges with an unknown that each rank owns; None without such edges.
     edge_arrays : mapping of str to (n_edges,) array of float64

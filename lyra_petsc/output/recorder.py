@@ -33,7 +33,7 @@ from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, dump_scene, scene_changes
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping import term_memory
+from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 MAX_LISTED_CHANGES = 12
@@ -78,7 +78,7 @@ class Recorder:
         if any(field.on == "triangle" for field in self._fields):
             elements = problem.membrane.elements
             own = elements.index[: elements.n_owned].astype(np.int64)
-            self._triangles = FileOrder(points.comm, own, problem.outline.n_triangles)
+            self._triangles = FileOrder(points.comm, own, problem.whole.n_triangles)
         self._comm = points.comm
         self._background = Background(points.comm)
         self._last_checkpoint = clock.monotonic()
@@ -150,13 +150,13 @@ class Recorder:
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         """Restore the simulation from a checkpoint."""
-        simulation, memory = self._simulation, checkpoint.scalars
+        simulation, scalars = self._simulation, checkpoint.scalars
         system, layout = simulation.problem.system, simulation.problem.points
         arrays = {
             name: layout.join(values, checkpoint.edges.get(name))
             for name, values in checkpoint.arrays.items()
         }
-        for number, start in enumerate(memory["late_starts"]):
+        for number, start in enumerate(scalars["late_starts"]):
             system.reference.restore(float(start), arrays[f"start_{number}"])
         system.state.set(arrays["position"], arrays["velocity"])
         terms = simulation.problem.terms
@@ -165,8 +165,8 @@ class Recorder:
             for name, rows in checkpoint.elements.items()
             if name in terms
         }
-        simulation.resume(memory, arrays, checkpoint.edges, elements)
-        int(memory["last_state"])  # a bad entry must raise here, where `resume` catches it
+        simulation.resume(scalars, arrays, checkpoint.edges, elements)
+        int(scalars["last_state"])  # a bad entry must raise here, where `resume` catches it
 
     def _changing_elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
         """Changing elements from a checkpoint's rows (E, n + m).
@@ -222,7 +222,7 @@ class Recorder:
     def _table_columns(self) -> dict[str, tuple[str, ...]]:
         """Columns of each table that the scene requests, by file name."""
         scene, system = self._simulation.scene, self._simulation.problem.system
-        term_columns = tuple(self._simulation.ledger.column_names)
+        term_columns = tuple(self._simulation.energy_balance.column_names)
         tables: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *term_columns)}
         if scene.probes:
             tables["probes.csv"] = vector_columns(list(scene.probes))
@@ -241,7 +241,7 @@ class Recorder:
             folder,
             self._vertices,
             self._triangles,
-            n_triangles=self._simulation.problem.outline.n_triangles,
+            n_triangles=self._simulation.problem.whole.n_triangles,
             resume_after=resume_after,
             vtkhdf=self._simulation.scene.output.vtkhdf,
             background=self._background,
@@ -286,19 +286,19 @@ class Recorder:
             "potential_energy": budget.potential,
             "external_work": budget.external_work,
             "dissipation": budget.dissipation,
-            **self._simulation.ledger.columns(),
+            **self._simulation.energy_balance.columns(),
         }
-        rows, ledger = {"history.csv": [history]}, self._simulation.ledger
+        rows, energy_balance = {"history.csv": [history]}, self._simulation.energy_balance
         if "probes.csv" in self._tables:
             means = {f"{name}_": mean for name, mean in self._probe_means().items()}
             rows["probes.csv"] = [self._vector_row(report, means)]
         if "reactions.csv" in self._tables:
-            handle_forces = ledger.handle_forces(len(self._simulation.scene.handles))
+            handle_forces = energy_balance.handle_forces(len(self._simulation.scene.handles))
             forces = {f"handle{n}_": force for n, force in enumerate(handle_forces)}
-            moments = {f"handle{n}_m": moment for n, moment in ledger.handle_moments().items()}
+            moments = {f"handle{n}_m": moment for n, moment in energy_balance.handle_moments().items()}
             rows["reactions.csv"] = [self._vector_row(report, forces | moments)]
         if names := list(self._simulation.scene.obstacles or {}):
-            loads = zip(names, ledger.obstacle_forces(len(names)), strict=True)
+            loads = zip(names, energy_balance.obstacle_forces(len(names)), strict=True)
             rows["obstacles.csv"] = [_obstacle_row(report, *each) for each in loads]
 
         def work() -> bool:
@@ -361,19 +361,19 @@ class Recorder:
         simulation = self._simulation
         system, layout = simulation.problem.system, simulation.problem.points
         n = layout.n_owned
-        rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
+        rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.checkpoint_arrays()}
         for number, start in enumerate(sorted(system.reference.late)):
             rows[f"start_{number}"] = system.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()}
-        arrays |= term_memory.vertex_arrays(system)
+        arrays |= term_states.vertex_arrays(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= term_memory.edge_arrays(system)
-        scalars = simulation.memory() | {
+        edges |= term_states.edge_arrays(system)
+        scalars = simulation.checkpoint_scalars() | {
             "last_state": last_state,
             "scheme": simulation.scene.time.scheme,
         }
         began = clock.monotonic()
-        elements = term_memory.element_arrays(system)
+        elements = term_states.element_arrays(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
@@ -392,7 +392,7 @@ class Recorder:
         write_failure(
             self._folder,
             self._vertices,
-            simulation.problem.outline.n_triangles,
+            simulation.problem.whole.n_triangles,
             simulation.step_number,
             (FailureState(failure.time, system.x[:n], before), FailureState(stuck.time, position, failing)),
             failure.text,

@@ -77,17 +77,17 @@ class Blend:
         self.value = min(1.0, larger)
         return True
 
-    def memory(self) -> dict[str, float]:
+    def saved_state(self) -> dict[str, float]:
         """Entries of a checkpoint, for `restore`."""
         return {"blend": self.value, "too_little": self._too_little, "enough": self._enough}
 
-    def restore(self, memory: Mapping[str, float]) -> None:
-        """Continue from a memory; older ones have the weight only."""
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`; older ones have the weight only."""
         if not self._adaptive:
             return
-        self.value = float(memory.get("blend", self.value))
-        self._too_little = float(memory.get("too_little", self._too_little))
-        self._enough = float(memory.get("enough", self._enough))
+        self.value = float(saved.get("blend", self.value))
+        self._too_little = float(saved.get("too_little", self._too_little))
+        self._enough = float(saved.get("enough", self._enough))
 
     @staticmethod
     def _bisect(low: float, high: float) -> float:

@@ -84,7 +84,7 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
-class Ledger:
+class EnergyBalance:
     """Accumulates the budget over the steps; collective.
 
     Attributes
@@ -141,7 +141,7 @@ class Ledger:
         return budget
 
     def snapshot(self) -> tuple[Budget, float]:
-        """Copy of the ledger's state, for `revert`."""
+        """Copy of the state, for `revert`."""
         return replace(self.budget, more=dict(self.budget.more)), self._target_energy
 
     def revert(self, snapshot: tuple[Budget, float]) -> None:
@@ -207,12 +207,12 @@ class Ledger:
         system.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat
 
-    def memory(self) -> tuple[dict[str, Array], dict[str, Any]]:
+    def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""
         return ({} if self._pull is None else {"pull": self._pull}), asdict(self.budget)
 
     def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
-        """Restore works from a checkpoint's memory; energies are measured at the present state."""
+        """Restore works from a checkpoint; energies are measured at the present state."""
         for name, value in budget.items():
             if name != "more":
                 setattr(self.budget, name, float(value))

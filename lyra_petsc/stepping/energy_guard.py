@@ -155,8 +155,8 @@ class EnergyGuard:
     # -- a step ------------------------------------------------------------------------------------
 
     def balance(self, x0: Array, v0: Array, before: Budget, after: Budget, works: Works) -> Balance:
-        """Balance of the step just taken from x0, v0 (n_local, 3), by the ledger's energies before and after
-        it and its works; collective.
+        """Balance of the step just taken from x0, v0 (n_local, 3), by the energies before and after it and
+        its works; collective.
         """
         system = self._system
         layout, n = system.points, system.points.n_owned
@@ -168,7 +168,7 @@ class EnergyGuard:
         change = kinetic_energy(system.mass, v1[:n] - v0[:n])
         moved = x1[:n] - x0[:n]
         works, extra_heat = self._with_least_heat(x0, x1, works)
-        # kinetic energies of prescribed coordinates, which the ledger's include
+        # kinetic energies of prescribed coordinates, which the budget includes
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
         work = self._load_work(x0, v0, x1, v1, moved)
         work += self._handle_work(x0, x1, moved, works)
@@ -393,13 +393,13 @@ class EnergyGuard:
 
     # -- checkpoints -------------------------------------------------------------------------------
 
-    def memory(self) -> dict[str, Any]:
+    def saved_state(self) -> dict[str, Any]:
         """Entry of a checkpoint."""
         return asdict(self.gains)
 
-    def restore(self, memory: Mapping[str, Any], *, same: bool) -> None:
-        """Restore a checkpoint's memory; without its gains if the integrator is another (not ``same``)."""
-        self.gains = GuardState(**memory)
+    def restore(self, saved: Mapping[str, Any], *, same: bool) -> None:
+        """Restore a `saved_state`; without its gains if the integrator is another (not ``same``)."""
+        self.gains = GuardState(**saved)
         if not same:
             self.gains.total, self.gains.recent = 0.0, []
 

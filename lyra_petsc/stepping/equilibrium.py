@@ -437,26 +437,26 @@ class Equilibrium:
             note += f"friction is known to {100.0 * lag:.1g} % of what normal forces allow"
         return EquilibriumReport(found, newton, linear, note)
 
-    def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
+    def saved_state(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at the equilibrium at ``factor``; collective."""
         self._extrapolation.record(factor, self._system.x[: self._system.points.n_owned].copy())
-        arrays, past = self._extrapolation.memory()
+        arrays, past = self._extrapolation.saved_state()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._last_pseudo_dt}
-        numbers |= self._friction.memory()
+        numbers |= self._friction.saved_state()
         if self._tangent is not None:
             arrays["rate"] = self._tangent
         return arrays, numbers | {"extrapolation": past}
 
-    def restore(self, arrays: Mapping[str, Array], memory: Mapping[str, Any], factor: float) -> None:
-        """Continue from a memory; that of older checkpoints is empty."""
-        self._scale = float(memory.get("scale", self._scale))
-        self._in_vain = int(memory.get("in_vain", self._in_vain))
-        self._friction.restore(memory)
-        self._last_pseudo_dt = float(memory.get("sufficed", self._last_pseudo_dt))
+    def restore(self, arrays: Mapping[str, Array], saved: Mapping[str, Any], factor: float) -> None:
+        """Restore a `saved_state`; that of older checkpoints is empty."""
+        self._scale = float(saved.get("scale", self._scale))
+        self._in_vain = int(saved.get("in_vain", self._in_vain))
+        self._friction.restore(saved)
+        self._last_pseudo_dt = float(saved.get("sufficed", self._last_pseudo_dt))
         self._last_factor = factor
         self._tangent = np.array(arrays["rate"]) if "rate" in arrays else None
         x = self._system.x[: self._system.points.n_owned].copy()
-        self._extrapolation.restore(arrays, memory.get("extrapolation", {}), factor, x)
+        self._extrapolation.restore(arrays, saved.get("extrapolation", {}), factor, x)
 
     @property
     def in_vain(self) -> bool:

@@ -64,7 +64,7 @@ class Extrapolation:
         self._times = [*self._times[-MAX_DEGREE:], t0]
         self._values = [*self._values[-MAX_DEGREE:], v]
 
-    def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
+    def saved_state(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Arrays (n, 3) and numbers of a checkpoint, for `restore`, without the newest velocities."""
         past = list(zip(self._times[:-1], self._values[:-1], strict=True))
         arrays = {f"past_{number}": value for number, (_, value) in enumerate(past)}
@@ -73,7 +73,7 @@ class Extrapolation:
         }
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float], t0: float, v: Array) -> None:
-        """Continue from a memory, empty in old checkpoints, and velocities v (n, 3) [m/s] at t0 [s]."""
+        """Restore a `saved_state`, empty in old checkpoints, and velocities v (n, 3) [m/s] at t0 [s]."""
         names = sorted(name for name in numbers if name.startswith("past_") and name in arrays)
         if not names:
             return

@@ -70,14 +70,14 @@ class FrictionBalance:
     def in_vain(self) -> bool:
         return self._sliding_steps >= MAX_SLIDING
 
-    def memory(self) -> dict[str, Any]:
+    def saved_state(self) -> dict[str, Any]:
         """Entries of a checkpoint, for `restore`."""
         return {"slid": self._sliding_steps, "slid_in": self._sliding_increment}
 
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Continue from a memory; that of older checkpoints is empty."""
-        self._sliding_steps = int(memory.get("slid", self._sliding_steps))
-        self._sliding_increment = float(memory.get("slid_in", self._sliding_increment))
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Restore a `saved_state`; that of older checkpoints is empty."""
+        self._sliding_steps = int(saved.get("slid", self._sliding_steps))
+        self._sliding_increment = float(saved.get("slid_in", self._sliding_increment))
 
     def _sums(self) -> tuple[float, str]:
         """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""

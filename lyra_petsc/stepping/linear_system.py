@@ -55,13 +55,13 @@ class DiagonalShift:
         """Fraction by which diagonal blocks are to be larger; 0 where nothing is factored incompletely."""
         return self._value if self._acts and is_incomplete(self._ksp.getPC()) else 0.0
 
-    def memory(self) -> dict[str, float]:
+    def saved_state(self) -> dict[str, float]:
         """Entries of a checkpoint, for `restore`."""
         return {"shift": self._value}
 
-    def restore(self, memory: Mapping[str, float]) -> None:
-        """Continue from a memory."""
-        self._value = float(memory.get("shift", self._value))
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`."""
+        self._value = float(saved.get("shift", self._value))
 
     def decrease(self) -> None:
         """Try a slightly smaller shift in a new step."""

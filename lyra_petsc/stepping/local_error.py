@@ -67,11 +67,11 @@ class LocalError:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
 
-    def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
+    def saved_state(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""
         return ({} if self._slope is None else {"slope": self._slope}), {"slope_dt": self._dt}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
-        """Restore a checkpoint's memory."""
+        """Restore a `saved_state`."""
         self._slope = arrays.get("slope")
         self._dt = float(numbers.get("slope_dt", 0.0))

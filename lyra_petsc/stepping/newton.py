@@ -371,23 +371,23 @@ class Newton:
         spent = self.linear_iterations - self.contact_iterations
         return self.convergence.test(snes, iteration, norms[2], spent)
 
-    def memory(self) -> dict[str, float]:
+    def saved_state(self) -> dict[str, float]:
         """What a checkpoint must hold for the next steps to be solved as they would be."""
         return {
             "convex": self._convex_at_start,
             "tolerance": self.forcing.tolerance,
             "usual": self.convergence.mean_iterations,
-            **self._blend.memory(),
-            **self._linear.shift.memory(),
+            **self._blend.saved_state(),
+            **self._linear.shift.saved_state(),
         }
 
-    def restore(self, memory: Mapping[str, float]) -> None:
-        """Continue from a memory; entries that older checkpoints lack keep their defaults."""
-        self._convex_at_start = bool(memory.get("convex", self._convex_at_start))
-        self.forcing.tolerance = float(memory.get("tolerance", self.forcing.tolerance))
-        self.convergence.mean_iterations = float(memory.get("usual", self.convergence.mean_iterations))
-        self._blend.restore(memory)
-        self._linear.shift.restore(memory)
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`; entries that older checkpoints lack keep their defaults."""
+        self._convex_at_start = bool(saved.get("convex", self._convex_at_start))
+        self.forcing.tolerance = float(saved.get("tolerance", self.forcing.tolerance))
+        self.convergence.mean_iterations = float(saved.get("usual", self.convergence.mean_iterations))
+        self._blend.restore(saved)
+        self._linear.shift.restore(saved)
 
     @property
     def linear_iterations(self) -> int:

@@ -55,7 +55,7 @@ would be thrown apart.
 
 
 @dataclass
-class Outline:
+class WholeProblem:
     """Properties of the whole problem that every rank knows."""
 
     n_vertices: int
@@ -78,7 +78,7 @@ class Problem:
 
     Attributes
     ----------
-    scene, outline
+    scene, whole
     discretisation : Discretisation
     terms : dict of name → Term
         The active terms.
@@ -97,7 +97,7 @@ class Problem:
     """
 
     scene: Scene
-    outline: Outline
+    whole: WholeProblem
     discretisation: Discretisation
     terms: dict[str, Term]
     system: StageEquations
@@ -141,23 +141,23 @@ def build_problem(
     InputError
         On all ranks, if the scene or its meshes cannot be simulated.
     """
-    whole: GlobalMesh | None = None
+    global_mesh: GlobalMesh | None = None
     mesh: Mesh | None = None
 
-    def prepare() -> Outline:
-        nonlocal whole, mesh
+    def prepare() -> WholeProblem:
+        nonlocal global_mesh, mesh
         mesh = known or build_scene_mesh(scene, phases.report)
-        outline, whole = _prepare(scene, mesh)
-        whole.owner = owner
-        return outline
+        whole, global_mesh = _prepare(scene, mesh)
+        global_mesh.owner = owner
+        return whole
 
     with phases("mesh"):
-        outline = on_root(comm, prepare)
+        whole = on_root(comm, prepare)
     with phases("partition"):
-        part = distribute(comm, whole)
-        whole = None
+        part = distribute(comm, global_mesh)
+        global_mesh = None
     with phases("assembly"):
-        problem = _build_local(scene, outline, part, mesh)
+        problem = _build_local(scene, whole, part, mesh)
         del part
         _trim_heap()
         return problem
@@ -183,7 +183,7 @@ def event_times(scene: Scene) -> list[float]:
     return [*(t for window in windows for t in window.events()), *jumps]
 
 
-def _prepare(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
+def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     """Compute everything that is to be distributed (on rank 0)."""
     rest = RestShape(scene, mesh)
     massless = np.flatnonzero(~(rest.mass > 0.0))
@@ -226,16 +226,16 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
-    places = None
+    positions = None
     if scene.contact is not None:
         from lyra_petsc.mesh.obstacles import build_obstacles
         from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
-        places = data.get("start", mesh.positions)
-        refuse_crossings(scene, mesh, places, build_obstacles(scene, mesh.obstacles, Motion))
+        positions = data.get("start", mesh.positions)
+        refuse_crossings(scene, mesh, positions, build_obstacles(scene, mesh.obstacles, Motion))
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
-    outline = Outline(
+    whole = WholeProblem(
         n_vertices=mesh.n_vertices,
         n_triangles=mesh.n_triangles,
         spacing=spacing,
@@ -248,7 +248,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[Outline, GlobalMesh]:
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
-    return outline, GlobalMesh(mesh.n_vertices, mesh.triangles, elements, data, edges, positions=places)
+    return whole, GlobalMesh(mesh.n_vertices, mesh.triangles, elements, data, edges, positions=positions)
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
@@ -317,10 +317,10 @@ def _barrier(rest: RestShape) -> Barrier | None:
 
 
 def _set_up_contact(
-    scene: Scene, outline: Outline, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
+    scene: Scene, whole: WholeProblem, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
 ) -> None:
     """Pass the obstacles to the contact and friction terms; collective."""
-    if outline.barrier is None or scene.contact is None:
+    if whole.barrier is None or scene.contact is None:
         return
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
     from lyra_petsc.terms.contact import ContactBarrier
@@ -328,20 +328,18 @@ def _set_up_contact(
     obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
     self_contact, static = scene.contact.self, scene.time.static
-    contact.set_up(outline.barrier, obstacles, self_contact=self_contact, static=static)
+    contact.set_up(whole.barrier, obstacles, self_contact=self_contact, static=static)
     if "friction" in terms:
         from lyra_petsc.terms.friction import CoulombFriction
 
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 
 
-def _build_local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | None) -> Problem:
+def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
-    terms = {
-        n: make_term(registration_of(n), part.elements.get(n), scene, on_vertices) for n in outline.terms
-    }
-    _set_up_contact(scene, outline, terms, layout, mesh)
+    terms = {n: make_term(registration_of(n), part.elements.get(n), scene, on_vertices) for n in whole.terms}
+    _set_up_contact(scene, whole, terms, layout, mesh)
     for term in terms.values():
         if isinstance(term, (Elastic, Load)):
             term.connect(terms.values())
@@ -391,11 +389,11 @@ def _build_local(scene: Scene, outline: Outline, part: LocalMesh, mesh: Mesh | N
     for term in system.active.elastic:
         term.initialise(system.x)
     system.hold_targets(0.0)
-    refuse_contact(system, scene, "at the start", TOO_NEAR * outline.barrier.gap if outline.barrier else 0.0)
+    refuse_contact(system, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)
     probes = {name: _owned_vertices(part, f"probe {name}") for name in scene.probes}
     return Problem(
         scene,
-        outline,
+        whole,
         discretisation,
         terms,
         system,

@@ -1,7 +1,7 @@
 """Derivatives of a simulation with respect to numbers of its scene, by the tangent equations.
 
 Every integrator solves G(V; z_n, p) = 0 for the velocities V of a stage, where z_n is the state at the start
-of the step: positions, velocities and the integrator's memory. The end z_{n+1} is linear in V and z_n::
+of the step: positions, velocities and the integrator's history. The end z_{n+1} is linear in V and z_n::
 
     ∂G/∂V V' = −(∂G/∂z z_n' + ∂G/∂p)        z_{n+1}' = ∂z_{n+1}/∂V V' + ∂z_{n+1}/∂z_n z_n'
 
@@ -35,7 +35,7 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.energy_balance import Ledger
+from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.equilibrium import MAX_GROWTH
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
@@ -84,11 +84,11 @@ class Number:
 
 @dataclass
 class Tangent:
-    """Derivatives of positions, velocities (n_owned, 3) and memory with respect to one number."""
+    """Derivatives of positions, velocities (n_owned, 3) and history with respect to one number."""
 
     x: Array
     v: Array
-    memory: dict[str, Array] = field(default_factory=dict)
+    history: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass
@@ -98,7 +98,7 @@ class Neighbour:
     offset: float
     weight: float
     problem: Problem
-    ledger: Ledger | None = None
+    energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
 
     @property
@@ -112,12 +112,12 @@ Neighbours = list[Neighbour]
 
 @dataclass(frozen=True)
 class _StepStart:
-    """Time, state and memory at the start of a step."""
+    """Time, state and history at the start of a step."""
 
     time: float
     x: Array
     v: Array
-    memory: dict[str, Array]
+    history: dict[str, Array]
     numbers: dict[str, float]
     frames: list[Frames]
 
@@ -221,7 +221,7 @@ class Sensitivities:
                 if self._system.applied.unbalanced is not None:
                     system.applied.unbalanced = -system.out_of_balance()[0]
             if reactions:
-                neighbour.ledger = Ledger(system)
+                neighbour.energy_balance = EnergyBalance(system)
         self.tangents.append(tangent)
 
     def _solve_initial_edges(self) -> None:
@@ -262,10 +262,10 @@ class Sensitivities:
         """
         simulation, system = self.simulation, self._system
         n = system.points.n_owned
-        memory, numbers = system.integrator.memory()
+        history, numbers = system.integrator.saved_state()
         frames = [term.frames for term in _edged(system)]
         before = _StepStart(
-            simulation.time, system.x[:n].copy(), system.v[:n].copy(), dict(memory), dict(numbers), frames
+            simulation.time, system.x[:n].copy(), system.v[:n].copy(), dict(history), dict(numbers), frames
         )
         report = simulation.step()
         if self._static:
@@ -288,8 +288,8 @@ class Sensitivities:
             self._differentiate_edges(before)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
-                if each.ledger is not None:
-                    each.ledger.record(before.x + each.offset * delta * tangent.x)
+                if each.energy_balance is not None:
+                    each.energy_balance.record(before.x + each.offset * delta * tangent.x)
             self._update_tangent(tangent, neighbours, delta)
             for each in neighbours:
                 each.system.set_references(end)
@@ -300,10 +300,10 @@ class Sensitivities:
         """Begin the step that the simulation has taken with a neighbour."""
         system, change = each.system, each.offset * delta
         system.state.set(before.x + change * tangent.x, before.v + change * tangent.v)
-        memory = {
-            name: values + change * tangent.memory.get(name, 0.0) for name, values in before.memory.items()
+        history = {
+            name: values + change * tangent.history.get(name, 0.0) for name, values in before.history.items()
         }
-        system.integrator.restore(memory, before.numbers)
+        system.integrator.restore(history, before.numbers)
         for term, frames in zip(_edged(system), before.frames, strict=True):
             term.frames = frames
             term.initialise(system.x)
@@ -369,8 +369,8 @@ class Sensitivities:
             self._change_frames(each.system)
         tangent.x = _difference(neighbours, delta, lambda each: each.system.x[:n])
         tangent.v = _difference(neighbours, delta, lambda each: each.system.v[:n])
-        names = neighbours[0].system.integrator.memory()[0].keys()
-        tangent.memory = {
+        names = neighbours[0].system.integrator.saved_state()[0].keys()
+        tangent.history = {
             name: _difference(neighbours, delta, partial(_memory_array, name)) for name in names
         }
 
@@ -439,9 +439,9 @@ class Sensitivities:
                 tangent.x = self._solve_affine(lambda r: reach * solve(r), forces, prescribed, delta)
                 self._force_derivative(now, neighbours, delta, tangent.x)
                 for each in neighbours:
-                    if each.ledger is not None:
+                    if each.energy_balance is not None:
                         each.system.evaluate_at_start()
-                        each.ledger.record(now.x)
+                        each.energy_balance.record(now.x)
                     each.system.set_references(now.factor)
         integrator.pseudo_dt = pseudo
         system.begin_step(now.before, now.factor)
@@ -466,7 +466,7 @@ class Sensitivities:
         system = self._system
         loads, mass = np.linalg.norm(system.applied.force), system.mass.sum()
         force, total = system.points.global_sum(float(loads) ** 2, float(mass))
-        return math.sqrt(self.simulation.problem.outline.size * total / math.sqrt(force)) if force else 1.0
+        return math.sqrt(self.simulation.problem.whole.size * total / math.sqrt(force)) if force else 1.0
 
     # -- linear equations --------------------------------------------------------------------------
 
@@ -542,13 +542,13 @@ class Sensitivities:
 
     # -- what comes out ----------------------------------------------------------------------------
 
-    def derivatives(self, quantity: Callable[[Problem, Ledger | None], Array]) -> Array:
+    def derivatives(self, quantity: Callable[[Problem, EnergyBalance | None], Array]) -> Array:
         """Derivatives (m, n) of a quantity (m,) of the present state with respect to the n numbers.
 
         Parameters
         ----------
         quantity : callable
-            Takes a problem at its state, and its ledger if reactions are needed; collective.
+            Takes a problem at its state, and its energy balance if reactions are needed; collective.
         """
         n, columns = self._system.points.n_owned, []
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
@@ -558,7 +558,7 @@ class Sensitivities:
                 system.state.set(
                     self._system.x[:n] + change * tangent.x, self._system.v[:n] + change * tangent.v
                 )
-                return np.asarray(quantity(each.problem, each.ledger))
+                return np.asarray(quantity(each.problem, each.energy_balance))
 
             columns.append(_difference(neighbours, delta, value))
         return np.stack(columns, axis=1)
@@ -573,8 +573,8 @@ def _difference(neighbours: Neighbours, delta: float, of: Callable[[Neighbour], 
 
 
 def _memory_array(name: str, each: Neighbour) -> Array:
-    """The array ``name`` of the integrator's memory."""
-    return each.system.integrator.memory()[0][name]
+    """The array ``name`` of the integrator's history."""
+    return each.system.integrator.saved_state()[0][name]
 
 
 def _drop_roundoff(values: Array, base: Array, delta: float) -> None:

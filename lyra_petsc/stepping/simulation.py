@@ -21,9 +21,9 @@ from lyra_petsc.linear.refused_options import check_options, check_size
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping import term_memory
+from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.compression_watch import CompressionWatch
-from lyra_petsc.stepping.energy_balance import Budget, Ledger
+from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, contact_advice, failure_kind
@@ -154,18 +154,18 @@ class SteppedScene:
 
     def _set_up(self, scene: Scene) -> None:
         self.problem: Problem = build_problem(self.comm, scene, self.phases, self._mesh)
-        self.notes, self.earlier_notes = list(self.problem.outline.notes), 0
-        outline, system = self.problem.outline, self.problem.system
+        self.notes, self.earlier_notes = list(self.problem.whole.notes), 0
+        whole, system = self.problem.whole, self.problem.system
         check_size(self.problem.points.n_unknowns)
         with self.phases("solve"):
-            floor = residual_roundoff(system, outline.largest_coordinate)
+            floor = residual_roundoff(system, whole.largest_coordinate)
             if not math.isfinite(floor):
                 raise InputError(
                     "stiffness times size overflows; give smaller numbers or another unit of length",
                     file=scene.source,
                     key="material",
                 )
-            self.stepper = Stepper(scene, system, self.problem.surface, outline.spacing, floor)
+            self.stepper = Stepper(scene, system, self.problem.surface, whole.spacing, floor)
         self.roundoff = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
@@ -195,10 +195,10 @@ class SteppedScene:
                 term.initialise(system.x)
         self._equilibrium: Equilibrium | None = None
         if scene.time.static:
-            sizes = outline.spacing, outline.size, floor
+            sizes = whole.spacing, whole.size, floor
             self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
         self._scene_integrator = system.integrator
-        self.ledger = Ledger(system)
+        self.energy_balance = EnergyBalance(system)
         self.guard = EnergyGuard(system) if system.integrator.dynamic else None
 
     def _create_control(self, step: float, end: float) -> StepControl:
@@ -241,7 +241,7 @@ class SteppedScene:
     @property
     def budget(self) -> Budget:
         """Energies of the present state and works up to it."""
-        return self.ledger.budget
+        return self.energy_balance.budget
 
     @property
     def finished(self) -> bool:
@@ -271,8 +271,8 @@ class SteppedScene:
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
-            past, past_error = system.integrator.memory(), self.estimated_error
-            past_slope = self.local_error.memory() if self.local_error is not None else None
+            past, past_error = system.integrator.saved_state(), self.estimated_error
+            past_slope = self.local_error.saved_state() if self.local_error is not None else None
             with self.phases("solve"):
                 self.stepper.follow_integrator()
                 attempt = (self._equilibrium or self.stepper).attempt(self.time, end)
@@ -325,7 +325,7 @@ class SteppedScene:
         self.step_number += 1
         with self.phases("balance"):
             if self.guard is None:
-                self.ledger.record(x_before[:n])
+                self.energy_balance.record(x_before[:n])
             when = f"step {self.step_number} ({self._time_text()})"
             note = self.compression.check(when, reported="compression" in self._reported)
         if note:
@@ -378,7 +378,7 @@ class SteppedScene:
         control = self.control
         if self.local_error is None or not isinstance(control, ToleranceControl):
             return True
-        size = self.problem.outline.size
+        size = self.problem.whole.size
         error = self.local_error.estimate(v_before, dt) / size
         share = (self.scene.time.tolerance or 0.0) * dt / control.end
         minimum = self._minimum_dt_in_contact()
@@ -411,20 +411,20 @@ class SteppedScene:
         return min(term.skin for term in system.active.limiting) / max(fastest, 1e-300)
 
     def _conserves_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
-        """Whether the energy guard accepts the step just taken; if so, it is recorded in the ledger."""
+        """Whether the energy guard accepts the step just taken; if so, `energy_balance` records it."""
         if self.guard is None:
             return True
         system = self.problem.system
         with self.phases("balance"):
-            snapshot = self.ledger.snapshot()
-            after = self.ledger.record(x_before[: system.points.n_owned])
-            balance = self.guard.balance(x_before, v_before, snapshot[0], after, self.ledger.works)
+            snapshot = self.energy_balance.snapshot()
+            after = self.energy_balance.record(x_before[: system.points.n_owned])
+            balance = self.guard.balance(x_before, v_before, snapshot[0], after, self.energy_balance.works)
             # short steps of the midpoint rule are judged leniently: backward Euler would not conserve
             # angular momentum as they do
             strict = not system.integrator.exact_work or end - self.time > IMPACT_DT * self.control.step
             accepted = self.guard.accept(balance, strict=strict)
             if not accepted:
-                self.ledger.revert(snapshot)
+                self.energy_balance.revert(snapshot)
             return accepted
 
     def _switch_at_crossing(self, attempt: Attempt, dt: float) -> bool:
@@ -555,7 +555,7 @@ class SteppedScene:
         """Report on the last failed attempt at a step; collective."""
         problem, scene, solve = self.problem, self.scene, attempt.failed_solve
         assert solve is not None
-        system, outline, stepper = problem.system, problem.outline, self.stepper
+        system, whole, stepper = problem.system, problem.whole, self.stepper
         diagnosis = diagnose(
             problem.points, problem.membrane, system.held, solve, system.x, system.mass, problem.tags
         )
@@ -565,7 +565,7 @@ class SteppedScene:
         now = Circumstances(
             dt=end - self.time,
             nominal=self.control.step,
-            spacing=outline.spacing,
+            spacing=whole.spacing,
             floor=self.roundoff,
             max_iterations=stepper.snes.getTolerances()[3],
             iterations_key=self._iterations_key,
@@ -586,51 +586,51 @@ class SteppedScene:
                 # contact forces grow without bounds where parts would cross, so other advice would mislead
                 *(on_contact or advice(diagnosis, solve, scene, now)),
             ],
-            sources=outline.sources,
+            sources=whole.sources,
             failed_solve=solve,
             near=near,
             obstacle=nearest_obstacle(system) if between_sheets else None,
         )
 
-    def memory(self) -> dict[str, Any]:
+    def checkpoint_scalars(self) -> dict[str, Any]:
         """Numbers of a checkpoint, besides positions and velocities, to continue as if never stopped."""
         equilibrium = self._equilibrium
         return {
             "time": self.time,
             "step": self.step_number,
-            "budget": self.ledger.memory()[1],
+            "budget": self.energy_balance.saved_state()[1],
             "totals": dict(self.totals),
             "stability": self.stability,
             "repeated": dict(self._repeats),
             "least": self._smallest_dt if self._repeats else None,
             "notes": list(self.notes),
             "told": sorted(self._reported),
-            **self.control.memory(),
+            **self.control.saved_state(),
             "estimated_error": self.estimated_error,
             "integrator": self._integrator_numbers(),
-            **self.stepper.memory(self.time)[1],
-            **({} if equilibrium is None else {"equilibrium": equilibrium.memory(self.time)[1]}),
-            "energy": None if self.guard is None else self.guard.memory(),
+            **self.stepper.saved_state(self.time)[1],
+            **({} if equilibrium is None else {"equilibrium": equilibrium.saved_state(self.time)[1]}),
+            "energy": None if self.guard is None else self.guard.saved_state(),
             "late_starts": sorted(self.problem.system.reference.late),
         }
 
     def _integrator_numbers(self) -> dict[str, float]:
-        numbers = self.problem.system.integrator.memory()[1]
-        return numbers if self.local_error is None else numbers | self.local_error.memory()[1]
+        numbers = self.problem.system.integrator.saved_state()[1]
+        return numbers if self.local_error is None else numbers | self.local_error.saved_state()[1]
 
-    def arrays(self) -> dict[str, Array]:
+    def checkpoint_arrays(self) -> dict[str, Array]:
         """Arrays (n_owned, 3) of a checkpoint besides positions and velocities."""
-        arrays = dict(self.problem.system.integrator.memory()[0])
-        arrays |= self.ledger.memory()[0] | self.stepper.memory(self.time)[0]
+        arrays = dict(self.problem.system.integrator.saved_state()[0])
+        arrays |= self.energy_balance.saved_state()[0] | self.stepper.saved_state(self.time)[0]
         if self._equilibrium is not None:
-            arrays |= self._equilibrium.memory(self.time)[0]
+            arrays |= self._equilibrium.saved_state(self.time)[0]
         if self.local_error is not None:
-            arrays |= self.local_error.memory()[0]
+            arrays |= self.local_error.saved_state()[0]
         return arrays
 
     def resume(
         self,
-        memory: Mapping[str, Any],
+        scalars: Mapping[str, Any],
         arrays: Mapping[str, Array],
         edges: Mapping[str, Array] = MappingProxyType({}),
         elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
@@ -638,31 +638,31 @@ class SteppedScene:
         """Continue from a checkpoint whose x and v of owned rows are in ``problem.system`` already."""
         system = self.problem.system
         system.state.update_ghosts()
-        term_memory.restore_fixed(system, edges, elements)
-        self.time, self.step_number = float(memory["time"]), int(memory["step"])
+        term_states.restore_fixed(system, edges, elements)
+        self.time, self.step_number = float(scalars["time"]), int(scalars["step"])
         # loads and handles which only the changed scene lets start earlier start now; the others have started
         system.set_references(self.time)
         system.hold_targets(self.time)
         refuse_contact(system, self.scene, f"at {self._time_text()}")
-        self.ledger.restore(arrays, memory["budget"])
-        self.control.restore(memory)
+        self.energy_balance.restore(arrays, scalars["budget"])
+        self.control.restore(scalars)
         if self._equilibrium is not None:
-            self._equilibrium.restore(arrays, memory.get("equilibrium", {}), self.time)
-        self.estimated_error = float(memory["estimated_error"])
-        system.integrator.restore(arrays, memory["integrator"])
-        if self.guard is not None and memory.get("energy"):  # older checkpoints have none
-            same = memory.get("scheme") == self.scene.time.scheme
-            self.guard.restore(memory["energy"], same=same)
+            self._equilibrium.restore(arrays, scalars.get("equilibrium", {}), self.time)
+        self.estimated_error = float(scalars["estimated_error"])
+        system.integrator.restore(arrays, scalars["integrator"])
+        if self.guard is not None and scalars.get("energy"):  # older checkpoints have none
+            same = scalars.get("scheme") == self.scene.time.scheme
+            self.guard.restore(scalars["energy"], same=same)
         if self.local_error is not None:
-            self.local_error.restore(arrays, memory["integrator"])
-        term_memory.restore_changing(system, arrays, elements)
-        self.stepper.restore(arrays, memory, self.time, self.step_number)
-        self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
-        self.stability = self.stability and memory.get("stability", self.stability)
-        self._repeats = {str(why): int(count) for why, count in memory.get("repeated", {}).items()}
-        self._smallest_dt = math.inf if memory.get("least") is None else float(memory["least"])
-        self._reported |= set(memory.get("told", ()))
-        earlier = [str(note) for note in memory.get("notes", ())]
+            self.local_error.restore(arrays, scalars["integrator"])
+        term_states.restore_changing(system, arrays, elements)
+        self.stepper.restore(arrays, scalars, self.time, self.step_number)
+        self.totals |= {name: int(number) for name, number in scalars.get("totals", {}).items()}
+        self.stability = self.stability and scalars.get("stability", self.stability)
+        self._repeats = {str(why): int(count) for why, count in scalars.get("repeated", {}).items()}
+        self._smallest_dt = math.inf if scalars.get("least") is None else float(scalars["least"])
+        self._reported |= set(scalars.get("told", ()))
+        earlier = [str(note) for note in scalars.get("notes", ())]
         self.earlier_notes = len(earlier)
         self.notes[:] = [*earlier, *(note for note in self.notes if note not in earlier)]
 

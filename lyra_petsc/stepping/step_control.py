@@ -119,7 +119,7 @@ class StepControl:
             self.factor = min(1.0, 2.0 * self.factor)
             self.successes = 0
 
-    def memory(self) -> dict[str, float]:
+    def saved_state(self) -> dict[str, float]:
         """Numbers of a checkpoint."""
         return {
             "factor": self.factor,
@@ -128,11 +128,11 @@ class StepControl:
             "nominal": self.step,
         }
 
-    def restore(self, memory: Mapping[str, float]) -> None:
-        """Restore a checkpoint's memory, unless its nominal step is another."""
-        if float(memory.get("nominal", self.step)) == self.step:
-            self.factor, self.successes = float(memory["factor"]), int(memory["good"])
-            self.patience = int(memory.get("patience", GROW_AFTER))
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`, unless its nominal step is another."""
+        if float(saved.get("nominal", self.step)) == self.step:
+            self.factor, self.successes = float(saved["factor"]), int(saved["good"])
+            self.patience = int(saved.get("patience", GROW_AFTER))
 
 
 class ToleranceControl(StepControl):
@@ -177,12 +177,12 @@ class ToleranceControl(StepControl):
     def _halvings(self, dt: float) -> int:
         return 0
 
-    def restore(self, memory: Mapping[str, float]) -> None:
-        """Restore a checkpoint's memory; if its largest step is another, only the length of the next step."""
-        super().restore(memory)
-        nominal = float(memory.get("nominal", self.step))
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`; if its largest step is another, only the length of the next step."""
+        super().restore(saved)
+        nominal = float(saved.get("nominal", self.step))
         if nominal != self.step:
-            planned = float(memory["factor"]) * nominal
+            planned = float(saved["factor"]) * nominal
             self.factor = min(max(planned, self.smallest) / self.step, 1.0)
 
 

@@ -145,17 +145,17 @@ class Stepper:
         if self._system.integrator.iterates == self._iterates:
             return
         time, step = self.ts.getTime(), self.ts.getStepNumber()
-        suspended, memory = self._suspended, self._newton.memory()
+        suspended, saved = self._suspended, self._newton.saved_state()
         self.destroy()
         self._iterates = not self._iterates
         self._blend = Blend(self._hessian)
         if suspended is None:
-            self._suspended, self.presets = (self.presets, memory), self._candidates()
+            self._suspended, self.presets = (self.presets, saved), self._candidates()
         else:
-            self._suspended, (self.presets, memory) = None, suspended
+            self._suspended, (self.presets, saved) = None, suspended
         self._create_objects()
         if suspended is not None:
-            self._newton.restore(memory)
+            self._newton.restore(saved)
         self.start(time, step)
 
     def _create_objects(self) -> None:
@@ -424,21 +424,21 @@ class Stepper:
             return None, "the velocities are not finite"
         return velocity, ""
 
-    def memory(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
+    def saved_state(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at ``time`` [s]; collective."""
         arrays: dict[str, Array] = {}
-        names, newton = self._suspended or (self.presets, self._newton.memory())
+        names, newton = self._suspended or (self.presets, self._newton.saved_state())
         numbers: dict[str, Any] = {"preset": names[0], **newton}
         self.linear.reuse.discard()  # a resumed run has no preconditioner to reuse, and must behave alike
         if not self._iterates or self._suspended is not None:
             self._extrapolation.record(time, self._system.v[: self._shape[0]])
-            arrays, numbers["extrapolation"] = self._extrapolation.memory()
+            arrays, numbers["extrapolation"] = self._extrapolation.saved_state()
         return arrays, numbers
 
     def restore(
         self, arrays: Mapping[str, Array], numbers: Mapping[str, Any], time: float, step: int
     ) -> None:
-        """Restore a checkpoint's memory for the state at ``time`` [s], after ``step`` steps; collective."""
+        """Restore a `saved_state` for the state at ``time`` [s], after ``step`` steps; collective."""
         while numbers["preset"] in self.presets[1:]:
             self.next_preset()
         self._newton.restore(numbers)

@@ -146,14 +146,14 @@ def steps(comm: Comm, job: Result) -> Result:
         if comm.bcast(time.perf_counter() - first > job["seconds"] and len(rows) >= MIN_STEPS):
             break
     _, peak = resident()
-    outline, stepper = simulation.problem.outline, simulation.stepper
+    whole, stepper = simulation.problem.whole, simulation.stepper
     operator, pattern = stepper.linear.operator, simulation.problem.pattern
     # PETSc's own product, with the storage of as many entries
     assembled = AssembledMatrix(simulation.problem.points, pattern, "sbaij")
     assembled.set(operator.rows)
     return {
-        "vertices": outline.n_vertices,
-        "triangles": outline.n_triangles,
+        "vertices": whole.n_vertices,
+        "triangles": whole.n_triangles,
         "integer_bits": 8 * np.dtype(PETSc.IntType).itemsize,
         "build_seconds": built,
         "set_up_seconds": set_up,
@@ -182,7 +182,7 @@ def meshes(comm: Comm, job: Result) -> Result:
         simulation.step()
         simulations[name] = simulation
         found[name] = {
-            "vertices": simulation.problem.outline.n_vertices,
+            "vertices": simulation.problem.whole.n_vertices,
             "preset": simulation.stepper.preset,
             "set_up_cpu": comm.allreduce(time.process_time() - began),
             "steps": [],
@@ -226,7 +226,7 @@ def overhead(comm: Comm, job: Result) -> Result:
             newton += simulation.step().newton_iterations
         rates.append(job["steps"] / (now(comm) - began))
     return {
-        "triangles": simulation.problem.outline.n_triangles,
+        "triangles": simulation.problem.whole.n_triangles,
         "preset": simulation.stepper.preset,
         "newton": newton / (job["steps"] * job["blocks"]),
         "steps_a_second": rates,
@@ -257,7 +257,7 @@ def output(comm: Comm, job: Result) -> Result:
         sizes.append(sum(written))
     recorder.close()
     return {
-        "vertices": simulation.problem.outline.n_vertices,
+        "vertices": simulation.problem.whole.n_vertices,
         "bytes": statistics.median(sizes),
         "states_bytes_a_second": [size / seconds for size, seconds in zip(sizes, ours, strict=True)],
         "plain_bytes_a_second": [size / seconds for size, seconds in zip(sizes, raw, strict=True)],

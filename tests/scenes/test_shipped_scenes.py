@@ -33,7 +33,7 @@ def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
 def test_a_turning_ball_takes_its_cloth_along() -> None:
     with simulated("ball", "mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.01") as simulation:
         x, surface = simulation.problem.system.x, simulation.problem.surface
-        columns = simulation.ledger.columns()
+        columns = simulation.energy_balance.columns()
         crossings = self_crossings(x, surface.triangles.astype(np.int64))
     near = (distance := np.linalg.norm(surface.x[:, :2], axis=1)) < 0.25
     near &= distance > 0.01
@@ -62,7 +62,7 @@ def test_draped_square_hangs_with_its_whole_weight() -> None:
     with simulated(
         "drape", "mesh.size=0.1", "time.step=0.25", "time.end=20", "output.every=20"
     ) as simulation:
-        pull = sum(simulation.ledger.handle_forces(2))
+        pull = sum(simulation.energy_balance.handle_forces(2))
         lowest = simulation.problem.system.x[:, 2].min()
     np.testing.assert_allclose(pull, [0.0, 0.0, 0.187 * 9.81], atol=2e-3)
     assert lowest < -0.9
@@ -83,7 +83,7 @@ def test_spun_corners_stand_opposite_after_half_a_turn() -> None:
 def test_sail_passes_wind_and_weight_on_to_its_handles() -> None:
     with simulated("sail", "mesh.size=0.2", "time.step=0.1", "time.end=20", "output.every=20") as simulation:
         system, scene = simulation.problem.system, simulation.scene
-        pull = sum(simulation.ledger.handle_forces(2))
+        pull = sum(simulation.energy_balance.handle_forces(2))
         membrane = simulation.problem.membrane
         corners = system.x[membrane.stencil]
         area = membrane.elements.data["area"][:, None]
@@ -145,7 +145,7 @@ def test_shell_opens_as_far_as_on_a_finer_mesh() -> None:
 def test_buckled_strip_hangs_between_its_clamps() -> None:
     settings = ("mesh.grid.nx=40", "time.step=0.02", "output.every=2")
     with simulated("buckle", *settings) as simulation:
-        middle, (left, right) = mean_of(simulation, "middle"), simulation.ledger.handle_forces(2)
+        middle, (left, right) = mean_of(simulation, "middle"), simulation.energy_balance.handle_forces(2)
     np.testing.assert_allclose(middle[:2], [0.25, 0.05], atol=1e-3)
     assert -0.4 < middle[2] < -0.3
     assert left[0] > 10.0 > -10.0 > right[0]  # what presses
@@ -155,7 +155,7 @@ def test_buckled_strip_hangs_between_its_clamps() -> None:
 def test_twisted_strip_has_turned_by_half_in_the_middle() -> None:
     settings = ("mesh.grid.nx=50", "mesh.grid.ny=6", "time.step=0.02", "output.every=2")
     with simulated("twist", *settings) as simulation:
-        problem, forces = simulation.problem, simulation.ledger.handle_forces(2)
+        problem, forces = simulation.problem, simulation.energy_balance.handle_forces(2)
         x = problem.system.x[np.argsort(problem.points.mesh_vertices)].reshape(7, 51, 3)
     assert np.linalg.norm(x[3, 25, 1:]) < 0.015
     assert x[6, 25, 1] < -0.02 < 0.02 < x[0, 25, 1]

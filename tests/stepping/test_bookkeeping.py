@@ -32,7 +32,7 @@ def done(comm: MPI.Comm, **content: Any) -> AbstractContextManager[SteppedScene]
 
 def handle_sums(comm: MPI.Comm, handles: list[dict[str, Any]]) -> Array:
     with done(comm, handles=handles, time=STATIC) as simulation:
-        return np.array(simulation.ledger.handle_forces(len(handles)))
+        return np.array(simulation.energy_balance.handle_forces(len(handles)))
 
 
 @pytest.mark.parametrize("stiffness", [None, 40.0])
@@ -83,7 +83,7 @@ def test_first_order_error_estimate_of_free_fall_is_exact(comm: MPI.Comm) -> Non
     """Backward Euler has an error of ½ g Δt² in every step, and the errors add up."""
     time = {"end": 0.2, "step": "auto", "tolerance": 0.02}
     with done(comm, time=time) as simulation:
-        size = simulation.problem.outline.size
+        size = simulation.problem.whole.size
         fallen = shape(simulation)[:, 2]
         error = np.abs(fallen + 0.5 * 9.81 * 0.2**2).max() / size
         assert simulation.estimated_error == pytest.approx(error, rel=0.02)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.energy_balance import Budget, Ledger
+from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -77,12 +77,12 @@ def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: s
     with Simulation(BASE | SCENES[name], comm) as simulation:
         system = simulation.system
         n = system.points.n_owned
-        ledger = Ledger(system)
-        size = max(total(ledger.budget), 0.1)
+        energy_balance = EnergyBalance(system)
+        size = max(total(energy_balance.budget), 0.1)
         for _ in range(10):
-            x, v, old = system.x.copy(), system.v[:n].copy(), Budget(**vars(ledger.budget))
+            x, v, old = system.x.copy(), system.v[:n].copy(), Budget(**vars(energy_balance.budget))
             simulation.step(DT)
-            new = ledger.record(x[:n])
+            new = energy_balance.record(x[:n])
             jump = system.mass[:, None] * (system.v[:n] - v) ** 2
             lost = 0.5 * comm.allreduce(float(jump.sum()))
             heat, work = new.dissipation - old.dissipation, new.external_work - old.external_work
@@ -98,17 +98,17 @@ def test_a_free_sheet_gains_energy_only_by_its_bracket(comm: MPI.Comm, name: str
     with Simulation(BASE | SCENES[name], comm) as simulation:
         system = simulation.system
         n = system.points.n_owned
-        ledger = Ledger(system)
-        first = total(ledger.budget)
+        energy_balance = EnergyBalance(system)
+        first = total(energy_balance.budget)
         fed = 0.0
         for _ in range(10):
             x = system.x.copy()
             simulation.step(DT)
-            ledger.record(x[:n])
+            energy_balance.record(x[:n])
             fed += max(0.0, bracket(simulation, x))
-        assert ledger.budget.external_work == pytest.approx(0.0, abs=1e-12)
-        assert total(ledger.budget) < first + fed
-        assert total(ledger.budget) > 0.0
+        assert energy_balance.budget.external_work == pytest.approx(0.0, abs=1e-12)
+        assert total(energy_balance.budget) < first + fed
+        assert total(energy_balance.budget) > 0.0
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if "clamp" not in name])
@@ -116,13 +116,14 @@ def test_forces_and_reactions_equal_the_change_of_momentum(comm: MPI.Comm, name:
     with Simulation(BASE | SCENES[name], comm) as simulation:
         system = simulation.system
         n = system.points.n_owned
-        ledger = Ledger(system)
+        energy_balance = EnergyBalance(system)
         for _ in range(5):
             x, v = system.x[:n].copy(), system.v[:n].copy()
             simulation.step(DT)
-            ledger.record(x)
+            energy_balance.record(x)
             parts = dict(system.forces_at_stage())
-            outer = ledger.reaction - sum(parts[key] for key in ("loads", "wind", "springs") if key in parts)
+            applied = sum(parts[key] for key in ("loads", "wind", "springs") if key in parts)
+            outer = energy_balance.reaction - applied
             force = comm.allreduce(outer.sum(axis=0))
             momentum = comm.allreduce((system.mass[:, None] * (system.v[:n] - v)).sum(axis=0))
             np.testing.assert_allclose(momentum / DT, force, atol=1e-7 * max(1.0, np.abs(force).max()))
@@ -137,14 +138,14 @@ def test_reactions_of_a_sheet_at_rest_carry_its_weight(comm: MPI.Comm) -> None:
     with Simulation(content, comm) as simulation:
         system = simulation.system
         n = system.points.n_owned
-        ledger = Ledger(system)
+        energy_balance = EnergyBalance(system)
         for _ in range(12):
             x = system.x[:n].copy()
             simulation.step(10.0)
-        ledger.record(x)
-        reaction = comm.allreduce(ledger.reaction.sum(axis=0))
+        energy_balance.record(x)
+        reaction = comm.allreduce(energy_balance.reaction.sum(axis=0))
         np.testing.assert_allclose(reaction, [0.0, 0.2 * 0.8 * 9.81, 0.0], atol=1e-7)
         # only where a handle holds
-        held = np.abs(ledger.reaction).max(axis=1, initial=0.0) > 0.0
+        held = np.abs(energy_balance.reaction).max(axis=1, initial=0.0) > 0.0
         assert comm.allreduce(int(held.sum())) == 6
-        assert ledger.budget.kinetic < 1e-15
+        assert energy_balance.budget.kinetic < 1e-15

@@ -51,7 +51,7 @@ def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> SteppedScene:
     v = np.zeros((n, 3))
     v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, -SPEED, SPEED)
     system.state.set(system.x[:n].copy(), v)
-    simulation.ledger.measure()
+    simulation.energy_balance.measure()
     simulation.stepper.start(0.0, 0)
     return simulation
 
@@ -82,7 +82,7 @@ def flown(
         while not simulation.finished:
             simulation.step()
             watch(simulation)
-            pairs = max(pairs, simulation.ledger.columns()["pairs"])
+            pairs = max(pairs, simulation.energy_balance.columns()["pairs"])
         x, v = shape(simulation), gathered(simulation.problem.points, simulation.problem.system.v)
         simulation.destroy()
     return x, float(v[30:, 2].mean()), pairs
@@ -132,7 +132,7 @@ def test_nothing_crosses_and_newton_increments_are_limited(comm: MPI.Comm) -> No
     nearest: list[float] = []
 
     def watch(simulation: SteppedScene) -> None:
-        nearest.append(simulation.ledger.columns()["nearest"])
+        nearest.append(simulation.energy_balance.columns()["nearest"])
         assert simulation.problem.system.active.limiting
 
     flown(comm, {"time": {"end": 0.06, "step": 0.02}}, watch)

@@ -52,7 +52,7 @@ def test_the_obstacle_that_blocks_a_sheet_is_named(comm: MPI.Comm) -> None:
     assert "try more room for the sheet: obstacles.plate.motion must leave it some" in text
     assert len(failure.advice) == 1  # no number is absurd where there is no room
     assert failure.content()["near"]["obstacle"] == failure.near.obstacle
-    assert simulation.ledger.columns()["smallest_gap"] > 0.0
+    assert simulation.energy_balance.columns()["smallest_gap"] > 0.0
     simulation.destroy()
 
 
@@ -110,7 +110,7 @@ def test_initial_accelerations_exclude_obstacles_that_come_later(comm: MPI.Comm,
     }
     simulation = SteppedScene(comm, scene_of(scene))
     take_all_steps(simulation)
-    assert simulation.ledger.columns()["smallest_gap"] > 0.0
+    assert simulation.energy_balance.columns()["smallest_gap"] > 0.0
     assert simulation.budget.kinetic > 0.1
     simulation.destroy()
 
@@ -185,9 +185,9 @@ def test_semi_implicit_impacts_are_computed_by_newtons_method(comm: MPI.Comm) ->
     while not simulation.finished:
         simulation.step()
         assert simulation.budget.total < 1.005 * start
-        assert simulation.ledger.columns()["smallest_gap"] > 0.0
+        assert simulation.energy_balance.columns()["smallest_gap"] > 0.0
         # a checkpoint is of the usual steps
-        assert simulation.memory()["preset"] == solver
+        assert simulation.checkpoint_scalars()["preset"] == solver
     assert any("repeated by backward Euler" in note for note in simulation.notes)
     assert simulation.totals["newton_iterations"] > 2 * simulation.step_number
     simulation.destroy()
@@ -245,5 +245,5 @@ def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm)
         assert nearest is not None
         assert not nearest.obstacle
         assert (None if obstacle is None else obstacle.obstacle) == name
-        assert simulation.ledger.columns()["friction_work"] == 0.0
+        assert simulation.energy_balance.columns()["friction_work"] == 0.0
         simulation.destroy()

@@ -111,7 +111,7 @@ def test_an_obstacle_of_huge_radius_acts_as_a_plane(comm: MPI.Comm, shape: str) 
         assert not step.rejected
         iterations.append(step.newton_iterations)
     weight = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum()))
-    force = simulation.ledger.obstacle_forces(1)[0, :3]
+    force = simulation.energy_balance.obstacle_forces(1)[0, :3]
     simulation.destroy()
     np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-6 * weight)
     assert np.mean(iterations) < 3.0

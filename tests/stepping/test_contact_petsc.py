@@ -52,7 +52,7 @@ def thrown(comm: MPI.Comm, options: dict[str, str]) -> Array:
     contacts = 0.0
     for _ in range(STEPS):
         simulation.step()
-        contacts = max(contacts, simulation.ledger.columns()["contacts"])
+        contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
     assert contacts >= (CELLS + 1) ** 2
     x = gathered(simulation.problem.points, simulation.problem.system.x)
     simulation.destroy()
@@ -83,11 +83,11 @@ def test_the_monitor_shows_contact_and_friction(comm: MPI.Comm, capfd: pytest.Ca
     capfd.readouterr()
     for _ in range(STEPS):
         iterations.append(simulation.step().newton_iterations)
-        columns = simulation.ledger.columns()
+        columns = simulation.energy_balance.columns()
         touching.append((columns["contacts"], columns["smallest_gap"]))
         # the monitor's are those of the barrier
         damped = comm.allreduce(float(simulation.problem.system.contact_impulses.force[:, 2].sum()))
-        weights.append(simulation.ledger.obstacle_forces(1)[0, 2] - damped)
+        weights.append(simulation.energy_balance.obstacle_forces(1)[0, 2] - damped)
     PETSc.Sys.syncFlush(comm)
     out = capfd.readouterr().out
     simulation.destroy()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import Simulation, direct_solver, gathered, grid, obj_file, scene_of
 
-from lyra_petsc.stepping.energy_balance import Ledger
+from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms import contact
 from lyra_petsc.terms.contact import ContactBarrier
@@ -115,11 +115,11 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
         for name, value in (direct_solver(ranks) | {"ksp_rtol": "1e-12"}).items():
             PETSc.Options().setValue(name, value)
         simulation = SteppedScene(ranks, scene_of(content))
-        size, contacts = simulation.problem.outline.size, 0.0
+        size, contacts = simulation.problem.whole.size, 0.0
         ways.append([])
         for step in range(1, STEPS + 1):
             simulation.step()
-            contacts = max(contacts, simulation.ledger.columns()["contacts"])
+            contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
             if step in (20, STEPS):
                 ways[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
         assert contacts > 10.0
@@ -146,8 +146,8 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
         simulation = SteppedScene(ranks, scene_of(content))
         for _ in range(20):
             simulation.step()
-            contacts = max(contacts, simulation.ledger.columns()["contacts"])
-        size = simulation.problem.outline.size
+            contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
+        size = simulation.problem.whole.size
         ways.append(gathered(simulation.problem.points, simulation.problem.system.x))
         simulation.destroy()
     assert contacts > 10.0
@@ -203,11 +203,11 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
         v[:, 2] = np.where(points.mesh_vertices < 13 * 13, 10.0, -10.0)
         system.state.set(system.x[:n], v)
         simulation.stepper.start(0.0, 0)
-        simulation.ledger = Ledger(system)
+        simulation.energy_balance = EnergyBalance(system)
         for _ in range(3):
             simulation.step()
-            contacts = max(contacts, simulation.ledger.columns()["contacts"])
-        size = simulation.problem.outline.size
+            contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
+        size = simulation.problem.whole.size
         ways.append(gathered(simulation.problem.points, system.x))
         simulation.destroy()
     assert contacts > 10.0

@@ -65,7 +65,7 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
         return found
 
     assert on_root(comm, crossings) == 0
-    force = simulation.ledger.obstacle_forces(1)[0, :3]
+    force = simulation.energy_balance.obstacle_forces(1)[0, :3]
     weight = WEIGHT * scene["mesh"]["grid"]["width"] ** 2
     np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=2e-3 * weight)
     return simulation, x, newton
@@ -144,7 +144,7 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
         newton += simulation.step().newton_iterations
     term, system = simulation.problem.terms["contact"], simulation.problem.system
     assert isinstance(term, ContactBarrier)
-    torque = abs(simulation.ledger.obstacle_forces(1)[0, 4])
+    torque = abs(simulation.energy_balance.obstacle_forces(1)[0, 4])
     allowed = (
         MU
         * RADIUS
@@ -184,7 +184,7 @@ def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(scene))
     while not simulation.finished:
         simulation.step()
-    torque, weight = simulation.ledger.obstacle_forces(1)[0, 5], WEIGHT * 0.4**2
+    torque, weight = simulation.energy_balance.obstacle_forces(1)[0, 5], WEIGHT * 0.4**2
     # the forces with the friction that the normal forces in the equilibrium allow
     system, end = simulation.problem.system, simulation.time
     system.begin_step(end, end + 1e-9)

@@ -98,7 +98,7 @@ def test_a_resumed_run_extrapolates_the_same() -> None:
     for before, after in pairwise(times):
         whole.extrapolate(after, before, curved(before))
     whole.record(0.5, curved(0.5))
-    arrays, numbers = whole.memory()
+    arrays, numbers = whole.saved_state()
     resumed = Extrapolation(MPI.COMM_SELF)
     resumed.restore(arrays, numbers, 0.5, curved(0.5))
     assert numbers["degree"] > 0

@@ -56,8 +56,8 @@ def test_cyclic_bending_has_the_hysteresis_of_kes() -> None:
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
         while not trial.simulation.finished:
             trial.step()
-            moments.append(float(trial.simulation.ledger.handle_moments()[0][1]) / WIDTH)
-            heats.append(trial.simulation.ledger.budget.dissipation / (LENGTH * WIDTH))
+            moments.append(float(trial.simulation.energy_balance.handle_moments()[0][1]) / WIDTH)
+            heats.append(trial.simulation.energy_balance.budget.dissipation / (LENGTH * WIDTH))
     m = np.array(moments) if moments[1] > 0.0 else -np.array(moments)
     for up, down in ((13, 5), (14, 4), (11, 7)):  # 50, 150, −50
         assert PATH[up] == PATH[down]
@@ -80,7 +80,7 @@ def test_a_fold_remains() -> None:
     }
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
         x = trial.run().x
-        budget = trial.simulation.ledger.budget
+        budget = trial.simulation.energy_balance.budget
     # B κ = M_f at 20 1/m: what was bent more stays at that
     assert x[:, 2].max() > 0.01
     assert budget.dissipation > 0.0
@@ -109,7 +109,7 @@ def test_cyclic_shear_has_the_hysteresis_of_kes() -> None:
         forces = [0.0]
         while not trial.simulation.finished:
             trial.step()
-            forces.append(-trial.simulation.ledger.handle_forces(4)[0][1] / side)
+            forces.append(-trial.simulation.energy_balance.handle_forces(4)[0][1] / side)
     f = np.array(forces) * np.sign(forces[1])
     assert f[9] - f[3] == pytest.approx(2.0 * FORCE, rel=1e-3)
     assert f[9] == pytest.approx(SHEAR * 0.02 + FORCE, rel=2e-2)
@@ -132,10 +132,10 @@ def test_the_energy_balance_closes(integrator: str) -> None:
     lost = []
     for step in (0.002, 0.001):
         simulation = SteppedScene(MPI.COMM_SELF, scene_of(falling(integrator, step)))
-        start = simulation.ledger.budget.total
+        start = simulation.energy_balance.budget.total
         while not simulation.finished:
             simulation.step()
-        budget = simulation.ledger.budget
+        budget = simulation.energy_balance.budget
         assert budget.dissipation > 2e-6
         lost.append((budget.total - start + budget.dissipation - budget.external_work) / budget.dissipation)
         simulation.destroy()
@@ -149,7 +149,7 @@ def test_a_run_resumes_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Pa
     while not simulation.finished:
         simulation.step()
     unbroken = gathered(simulation.problem.points, simulation.problem.system.x)
-    heat = simulation.ledger.budget.dissipation
+    heat = simulation.energy_balance.budget.dissipation
     simulation.destroy()
     x = end_on_one_rank(comm, scene, shared_tmp / "run", 20)
     if x is not None:

@@ -58,8 +58,8 @@ def on_slope(
         float(system.points.global_sum(float(system.mass @ (values @ DOWN)))[0]) / mass
         for values in (system.x[:n] - start, system.v[:n])
     )
-    force = simulation.ledger.obstacle_forces(1)[0]
-    work = simulation.ledger.columns()["friction_work"]
+    force = simulation.energy_balance.obstacle_forces(1)[0]
+    work = simulation.energy_balance.columns()["friction_work"]
     simulation.destroy()
     return way, speed, np.asarray(force), mass * G, work
 
@@ -329,7 +329,7 @@ def test_sheets_with_friction_conserve_angular_momentum(comm: MPI.Comm) -> None:
     spin = np.cross(np.where(below, [0.0, 0.0, 8.0], [0.0, 0.0, -8.0]), system.x[:n] - 0.5 * side)
     system.v[:n] = np.where(below, [0.4, 0.0, 2.0], [0.0, 0.0, -2.0]) + spin
     layout.update_ghosts(system.v)
-    simulation.ledger.measure()
+    simulation.energy_balance.measure()
 
     def angular() -> Array:
         each = np.cross(system.x[:n], system.mass[:n, None] * system.v[:n])
@@ -339,7 +339,7 @@ def test_sheets_with_friction_conserve_angular_momentum(comm: MPI.Comm) -> None:
     while not simulation.finished:
         simulation.step()
         np.testing.assert_allclose(angular()[0], before, rtol=0, atol=1e-11 * size.sum())
-        rubbed = simulation.ledger.columns()["friction_work"]
+        rubbed = simulation.energy_balance.columns()["friction_work"]
     assert rubbed > 0.05 * simulation.budget.total
     simulation.destroy()
 

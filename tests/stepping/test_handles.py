@@ -402,6 +402,6 @@ def test_handles_that_hold_the_same_vertices_elsewhere_are_noted(
 ) -> None:
     content = {"mesh": MESH, "handles": handles, "motions": LIFT, "time": {"end": 2.0, "step": 0.1}}
     with Simulation(content, MPI.COMM_SELF) as simulation:
-        notes = [note for note in simulation.problem.outline.notes if "different places" in note]
+        notes = [note for note in simulation.problem.whole.notes if "different places" in note]
     assert len(notes) == told
     assert all("hold 1 vertices (first: 1)" in note and "handles[1], the later" in note for note in notes)

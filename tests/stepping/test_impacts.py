@@ -44,7 +44,7 @@ def test_colliding_parts_hardly_rebound(
     before, impulse = simulation.budget.total, 0.0
     while not simulation.finished:
         taken = simulation.step()
-        impulse -= taken.dt * float(simulation.ledger.obstacle_forces(1)[0, 2])
+        impulse -= taken.dt * float(simulation.energy_balance.obstacle_forces(1)[0, 2])
     own = float(system.mass.sum()), float(system.mass @ system.v[:n, 2])
     mass, momentum = (float(value) for value in system.points.global_sum(*own))
     budget = simulation.budget
@@ -74,7 +74,7 @@ def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
     before = simulation.budget.total
     while not simulation.finished:
         simulation.step()
-    assert simulation.ledger.columns()["contacts"] > 2
+    assert simulation.energy_balance.columns()["contacts"] > 2
     assert simulation.budget.total < before
     assert simulation.step_number == 8
     simulation.destroy()

@@ -112,7 +112,7 @@ def test_second_order_during_contact(integrator: str, comm: MPI.Comm) -> None:
         weight, carried = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum())), 0.0
         while not simulation.finished:
             assert simulation.step().rejected == 0
-            carried -= float(simulation.ledger.obstacle_forces(1)[0, 2]) / steps
+            carried -= float(simulation.energy_balance.obstacle_forces(1)[0, 2]) / steps
         assert carried == pytest.approx(weight, rel=0.2)
         system = simulation.problem.system
         shapes.append(gathered(system.points, system.x))

@@ -12,7 +12,7 @@ from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.presets import BETWEEN_RANKS, PRESETS
 from lyra_petsc.mesh import distribute
-from lyra_petsc.stepping.energy_balance import Ledger
+from lyra_petsc.stepping.energy_balance import EnergyBalance
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 
@@ -53,16 +53,16 @@ def outcome(
 ) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Positions, velocities and energies after some steps."""
     with Simulation(content, comm) as simulation:
-        ledger = Ledger(simulation.system)
+        energy_balance = EnergyBalance(simulation.system)
         n = simulation.system.points.n_owned
         for _ in range(steps):
             x = simulation.system.x[:n].copy()
             simulation.step(0.01)
-            ledger.record(x)
+            energy_balance.record(x)
         return (
             simulation.x,
             simulation.v,
-            [value for key, value in vars(ledger.budget).items() if key != "more"],
+            [value for key, value in vars(energy_balance.budget).items() if key != "more"],
         )
 
 

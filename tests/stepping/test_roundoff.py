@@ -64,7 +64,7 @@ def test_a_strongly_pressed_sheet_needs_no_shorter_steps(comm: MPI.Comm) -> None
         "solver": {},
     }
     with finished(comm, scene) as simulation:
-        force = simulation.ledger.obstacle_forces(2)[:, 2]
+        force = simulation.energy_balance.obstacle_forces(2)[:, 2]
         newton, steps = simulation.totals["newton_iterations"], simulation.step_number
         notes = [note for note in simulation.notes if "round-off" in note]
     assert force[1] > 2e4

@@ -41,7 +41,7 @@ def test_bdf2_differentiates_parabolas_exactly(steps: tuple[float, ...]) -> None
 def test_bdf2_restarts_with_given_accelerations() -> None:
     scheme, resumed = Bdf2(), Bdf2()
     scheme.set_acceleration(parabola(1.0))
-    resumed.restore(*scheme.memory())
+    resumed.restore(*scheme.saved_state())
     assert not resumed.needs_acceleration
     stages = [each.stage(parabola(0.0), parabola(0.0), 0.1) for each in (scheme, resumed)]
     assert stages[0].v is not None
@@ -63,7 +63,7 @@ def amplification(radius: float, omega_dt: float) -> float:
         u = (stage.sigma * stage.v - omega_dt**2 * stage.x) / (stage.sigma + omega_dt**2 * stage.c)
         end_x, end_v = scheme.end(x, v, u, 1.0)
         scheme.record_step(x, v, np.ones((1, 1), dtype=bool), 1.0)
-        columns.append([end_x[0, 0], end_v[0, 0], scheme.memory()[0]["acceleration"][0, 0]])
+        columns.append([end_x[0, 0], end_v[0, 0], scheme.saved_state()[0]["acceleration"][0, 0]])
     return float(np.abs(np.linalg.eigvals(np.array(columns).T)).max())
 
 

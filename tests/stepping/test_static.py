@@ -211,7 +211,7 @@ def test_the_tangent_includes_moving_handles(comm: MPI.Comm) -> None:
         with at_rest(comm, **content) as simulation:
             x.append(shape(simulation))
             if more == 1.0:
-                rate = simulation.problem.points.gather(simulation._equilibrium.memory(1.0)[0]["rate"])
+                rate = simulation.problem.points.gather(simulation._equilibrium.saved_state(1.0)[0]["rate"])
     expected = (x[1] - x[0]) / 0.01
     assert np.abs(rate - expected).max() < 0.05 * np.abs(expected).max()
 
@@ -234,7 +234,7 @@ def test_a_solve_ends_when_its_error_estimate_is_below_the_tolerance(comm: MPI.C
         with at_rest(comm, **content) as simulation:
             found.append(simulation.problem.system.x[: simulation.problem.points.n_vertices].copy())
             iterations.append(simulation.totals["newton_iterations"])
-            spacing = simulation.problem.outline.spacing
+            spacing = simulation.problem.whole.spacing
     assert np.abs(found[0] - found[1]).max() <= 1e-6 * spacing
     assert iterations[0] <= 32  # 30; 35 without
 

@@ -39,7 +39,7 @@ def test_errors_of_positions_are_within_the_tolerance(
 ) -> None:
     asked = SteppedScene(comm, scene_of(sheet(stiffness, dt, tolerance)))
     exact = SteppedScene(comm, scene_of(sheet(stiffness, dt, 1e-11)))
-    spacing = asked.problem.outline.spacing
+    spacing = asked.problem.whole.spacing
     iterations = []
     while not asked.finished:
         for values, state in zip(state_of(exact), state_of(asked), strict=True):

@@ -83,7 +83,7 @@ class Watched:
         x = self.system.x[:n].copy()
         vertices = np.arange(n)[:, None] < self.system.points.n_vertices
         self.system.state.set(x, np.where(vertices, v(x), 0.0))
-        self.simulation.ledger.measure()
+        self.simulation.energy_balance.measure()
         self.simulation.stepper.start(0.0, 0)
 
     def look(self) -> None:

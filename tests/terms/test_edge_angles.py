@@ -44,7 +44,7 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array,
         budget, layout = simulation.budget, simulation.problem.points
         bending = budget.bending + budget.more.get("angle_energy", 0.0)
         energies = np.array([budget.kinetic, budget.membrane, bending, budget.potential])
-        reactions = np.array(simulation.ledger.handle_forces(1))
+        reactions = np.array(simulation.energy_balance.handle_forces(1))
         return shape(simulation), energies, reactions, layout.n_edges_global
 
 

@@ -161,7 +161,7 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
             strains.append(path[len(strains)])
-            forces.append(abs(simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
+            forces.append(abs(simulation.energy_balance.handle_forces(3)[0][0]) / CLAMPED)
             if forces[-1] >= FULL_LOAD:
                 break
     percent, converted = [100.0 * e for e in strains], [f / GF_PER_CM for f in forces]
@@ -222,7 +222,7 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     forces = [0.0]
     with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
-            force = simulation.ledger.handle_forces(5)[0][0]
+            force = simulation.energy_balance.handle_forces(5)[0][0]
             forces.append(-float(force) / (len(middle) * width))
     angles, converted = path[1 : len(forces)], [f / GF_PER_CM for f in forces[1:]]
     record.curves = [Curve("shear", "angle [°]", "force [gf/cm]", angles, converted)]
@@ -296,8 +296,8 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     moments = [0.0]
     with _load_path_simulation(bench, content, path) as steps:
         for simulation in steps:
-            ledger, kappa = simulation.ledger, path[len(moments)]
-            force, moment = ledger.handle_forces(4)[1], float(ledger.handle_moments()[1][1])
+            energy_balance, kappa = simulation.energy_balance, path[len(moments)]
+            force, moment = energy_balance.handle_forces(4)[1], float(energy_balance.handle_moments()[1][1])
             moments.append((np.dot(force, _chuck_rate(kappa)) / LENGTH - moment) / width)
     converted = [float(m) / (1e-2 * GF_PER_CM) for m in moments]  # gf·cm/cm
     curvature = [1e-2 * kappa for kappa in path]

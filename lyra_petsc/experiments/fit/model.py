@@ -172,7 +172,7 @@ class Model:
                 progress(simulation.time / end)
                 if abs(simulation.time - remaining[0].time) <= SAME_TIME * end:
                     instant = remaining.pop(0)
-                    values.append(instant.values(simulation.problem, simulation.ledger))
+                    values.append(instant.values(simulation.problem, simulation.energy_balance))
                     if sensitivities is not None:
                         slopes.append(sensitivities.derivatives(instant.values))
             if remaining:

@@ -20,7 +20,7 @@ from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import read_text
-from lyra_petsc.stepping.energy_balance import Ledger
+from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.problem import Problem
 
 AXES = ("x", "y", "z")
@@ -57,7 +57,7 @@ class Reading(ABC):
     uncertainty: Array = field(default_factory=lambda: np.empty(0))
 
     @abstractmethod
-    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
         """This rank's part of the sums over all ranks."""
 
     @abstractmethod
@@ -94,7 +94,7 @@ class Positions(Reading):
             found.append(order[at : at + 1] if here else np.empty(0, dtype=np.int64))
         return found
 
-    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
         x, rows = problem.system.x, self._rows(problem)
         parts = [np.append(x[mine].sum(axis=0), float(len(mine))) for mine in rows]
         return np.concatenate(parts)
@@ -129,7 +129,7 @@ class Shadow(Reading):
 
     block: DrapeCoefficient | None = None
 
-    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
         membrane = problem.membrane
         a, b, c = (problem.system.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
         first, second = b - a, c - a
@@ -148,10 +148,10 @@ class HandleForce(Reading):
     handle: int = 0
     axes: tuple[int, ...] = (0, 1, 2)
 
-    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
-        assert ledger is not None
+    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
+        assert energy_balance is not None
         count = len(problem.scene.handles)
-        force = ledger.handle_forces(count)[self.handle]
+        force = energy_balance.handle_forces(count)[self.handle]
         # every rank has the total force
         return force / problem.points.comm.size
 
@@ -166,9 +166,9 @@ class Instant:
     time: float
     readings: tuple[Reading, ...]
 
-    def values(self, problem: Problem, ledger: Ledger | None) -> Array:
+    def values(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
         """The values of all readings; collective."""
-        sums = [reading.sums(problem, ledger) for reading in self.readings]
+        sums = [reading.sums(problem, energy_balance) for reading in self.readings]
         total = np.concatenate(sums)
         problem.points.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         ends = np.cumsum([len(part) for part in sums])[:-1]

@@ -273,7 +273,7 @@ class BalanceRecorder:
         dx, dv = x1 - x0, v1[:n] - v0[:n]
         free = ~system.prescribed.mask[:n]
         parts = self._force_terms(report, dv / dt)
-        reaction = self._simulation.ledger.reaction
+        reaction = self._simulation.energy_balance.reaction
         if system.contact_impulses is not None:  # impact damping acts after the equations are solved
             at = system.prescribed.indices
             reaction.put(at, reaction.take(at) - system.contact_impulses.handle_force)
@@ -343,7 +343,7 @@ class BalanceRecorder:
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
-        floor = residual_roundoff(system, max(reach, simulation.problem.outline.largest_coordinate))
+        floor = residual_roundoff(system, max(reach, simulation.problem.whole.largest_coordinate))
         n = len(free)
         displacement = system.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
@@ -460,7 +460,7 @@ class StageBalanceRecorder(BalanceRecorder):
         frozen = {term: term.freeze(ended) for term in system.active.elastic}
         system.active.frozen = system.active.frozen | frozen
         total = np.asarray(sum(parts.values()))
-        defects = total - self._simulation.ledger.reaction
+        defects = total - self._simulation.energy_balance.reaction
         if not any(_acts_from_outside(term) for term in self._sheet):
             # external forces of such terms cannot be separated from internal ones here
             defects = defects - parts["internal"] - parts.get("damping", 0.0)

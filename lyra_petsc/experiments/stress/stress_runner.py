@@ -115,7 +115,7 @@ class BaseClock:
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
         seconds: list[tuple[float, float]] = []
         with self._setting.bench(self._comm, self._watch) as bench, bench.simulation(content) as trial:
-            self.size = trial.simulation.problem.outline.size
+            self.size = trial.simulation.problem.whole.size
             while not trial.simulation.finished:
                 began = time.process_time()
                 seconds.append((trial.step().wall_seconds, time.process_time() - began))
@@ -185,7 +185,7 @@ def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: floa
     mesh = simulation.problem.mesh
     record.triangles = mesh.triangles if mesh is not None else None
     if case.shape is not None:
-        shape = case.shape(trial.x, simulation.problem.outline.spacing)
+        shape = case.shape(trial.x, simulation.problem.whole.spacing)
         trial.set_state(x=shape)
     record.start_energy = _energy(trial)
     if case.observe is not None:

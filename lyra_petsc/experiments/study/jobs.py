@@ -253,10 +253,10 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
     with open_simulation(comm, scene, phases) as simulation, ExitStack() as stack:
         comm.Barrier()
         set_up = time.perf_counter() - began
-        recorder, outline = None, simulation.problem.outline
+        recorder, whole = None, simulation.problem.whole
         if repeat == 0:
-            result.vertices, result.triangles = outline.n_vertices, outline.n_triangles
-            result.spacing, result.sheets = outline.spacing, [each.n_vertices for each in outline.sources]
+            result.vertices, result.triangles = whole.n_vertices, whole.n_triangles
+            result.spacing, result.sheets = whole.spacing, [each.n_vertices for each in whole.sources]
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)

@@ -73,7 +73,7 @@ class GeneralisedAlpha(Integrator):
         assert self._next is not None
         self._a = np.where(free, self._next, 0.0)
 
-    def memory(self) -> tuple[Arrays, dict[str, float]]:
+    def saved_state(self) -> tuple[Arrays, dict[str, float]]:
         return ({} if self._a is None else {"acceleration": self._a}), {}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:

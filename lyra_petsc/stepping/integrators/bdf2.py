@@ -107,13 +107,13 @@ class Bdf2(Integrator):
             past.append((x - ago * change, v + change, dt))
         self._past = past
 
-    def memory(self) -> tuple[Arrays, dict[str, float]]:
+    def saved_state(self) -> tuple[Arrays, dict[str, float]]:
         arrays: Arrays = {}
         numbers: dict[str, float] = {}
         for i, (x, v, dt) in enumerate(self._past):
             arrays |= {f"past_position_{i}": x, f"past_velocity_{i}": v}
             numbers[f"past_dt_{i}"] = dt
-        return arrays if self._past else self._starter.memory()[0], numbers
+        return arrays if self._past else self._starter.saved_state()[0], numbers
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
         self._starter = GeneralisedAlpha(0.0)

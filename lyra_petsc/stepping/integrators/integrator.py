@@ -85,12 +85,12 @@ class NoHistory:
         as if they had been so before, too.
         """
 
-    def memory(self) -> tuple[Arrays, dict[str, float]]:
+    def saved_state(self) -> tuple[Arrays, dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
         return {}, {}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
-        """Go on with a memory."""
+        """Restore a `saved_state`."""
 
 
 class Integrator(NoHistory, ABC):

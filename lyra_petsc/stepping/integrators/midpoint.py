@@ -31,7 +31,7 @@ class Midpoint(Integrator):
     def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
         return x + dt * stage_velocity, 2.0 * stage_velocity - v
 
-    def memory(self) -> tuple[Arrays, dict[str, float]]:
+    def saved_state(self) -> tuple[Arrays, dict[str, float]]:
         return {}, {"surplus": self.surplus}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:

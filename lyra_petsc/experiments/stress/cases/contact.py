@@ -174,7 +174,7 @@ def _stack(setting: Setting, bench: Bench) -> Content:
 
 def _contacts(trial: Trial) -> tuple[int, float]:
     """Numbers of crossings and of contacts."""
-    return _crossings(trial), trial.simulation.ledger.columns()["contacts"]
+    return _crossings(trial), trial.simulation.energy_balance.columns()["contacts"]
 
 
 def _judge_many(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:

@@ -468,7 +468,7 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
 def _push(trial: Trial) -> float:
     """Compressive force per width at the right end."""
     end = trial.start[:, 0] > 1.0 - 1e-9
-    return -float(trial.gather(trial.simulation.ledger.reaction)[end, 0].sum()) / COLUMN
+    return -float(trial.gather(trial.simulation.energy_balance.reaction)[end, 0].sum()) / COLUMN
 
 
 def _height(trial: Trial) -> float:

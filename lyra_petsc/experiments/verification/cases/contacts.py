@@ -112,7 +112,7 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
                 before, weight = trial.run_to(0.5 * SLID).v, G * float(trial.mass.sum())
                 while not trial.simulation.finished:
                     trial.step()
-                    along = float(trial.simulation.ledger.obstacle_forces(1)[0, :3] @ down)
+                    along = float(trial.simulation.energy_balance.obstacle_forces(1)[0, :3] @ down)
                     error = abs(along / weight - friction * math.cos(angle))
                     friction_error = max(friction_error, error)
                 change = (trial.v - before) @ down
@@ -167,7 +167,7 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
         }
         pressure = np.empty(0)
         with bench.simulation(content) as trial:
-            force = trial.run().simulation.ledger.obstacle_forces(1)[0, :3]
+            force = trial.run().simulation.energy_balance.obstacle_forces(1)[0, :3]
             weight = G * float(trial.mass.sum())
             if words == "plane":
                 compute = FIELDS["contact_pressure"].compute
@@ -249,7 +249,7 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
     for turns, friction in WRAPS:
         content, ends = _belt(bench, math.pi * turns, friction, round(n))
         with bench.simulation(content) as trial:
-            pull = trial.gather(trial.run().simulation.ledger.reaction)[:, ::2]
+            pull = trial.gather(trial.run().simulation.energy_balance.reaction)[:, ::2]
         slack, tight = (float(np.linalg.norm(pull[end].sum(axis=0))) for end in ends)
         words = f"T2/T1, φ = {turns:g} π, μ = {friction:g}"
         yield Measured(words, tight / slack, math.exp(math.pi * turns * friction))
@@ -508,7 +508,7 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
     with bench.simulation(content) as trial:
         for (force, half_length, _, height), frame in zip(rows, frames[2::2], strict=True):
             trial.run_to(frame["time"])
-            push = trial.gather(trial.simulation.ledger.reaction)[ends[1], 0]
+            push = trial.gather(trial.simulation.energy_balance.reaction)[ends[1], 0]
             z = trial.x[:, 2] - trial.x[ends[1], 2].mean()
             root = np.cbrt(z / z.max())
             foot = (root > FOOT[0]) & (root < FOOT[1])

@@ -104,7 +104,7 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
     residual = np.abs(trial.gather(force)[inner]).max(initial=0.0)
     scale = float(max(stiffness, *np.abs(exact)))
     # force [N] of one triangle of mean size on a vertex
-    nodal = scale * float(np.sqrt(area / problem.outline.n_triangles))
+    nodal = scale * float(np.sqrt(area / problem.whole.n_triangles))
     mine = membrane.strain_and_stress(problem.system.x)[1][: membrane.n_owned]
     stress = np.concatenate(points.comm.allgather(mine))
     measured = [

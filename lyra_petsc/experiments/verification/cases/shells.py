@@ -508,7 +508,7 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
         )
         curve = [(0.0, 0.0)]
         for factor, trial in increments(bench, content, INCREMENT / 3.0):
-            push = trial.simulation.ledger.handle_forces(4)[3][2]
+            push = trial.simulation.energy_balance.handle_forces(4)[3][2]
             curve.append((factor * DEFLECTION, -4.0 * push / 3000.0))  # over the largest load [N]
         extent = deflections.max(), loads.max()
         distance = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
