@@ -1,4 +1,4 @@
-"""The terms of a problem, what each has frozen for the present step, and sums over them."""
+"""The terms of a problem, their frozen data in the present step, and sums over them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 
 class ActiveTerms:
-    """All terms that a scene needs.
+    """All terms that a scene needs, by kind and property.
 
     Parameters
     ----------
@@ -23,17 +23,23 @@ class ActiveTerms:
     Attributes
     ----------
     elastic, viscous, loads : list of Term
-        By kind.
+        The terms with an elastic energy, with a potential of the velocities, and the loads.
     following : list of Load
-        Those that follow the shape.
-    sheet, constraints, moving, pushing, limiting, changing, with_edges : list of Elastic
-        Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
-        those of them that work by forces, those that limit the length of Newton's steps, those whose stencils
-        change, and those with unknowns on edges.
+        Loads that follow the shape of the sheet.
+    sheet, constraints : list of Elastic
+        Terms that add to the energy of the sheet, and springs by which handles pull.
+    moving, pushing : list of Elastic
+        Terms of ``sheet`` with moving targets; of these the ones whose targets do work by forces (obstacles).
+    limiting : list of Elastic
+        Terms that limit the length of Newton's steps.
+    changing : list of Elastic
+        Terms whose stencils change (pairs that are near).
+    with_edges : list of Elastic
+        Terms with unknowns of edges.
     coarse : dict of Elastic → Elastic
-        Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
+        The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     frozen : dict of Term
-        What each has frozen for the step.
+        Frozen data of each term in the step.
     """
 
     def __init__(self, terms: Sequence[Term]) -> None:
@@ -53,19 +59,19 @@ class ActiveTerms:
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
     def freeze(self, step: UpcomingStep) -> None:
-        """Let every term that acts through positions or velocities freeze what it does."""
-        self.frozen = {}  # there is no room for both
+        """Freeze the data of all terms that depend on positions or velocities."""
+        self.frozen = {}  # frees the old data first, to save memory
         self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
 
-    def refreeze(self, found: Mapping[Any, Any]) -> None:
-        """Let terms, and those that follow them, have frozen this."""
-        following: dict[Term, Any] = {
-            term: found[term.partner] for term in self.elastic if term.partner and term.partner in found
+    def refreeze(self, changed: Mapping[Any, Any]) -> None:
+        """Replace the frozen data of terms, and of the terms that share it as their partners."""
+        partners: dict[Term, Any] = {
+            term: changed[term.partner] for term in self.elastic if term.partner and term.partner in changed
         }
-        self.frozen = {**self.frozen, **found, **following}
+        self.frozen = {**self.frozen, **changed, **partners}
 
     def move_targets(self, step: UpcomingStep) -> None:
-        """Let targets that move with handles stand where they do at ``step.target_time``."""
+        """Set moving targets and springs to their positions at ``step.target_time``."""
         self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
 
     def gradient(self, terms: Sequence[Elastic | Viscous], at: Array, layout: Layout) -> Array:
@@ -76,29 +82,29 @@ class ActiveTerms:
         return out[: layout.n_owned]
 
     def moving_energy(self, x: Array) -> float:
-        """Energy [J] of this rank's terms whose targets work by it, which stand where they are now."""
-        turning = [term for term in self.moving if not term.pushes]
-        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in turning)
+        """Energy [J] of this rank's terms with moving targets, without obstacles, at the present targets."""
+        terms = [term for term in self.moving if not term.pushes]
+        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in terms)
 
     def accept_substep(self, x: Array) -> None:
-        """A part of a static load step led to positions x."""
+        """Notify terms that a part of a static load step ended at positions x."""
         for term in self.changing:
             term.accept_substep(x, self.frozen[term])
 
     def friction_lag(self, x: Array) -> dict[str, Array]:
-        """See `Elastic.friction_lag`."""
+        """The results of `Elastic.friction_lag` of all terms."""
         return {name: sums for t in self.changing for name, sums in t.friction_lag(x, self.frozen[t]).items()}
 
     def contact_state(self) -> dict[Elastic, Any]:
-        """What terms know of what touches, to come back to by `restore_contacts`."""
+        """State of the contacts of all terms, for `restore_contacts`."""
         return {term: term.contact_state() for term in self.changing}
 
     def restore_contacts(self, states: Mapping[Elastic, Any]) -> None:
-        """Know just this of what touches."""
-        for term, what in states.items():
-            term.restore_contacts(what)
+        """Return to a `contact_state`."""
+        for term, state in states.items():
+            term.restore_contacts(state)
 
     def transport_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
-        """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
+        """Transport the frames of directors, those in use or in ``frozen``, to positions x."""
         for term in self.with_edges:
             term.accept(x, (frozen or self.frozen)[term])

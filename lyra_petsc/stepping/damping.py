@@ -17,15 +17,18 @@ from lyra_petsc.terms.term import Elastic, Term
 
 
 class ScaledDamping:
-    """Block rows that are factor · D + diagonal · I, but for values of which it keeps what they were.
+    """Products with D from block rows that hold factor · D + diagonal · I.
+
+    The caller may afterwards overwrite some values, for prescribed unknowns, of which a copy is kept.
 
     Parameters
     ----------
     values : (n_stored, 3, 3)
+        The block rows; not copied.
     factor : float
     diagonal : (n_owned,)
     changing : (n,) int
-        In the flat form, values that will be others afterwards.
+        Flat indices of the values that may be overwritten.
     """
 
     def __init__(self, values: Array, factor: float, diagonal: Array, changing: NDArray[np.int64]) -> None:
@@ -34,7 +37,7 @@ class ScaledDamping:
         self._changing, self._kept = changing, self._flat[changing]
 
     def product(self, blocks: BlockRows, v: Array) -> Array:
-        """D v (n_owned, 3) of v (n_local, 3)."""
+        """D v (n_owned, 3) for v (n_local, 3)."""
         now = self._flat[self._changing]
         self._flat[self._changing] = self._kept
         out = blocks.product(self._values, v)
@@ -45,26 +48,26 @@ class ScaledDamping:
 
 
 class Damping:
-    """D of the owned rows, from the regularised Hessians K⁺ of the damped terms.
+    """The owned rows of D, from the regularised Hessians K⁺ of the damped terms.
 
     Parameters
     ----------
     discretisation : Discretisation
     elastic : sequence of Elastic
-        All of the scene; those without damping are passed over.
+        All elastic terms of the scene; those without damping are ignored.
     dynamic : bool
-        Nothing is damped where time does not pass.
+        Whether the scene is a motion; in a static analysis nothing is damped.
     single_assembly : bool
-        A step's matrix is put together once, and stays until the step's end.
+        Whether the matrix is assembled only once in a step, and kept until its end.
 
     Attributes
     ----------
     active : bool
-        Whether anything is damped, on any rank; without, nothing is stored.
+        Whether any term is damped, on any rank; if not, nothing is stored.
     frozen : mapping of Term → any
-        What terms froze for the step, before edges turned far.
+        Frozen data of the terms at the start of the step, before frames of edges were updated.
     product : Remembered
-        D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3).
+        D v (n_owned, 3) [N] for velocities v (n_local, 3).
     """
 
     def __init__(
@@ -85,7 +88,7 @@ class Damping:
         self._multiple: ScaledDamping | None = None
         self._x: Array | None = None
         self.frozen: Mapping[Term, Any] = {}
-        # residual, objective and works ask at the same velocities
+        # residual, objective and works need it at the same velocities
         self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max()
@@ -94,11 +97,11 @@ class Damping:
 
     @property
     def _blocks(self) -> BlockRows:
-        """Damped terms have fixed stencils."""
+        """The block rows of fixed stencils; all damped terms have such stencils."""
         return self._discretisation.fixed
 
     def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
-        """Take the geometry of positions x (n_local, 3), left as they are, and what terms froze for it."""
+        """Set the geometry to positions x (n_local, 3), not copied, with the terms' frozen data."""
         self.release_values()
         self._x, self._stored, self.frozen = x, False, frozen
         self.product.forget()
@@ -106,7 +109,7 @@ class Damping:
             self._stored_values()
 
     def release_values(self) -> None:
-        """Work no longer with the rows that ``assemble_with_stiffness`` was given."""
+        """Stop using the block rows that `assemble_with_stiffness` was given."""
         self._multiple = None
 
     def _add(self, x: Array, weight: Callable[[Elastic], Array | float], values: Array) -> None:
@@ -114,7 +117,7 @@ class Damping:
             self._blocks.add_stiffness(term, x, self.frozen[term], 1.0, weight(term), values)
 
     def _stored_values(self) -> Array:
-        """D, stored from here on until the geometry is another."""
+        """Values of D, assembled at the first call after a change of the geometry."""
         if self._values is None:
             self._values = self._blocks.zeros()
         if not self._stored and self._x is not None:
@@ -124,14 +127,14 @@ class Damping:
         return self._values
 
     def _product(self, v: Array) -> Array:
-        if not v.any():  # as where a semi-implicit step looks at its forces
+        if not v.any():  # for example in the residual of a semi-implicit step
             return np.zeros((self._discretisation.layout.n_owned, 3))
         if self._multiple is not None:
             return self._multiple.product(self._blocks, v)
         return self._blocks.product(self._stored_values(), v)
 
     def product_at(self, x: Array, v: Array) -> Array:
-        """D v with the geometry of positions x (n_local, 3); that of the step is there again afterwards."""
+        """D v with the geometry of positions x (n_local, 3), instead of the geometry of the step."""
         kept, self._x, self._stored = self._x, x, False
         out = self._blocks.product(self._stored_values(), v)
         self._x, self._stored = kept, False
@@ -139,24 +142,24 @@ class Damping:
         return out
 
     def assemble(self, values: Array, diagonal: Array) -> None:
-        """Let ``values`` (n_stored, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
+        """Write D + ``diagonal`` (n_owned,) · I to ``values`` (n_stored, 3, 3)."""
         self.release_values()
-        rows, place = self._discretisation.rows, self._discretisation.fixed_positions
-        if self.active and place is None:
+        rows, positions = self._discretisation.rows, self._discretisation.fixed_positions
+        if self.active and positions is None:
             rows.scale(self._stored_values(), 1.0, diagonal, values)
         else:
             rows.set_diagonal(diagonal, values)
-            if self.active and place is not None:
-                rows.add_blocks(self._stored_values(), place, values)
+            if self.active and positions is not None:
+                rows.add_blocks(self._stored_values(), positions, values)
 
     def assemble_with_stiffness(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
     ) -> bool:
-        """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
+        """Write D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I to ``values``, if K⁺ is a multiple of D.
 
-        It is where all elements that there are have one γ, and D was frozen at x: half the assembly of a
-        semi-implicit step, and D need not be stored beside it. Else False. The caller may change ``changing``
-        (n,), in the flat form, afterwards.
+        K⁺ is a multiple of D if all elements have the same γ and D was frozen at x. This halves the assembly
+        of a semi-implicit step, and D need not be stored. Returns False, and writes nothing, in other cases.
+        The caller may afterwards overwrite ``values`` at the flat indices ``changing`` (n,).
         """
         self.release_values()
         other = self._discretisation.fixed_positions is not None or any(

@@ -1,6 +1,6 @@
-"""What may be the cause of a failed solve, and which key of the scene or option to change.
+"""Advice on a failed solve: which keys of the scene or options to change, and why.
 
-Rules, the most specific first; each looks at a diagnosis and names what to change, or returns None.
+A list of rules, the most specific first. Each checks a diagnosis for one probable cause.
 """
 
 from __future__ import annotations
@@ -14,29 +14,34 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis
 from lyra_petsc.stepping.near_pairs import NearPair
 from lyra_petsc.stepping.newton_trace import FailedSolve
+from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason
 
-SOFTENS = 1.0 / math.sqrt(3.0)
-"""Stretch below which the stiffness of St. Venant-Kirchhoff in compression is negative."""
+LARGE_MOTION = 0.5
+"""Displacement of a vertex in one step, over the mean edge length, above which it may be the cause."""
 
-LONG = 0.5
-"""Element sizes that something may move in one step and be harmless."""
+ABSURD_MOTION = 1e6
+"""Displacement in one step, over the mean edge length, which only a mistake in the scene can cause."""
 
-FAR = 1e6
-"""Element sizes that nothing moves in one step but by mistake."""
+LARGE_STRETCH = 1.5
+LARGE_ASPECT_RATIO = 50.0
 
-STRETCHED = 1.5
-SLIVER = 50.0
-NEARLY = 1e-3
-"""Residual over the forces at work below which a solve was nearly there."""
+SMALL_RESIDUAL = 1e-3
+"""Residual over the largest part of the forces below which a solve had almost converged."""
 
 NEAR_ROUNDOFF = 100.0
+"""Residual over its round-off below which the tolerances are too small."""
+
 FEW_ITERATIONS = 10
-MANY_LINEAR = 1000
-MANY_CUTS = 100.0
-"""Cut of Δt after which a smaller one is not what is missing."""
+"""Limit of the Newton iterations below which a larger limit is the first advice."""
+
+MANY_LINEAR_ITERATIONS = 1000
+"""Limit of the linear iterations from which on a larger limit is no longer advised."""
+
+LARGE_CUT = 100.0
+"""Planned over last Δt above which an even smaller Δt is no longer advised."""
 
 KEYS = {
     "inertia": "initial.velocity, motions and time.step",
@@ -46,12 +51,12 @@ KEYS = {
     "damping": "material.damping",
     "wind": "wind.velocity and wind.density",
 }
-"""Where the sizes of the parts of the residual come from."""
+"""Keys of the scene that determine the parts of the residual, by name of the part."""
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What else one must know of the step that failed.
+    """Properties of the failed step on which the advice depends.
 
     Attributes
     ----------
@@ -62,11 +67,11 @@ class Circumstances:
     floor : float
         Norm of the residual's round-off [N].
     max_iterations : int
-        Newton iterations a solve may take.
+        Largest number of Newton iterations of a solve.
     iterations_key : str
-        What sets them.
+        The key or option that sets this number.
     linear_iterations : int
-        What ``-ksp_max_it`` allows.
+        Largest number of linear iterations of a solve, ``-ksp_max_it``.
     preconditioner : str
     ranks : int
     """
@@ -90,16 +95,16 @@ def failure_kind(diagnosis: Diagnosis, solve: FailedSolve) -> str:
         return "linear trouble"
     if solve.ksp_reason >= 0:
         return "nonlinear trouble"
-    # what stopped the solve is the direction that this linear solve failed to give; where the iterations
-    # ran out it may be one failure of many solves
+    # The last linear solve failed. If Newton's method reached its limit of iterations, that is the cause only
+    # if most of the earlier linear solves failed, too.
     solved = solve.iterations[1:]
     failed = sum(each.linear_reason < 0 for each in solved)
-    ran_out = solve.snes_reason == SNES.DIVERGED_MAX_IT and 2 * failed < len(solved)
-    return "nonlinear trouble" if ran_out else "linear trouble"
+    few_failed = solve.snes_reason == SNES.DIVERGED_MAX_IT and 2 * failed < len(solved)
+    return "nonlinear trouble" if few_failed else "linear trouble"
 
 
 def advice(diagnosis: Diagnosis, solve: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
-    """What to try and why, most promising first; never empty."""
+    """Changes to try, each with its reason, the most promising first; never empty."""
     kind = failure_kind(diagnosis, solve)
     if kind == "overflow":
         return [_overflow_advice(diagnosis, now), *_step_advice(scene, now)]
@@ -121,42 +126,42 @@ def advice(diagnosis: Diagnosis, solve: FailedSolve, scene: Scene, now: Circumst
     return found
 
 
-def contact_advice(meets: NearPair, scene: Scene) -> str:
-    """What to change where two parts meet that may not."""
+def contact_advice(pair: NearPair, scene: Scene) -> str:
+    """The change to try if the step failed because this pair would collide."""
     moving = [name for name, obstacle in (scene.obstacles or {}).items() if obstacle.motion]
     handled = any(handle.motion for handle in scene.handles)
-    named = [meets.obstacle] if meets.obstacle in moving else moving
-    who = [f"obstacles.{name}.motion" for name in named]
-    if handled and meets.obstacle not in moving:
-        who.append("the motions of handles")
-    if who:
-        return f"more room for the sheet: {' and '.join(who)} must leave it some"
+    named = [pair.obstacle] if pair.obstacle in moving else moving
+    motions = [f"obstacles.{name}.motion" for name in named]
+    if handled and pair.obstacle not in moving:
+        motions.append("the motions of handles")
+    if motions:
+        return f"more space for the sheet, which is squeezed: change {' and '.join(motions)}"
     if scene.time.scheme in ("static", "beuler"):
         return (
             "slower motion or smaller loads (initial.velocity, gravity, loads, wind), or a larger contact.gap"
         )
-    return f"time.integrator: beuler, which stands impacts that {scene.time.scheme} does not"
+    return f"time.integrator: beuler, which is more robust at impacts than {scene.time.scheme}"
 
 
 def _overflow_advice(diagnosis: Diagnosis, now: Circumstances) -> str:
-    absurd = "smaller numbers where one is absurd, or lost its unit: in "
+    absurd = "smaller numbers where one is absurd, or has the wrong unit: in "
     if not diagnosis.iterate_finite or not diagnosis.overflowing:
         return absurd + "material, gravity, loads, wind, initial, motions, or mesh.transform.scale"
-    if diagnosis.vertex.moved > FAR * now.spacing:
+    if diagnosis.vertex.moved > ABSURD_MOTION * now.spacing:
         return (
             f"{absurd}initial.velocity, motions, gravity and loads (vertex {diagnosis.vertex.number} moves "
             f"{diagnosis.vertex.moved:.3g} m in this step)"
         )
     keys = "; ".join(KEYS.get(name, name) for name in diagnosis.overflowing)
-    return f"{absurd}{keys} (what overflows: {', '.join(diagnosis.overflowing)})"
+    return f"{absurd}{keys} (overflow in: {', '.join(diagnosis.overflowing)})"
 
 
 def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
-    """What is odd at the worst vertex and triangle."""
+    """Advice on extreme values at the vertex and triangle with the largest residual, and on handles."""
     found = []
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
     sizes = diagnosis.jump / now.spacing
-    if diagnosis.handle is not None and sizes > LONG:
+    if diagnosis.handle is not None and sizes > LARGE_MOTION:
         motion = scene.handles[diagnosis.handle].motion
         found.append(
             (f"more time for motions.{motion}" if motion else "a motion without jumps")
@@ -164,26 +169,27 @@ def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> lis
             f"{sizes:.2g} element sizes)"
         )
     small, large = triangle.stretches
-    if small < SOFTENS:
-        law = "; below 1/√3 = 0.577 the St. Venant-Kirchhoff membrane softens"
+    if small < SOFTENS_BELOW:
+        stvk = scene.material[0].law == "stvk"
+        law = "; below 1/√3 = 0.577 the St. Venant-Kirchhoff membrane softens" if stvk else ""
         found.append(
-            f"less squeezing by motions and loads, or a finer mesh that can fold (triangle {triangle.number} "
-            f"is at {small:.3g} of its size{law if scene.material[0].law == 'stvk' else ''})"
+            "less compression by motions and loads, or a finer mesh that can fold "
+            f"(triangle {triangle.number} is at {small:.3g} of its size{law})"
         )
-    if large > STRETCHED:
+    if large > LARGE_STRETCH:
         found.append(
             "less motion or load, or more material.membrane "
             f"(triangle {triangle.number} is stretched to {large:.3g} times its size)"
         )
     if scene.time.scheme != "static":
         for name, keys in (("wind", "wind.velocity"), ("loads", "gravity and loads")):
-            way = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
-            if way > LONG * now.spacing:
+            distance = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
+            if distance > LARGE_MOTION * now.spacing:
                 found.append(
                     f"less {keys}, or a smaller time.step ({name} alone would move vertex {vertex.number} by "
-                    f"{way:.3g} m in this step, {way / now.spacing:.2g} element sizes)"
+                    f"{distance:.3g} m in this step, {distance / now.spacing:.2g} element sizes)"
                 )
-    if triangle.aspect > SLIVER:
+    if triangle.aspect > LARGE_ASPECT_RATIO:
         found.append(
             f"a better mesh (triangle {triangle.number} has an aspect ratio of {triangle.aspect:.3g} at rest)"
         )
@@ -194,7 +200,7 @@ def _linear_advice(solve: FailedSolve, scene: Scene, now: Circumstances) -> list
     direct = "a direct solver: -pc_type lu"
     if now.ranks > 1:
         direct += " -pc_factor_mat_solver_type mumps"
-    if solve.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR:
+    if solve.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR_ITERATIONS:
         return [f"-ksp_max_it above {now.linear_iterations}", direct]
     if solve.ksp_reason == KSP.DIVERGED_INDEFINITE_MAT and scene.solver.hessian != "regularised":
         return ["solver.hessian: regularised", direct]
@@ -204,7 +210,7 @@ def _linear_advice(solve: FailedSolve, scene: Scene, now: Circumstances) -> list
 
 
 def _iteration_advice(solve: FailedSolve, now: Circumstances) -> list[str]:
-    """Whether more iterations would help."""
+    """Advice if the limit of iterations or function evaluations ended the solve."""
     if solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
         return ["a larger -snes_max_funcs"]
     if solve.snes_reason != SNES.DIVERGED_MAX_IT:
@@ -218,30 +224,30 @@ def _iteration_advice(solve: FailedSolve, now: Circumstances) -> list[str]:
     if now.max_iterations < FEW_ITERATIONS:
         return [above]
     return [
-        f"more material.damping (the last of {now.max_iterations} iterations did not lessen the residual)"
+        f"more material.damping (the last of {now.max_iterations} iterations did not reduce the residual)"
     ]
 
 
 def _tolerance_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
-    """Whether the tolerances ask for more than there is."""
-    asked = scene.solver.force_tolerance
-    if diagnosis.scale == 0.0 or diagnosis.norm > NEARLY * diagnosis.scale:
+    """Advice if the solve had almost converged: larger tolerances."""
+    tolerance = scene.solver.force_tolerance
+    if diagnosis.scale == 0.0 or diagnosis.norm > SMALL_RESIDUAL * diagnosis.scale:
         return []
-    share = diagnosis.norm / diagnosis.scale
-    loose = 10.0 ** math.ceil(math.log10(max(2.0 * share, 10.0 * asked)))
+    relative = diagnosis.norm / diagnosis.scale
+    loose = 10.0 ** math.ceil(math.log10(max(2.0 * relative, 10.0 * tolerance)))
     if diagnosis.norm <= NEAR_ROUNDOFF * now.floor:
         return [
             f"solver.force_tolerance: {loose:.0e} and solver.step_tolerance likewise "
-            f"(little more than round-off, {now.floor:.2g} N, is left)"
+            f"(the residual is near its round-off, {now.floor:.2g} N)"
         ]
-    balance = f"(forces balance to {share:.1e} of the largest)"
-    if share <= asked:
+    balance = f"(forces balance to {relative:.1e} of the largest)"
+    if relative <= tolerance:
         return [f"solver.step_tolerance above {scene.solver.step_tolerance:g} {balance}"]
-    return [f"solver.force_tolerance: {loose:.0e}, if that will do {balance}"]
+    return [f"solver.force_tolerance: {loose:.0e}, if that is accurate enough {balance}"]
 
 
 def _step_advice(scene: Scene, now: Circumstances) -> list[str]:
-    if now.nominal > MANY_CUTS * now.dt:
+    if now.nominal > LARGE_CUT * now.dt:
         return []
     if scene.time.scheme == "static":
         return ["a smaller time.step (first increment of the load), or a damped motion instead"]

@@ -1,8 +1,8 @@
-"""Where a failed solve is worst, and what is odd there: from each rank's arrays to a few numbers.
+"""Diagnosis of a failed solve: norms, the vertex and triangle with the largest residual, and their state.
 
-Everything here is collective, and every rank gets the same answer. Vertices and triangles are named by
-their numbers in the mesh; of several that are equally bad, the one of the smallest number is named, so
-that the answer does not depend on the number of ranks.
+All functions are collective and return the same on every rank. Vertices and triangles have their numbers in
+the mesh. Among equal residuals the smallest number is chosen, so that the result does not depend on the
+number of ranks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Vertex:
     ----------
     number : int
     tag : int
-        What the .msh file calls it, where that is another number; else 0.
+        Node tag in the .msh file, if it differs from the number; else 0.
     position, before : tuple of 3 floats
         At the failing iterate and before the step [m].
     residual : tuple of 3 floats
@@ -42,7 +42,7 @@ class Vertex:
     forces : dict of name → float
         Norms [N] of the parts of the residual.
     moved : float
-        Way from the position before the step [m].
+        Distance from the position before the step [m].
     mass : float
         [kg].
     """
@@ -85,26 +85,26 @@ class Triangle:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a failed solve looks like.
+    """Global measures of a failed solve, and its worst vertex and triangle.
 
     Attributes
     ----------
     norm : float
-        Of the residual on the free coordinates [N].
+        Norm of the residual on the free coordinates [N].
     scale : float
-        Norm of the largest of its parts [N], of those that are finite.
+        Largest norm of its finite parts [N].
     not_finite : int
-        Vertices whose residual is not a finite number.
+        Number of vertices whose residual is not finite.
     iterate_finite : bool
         Whether the velocities are finite.
     overflowing : list of str
-        Parts of the residual that hold such numbers.
+        Names of the parts of the residual that are not finite.
     vertex : Vertex
     triangle : Triangle
     handle : int or None
-        The handle that moves its vertices furthest in the step; None if none moves any.
+        The handle with the largest prescribed displacement in the step; None if no handle moves.
     jump : float
-        That way [m].
+        This displacement [m].
     """
 
     norm: float
@@ -127,20 +127,19 @@ def diagnose(
     mass: Array,
     tags: Array | None,
 ) -> Diagnosis:
-    """Look at where a solve stands.
+    """Diagnose a failed solve.
 
     Parameters
     ----------
     points : Layout
     membrane : Membrane
-        For its triangles.
     held : ExactHandles
     solve : FailedSolve
     x : (n_owned, 3) or more rows
         Positions before the step [m].
     mass : (n_owned,) [kg]
     tags : (n_owned,) or None
-        Of the .msh file.
+        Node tags in the .msh file.
     """
     comm, n = points.comm, points.n_vertices
     solve = solve.of_vertices(n)
@@ -169,7 +168,7 @@ def _squared_norm(comm: MPI.Comm, rows: Array) -> float:
 
 
 def _norms(rows: Array) -> Array:
-    """Norms of the rows, whose squares may overflow; infinite where a number is not finite."""
+    """Norms of rows, without overflow of their squares; infinite for a row that is not finite."""
     largest = np.abs(rows).max(axis=-1, initial=0.0)
     usable = np.isfinite(largest) & (largest > 0.0)
     scale = np.where(usable, largest, 1.0)[..., None]
@@ -178,17 +177,17 @@ def _norms(rows: Array) -> Array:
 
 
 def describe_worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
-    """``describe`` the row of the largest size, of the smallest number among equals; collective.
+    """Describe the row with the largest size, among equals that with the smallest number; collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     sizes : (n,)
-        Of this rank's rows; not NaN, may be infinite. Some rank has a row.
+        Sizes of this rank's rows; not NaN, may be infinite. At least one rank has a row.
     numbers : (n,) int64
-        Unique over all ranks.
+        Numbers of the rows, unique over all ranks.
     describe : callable
-        From a row to what all ranks shall know; called on the rank that has it.
+        Returns the description of a row; called on the rank that has the row, and broadcast.
     """
     largest = comm.allreduce(float(sizes.max(initial=-np.inf)), MPI.MAX)
     bad = np.flatnonzero(sizes >= largest * (1.0 - TIE)) if len(sizes) else np.empty(0, np.int64)
@@ -227,21 +226,21 @@ def _vertex(
 
 def _triangle(points: Layout, membrane: Membrane, solve: FailedSolve, residual: Array) -> Triangle:
     n, owned = points.n_vertices, membrane.n_owned
-    # with the ghosts: residual norms and mesh numbers, and positions
-    known, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
-    known[:n, 0], known[:n, 1] = _norms(residual), points.mesh_vertices
+    # triangles need residual norms and mesh numbers, in two columns, and positions of ghosts, too
+    norm_and_number, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
+    norm_and_number[:n, 0], norm_and_number[:n, 1] = _norms(residual), points.mesh_vertices
     position[:n] = solve.position
-    points.update_ghosts(known)
+    points.update_ghosts(norm_and_number)
     points.update_ghosts(position)
     stencil = membrane.stencil[:owned]
-    sizes = _norms(known[:, 0][stencil])
+    sizes = _norms(norm_and_number[stencil, 0])
     inverse = membrane.elements.data["inverse"]
 
     def describe(row: int) -> Triangle:
         corners = position[stencil[row]]
         return Triangle(
             number=int(membrane.elements.index[row]),
-            vertices=tuple(int(number) for number in known[stencil[row], 1]),
+            vertices=tuple(int(number) for number in norm_and_number[stencil[row], 1]),
             centre=_floats(corners.mean(axis=0)),
             residual=float(sizes[row]),
             aspect=_aspect(inverse[row]),
@@ -252,7 +251,7 @@ def _triangle(points: Layout, membrane: Membrane, solve: FailedSolve, residual: 
 
 
 def _aspect(inverse: Array) -> float:
-    """Longest side over shortest height of a triangle of this inverse rest matrix (2, 2)."""
+    """Longest side over shortest height of the triangle with this inverse rest matrix (2, 2)."""
     first, second = np.linalg.inv(inverse).T
     longest = max(float(side @ side) for side in (first, second, second - first))
     return longest * abs(float(np.linalg.det(inverse)))
@@ -268,16 +267,16 @@ def _stretches(corners: Array, inverse: Array) -> tuple[float, ...]:
 def _largest_handle_motion(
     comm: MPI.Comm, held: ExactHandles, solve: FailedSolve, x: Array
 ) -> tuple[int | None, float]:
-    """The handle that moves its vertices furthest, and how far [m]."""
-    ways = _norms(np.where(solve.prescribed, solve.goal - x, 0.0))
+    """The handle with the largest prescribed displacement of a vertex, and this displacement [m]."""
+    distances = _norms(np.where(solve.prescribed, solve.goal - x, 0.0))
     numbers = held.numbers
     if not numbers:
         return None, 0.0
-    local = np.array([ways[held.vertices(number)].max(initial=0.0) for number in numbers])
-    furthest = np.empty_like(local)
-    comm.Allreduce(local, furthest, MPI.MAX)
-    first = int(np.argmax(furthest))
-    return (numbers[first], float(furthest[first])) if furthest[first] > 0.0 else (None, 0.0)
+    local = np.array([distances[held.vertices(number)].max(initial=0.0) for number in numbers])
+    largest = np.empty_like(local)
+    comm.Allreduce(local, largest, MPI.MAX)
+    first = int(np.argmax(largest))
+    return (numbers[first], float(largest[first])) if largest[first] > 0.0 else (None, 0.0)
 
 
 def _floats(row: Array) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Why a run cannot go on, in words: one sentence, a few lines, and the whole."""
+"""Report of a failed step: as one sentence, as a few lines for the terminal, and as a text for a file."""
 
 from __future__ import annotations
 
@@ -15,13 +15,26 @@ from lyra_petsc.stepping.near_pairs import NearPair
 from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.stepper import Attempt
 
-FEW = 8
-"""Iterations, and attempts, that are all shown in the few lines."""
+MAX_SHOWN = 8
+"""Largest number of iterations, or of attempts, that the few lines show without abridging them."""
 
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """One attempt that failed: its Δt [s] (increment of the load factor), linear solver, and end."""
+    """A failed attempt at a step.
+
+    Attributes
+    ----------
+    dt : float
+        Length [s], or increment of the load factor.
+    solver : str
+        Preset of the linear solver.
+    newton_iterations, linear_iterations : int
+    residual : float
+        Norm of the last residual [N].
+    words : str
+        Why it failed.
+    """
 
     dt: float
     solver: str
@@ -32,7 +45,7 @@ class FailedAttempt:
 
     @classmethod
     def of(cls, attempt: Attempt, dt: float, solver: str) -> FailedAttempt:
-        """From the stepper's outcome."""
+        """The record of a stepper's failed attempt."""
         iterations = attempt.newton_iterations, attempt.linear_iterations
         norm = attempt.residual if attempt.failed_solve is None else attempt.failed_solve.norm
         return cls(dt, solver, *iterations, norm, attempt.message)
@@ -45,24 +58,24 @@ class Failure:
     Attributes
     ----------
     step : int
-        Its number, from 1.
+        Number of the step, from 1.
     time, dt : float
         Start and length [s] of the last attempt; load factors in a static analysis.
     static : bool
     kind : str
         ``overflow``, ``linear trouble`` or ``nonlinear trouble``.
     tried : list of FailedAttempt
-        All attempts at this step, the last one last.
+        All attempts at this step, in order.
     diagnosis : Diagnosis
     advice : list of str
     sources : list of Source
-        Of the mesh.
+        Sources of the mesh.
     failed_solve : FailedSolve
-        The last attempt's arrays, of this rank.
+        This rank's arrays of the last attempt.
     near : NearPair or None
-        With contact, what would meet in the last attempt, else what is nearest where it stands.
+        In a scene with contact: the pair that would collide in the last attempt, else the nearest pair.
     obstacle : NearPair or None
-        Where these are parts of sheets, the nearest obstacle that they touch.
+        The nearest touching pair with an obstacle, if ``near`` is a pair of sheets.
     """
 
     step: int
@@ -80,12 +93,12 @@ class Failure:
 
     @property
     def now(self) -> str:
-        """Where the step starts."""
+        """Text for the time or load factor at the start of the step."""
         return f"load factor {self.time:g}" if self.static else f"t = {self.time:g} s"
 
     @property
     def sentence(self) -> str:
-        """What happened, where, and what to try, in one line."""
+        """One line: what failed, where, and the first advice."""
         last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
         near = f": {_pair_text(self.near)}" if self.near is not None and self.near.blocks else ""
         what = f"{self.tried[-1].words}{near}"
@@ -102,26 +115,26 @@ class Failure:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The rest, short."""
+        """Short lines with the iterations, the worst vertex and triangle, and further advice."""
         history = ", ".join(_shortened([_iteration_text(each) for each in self.failed_solve.iterations]))
         found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
         found += [line for line in (self._linear(), self._earlier()) if line]
-        found += self._places()
+        found += self._worst_elements()
         return (*found, *(f"or try {words}" for words in self.advice[1:4]))
 
     @property
     def text(self) -> str:
-        """Everything, for a file."""
+        """The whole report, for a file."""
         rows = [self.sentence, "", "Attempts at this step:"]
         rows += [f"  {self._attempt(each)}: {each.words}" for each in self.tried]
         rows += ["", "The last attempt, Newton iteration by iteration:"]
-        rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}  part taken"]
+        rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}    fraction"]
         for number, each in enumerate(self.failed_solve.iterations):
             part = "" if each.taken is None else f"{each.taken:.3g}"
             linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
             rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
         rows += ["", "Where (vertices and triangles are counted from 0, in file order):"]
-        rows += [f"  {line}" for line in self._places()]
+        rows += [f"  {line}" for line in self._worst_elements()]
         rows += ["", "What to try:", *(f"  {words}" for words in self.advice)]
         if self._linear():
             rows += ["", "The last linear solve, residual norm by iteration:"]
@@ -130,7 +143,7 @@ class Failure:
         return "\n".join(rows) + "\n"
 
     def content(self) -> dict[str, Any]:
-        """For the summary."""
+        """Entries of summary.json."""
         return {
             "step": self.step,
             "load_factor" if self.static else "time": self.time,
@@ -153,7 +166,7 @@ class Failure:
         )
 
     def _earlier(self) -> str:
-        """The attempts before the last one."""
+        """A line on the attempts before the last one; empty if there was only one."""
         each = [
             f"{tried.dt:.3g}: {tried.residual:.3g} ({tried.newton_iterations})" for tried in self.tried[:-1]
         ]
@@ -162,20 +175,21 @@ class Failure:
         return f"attempts before, {step}: residual [N] (Newton iterations): {shown}" if each else ""
 
     def _linear(self) -> str:
-        """The linear solve, where it is what failed."""
+        """A line on the last linear solve; empty unless it is the cause."""
         norms = self.failed_solve.linear_residuals
         if self.kind != "linear trouble" or len(norms) < 2:
             return ""
         return f"last linear solve: residual {norms[0]:.3g} → {norms[-1]:.3g} in {len(norms) - 1} iterations"
 
-    def _places(self) -> list[str]:
+    def _worst_elements(self) -> list[str]:
+        """Lines on the worst vertex and triangle, and on the nearest pair."""
         vertex, triangle = self.diagnosis.vertex, self.diagnosis.triangle
         forces = ", ".join(f"{name} {size:.3g}" for name, size in vertex.forces.items())
         size = math.hypot(*vertex.residual)
         many = self.diagnosis.not_finite
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),
-            *([f"nearest, or in the way: {_pair_text(self.near)}"] if self.near is not None else []),
+            *([f"nearest or colliding: {_pair_text(self.near)}"] if self.near is not None else []),
             *([f"nearest obstacle: {_pair_text(self.obstacle)}"] if self.obstacle is not None else []),
             f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
             f"residual {size:.3g} N of forces [N] {forces}",
@@ -198,15 +212,18 @@ class Failure:
         return f"triangle {whole}" + (f" (triangle {number} of {label})" if len(self.sources) > 1 else "")
 
     def _within(self, number: int, counts: Sequence[int]) -> tuple[str, int]:
-        """The source that has a vertex or triangle, and its number there."""
+        """The mesh source of a vertex or triangle, and its number in this source.
+
+        ``counts`` are the numbers of vertices or triangles of the sources.
+        """
         ends = np.cumsum(counts)
         which = int(np.searchsorted(ends, number, side="right"))
         return self.sources[which].label, number - int(ends[which] - counts[which])
 
 
 def _pair_text(near: NearPair) -> str:
-    """A pair, and what is left between its parts."""
-    beyond = f" beside contact.thickness = {near.kept:g} m" if near.kept else ""
+    """A pair and its separation."""
+    beyond = f" beyond contact.thickness = {near.kept:g} m" if near.kept else ""
     return f"{near.text} {near.gap:.3g} m apart{beyond}"
 
 
@@ -217,7 +234,7 @@ def _iteration_text(each: Iteration) -> str:
 
 
 def _shortened(entries: list[str]) -> list[str]:
-    return entries if len(entries) <= FEW else [*entries[:3], "…", *entries[-4:]]
+    return entries if len(entries) <= MAX_SHOWN else [*entries[:3], "…", *entries[-4:]]
 
 
 def _point(position: Sequence[float], digits: int = 6) -> str:

@@ -1,7 +1,7 @@
-"""What terms keep in a checkpoint beside positions and velocities, for any number of ranks; collective.
+"""State of the terms in a checkpoint, independent of the number of ranks; collective.
 
-Of vertices and of edges with an unknown by ``term.name``; of elements that change with the vertices' numbers
-in the mesh.
+Entries of vertices and of edges have the key ``term.entry``. Entries of elements are identified by the
+numbers of the vertices in the mesh.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lyra_petsc.terms.term import Elastic
 
 
 def vertex_arrays(system: StageEquations) -> dict[str, Array]:
-    """Arrays (n_vertices, 3) of the owned vertices."""
+    """The terms' arrays (n_vertices, 3) of the owned vertices, by key."""
     return {
         f"{term.name}.{name}": values
         for term in system.active.elastic
@@ -25,7 +25,7 @@ def vertex_arrays(system: StageEquations) -> dict[str, Array]:
 
 
 def edge_arrays(system: StageEquations) -> dict[str, Array]:
-    """Arrays (n_edges,) of the owned edges with an unknown."""
+    """The terms' arrays (n_edges,) of the owned edges with an unknown, by key."""
     layout, found = system.points, {}
     for term in system.active.elastic:
         for name, values in term.edge_state().items():
@@ -36,7 +36,7 @@ def edge_arrays(system: StageEquations) -> dict[str, Array]:
 
 
 def element_arrays(system: StageEquations) -> dict[str, Array]:
-    """Of elements (E, n + m) each, of which the first n are numbers of vertices in the mesh."""
+    """Rows (E, n + m) of owned elements, by term: n mesh numbers of vertices, then m values."""
     layout, found = system.points, {}
     for term in system.active.elastic:
         if term.registration.element_vertices:
@@ -53,8 +53,10 @@ def element_arrays(system: StageEquations) -> dict[str, Array]:
 def restore_fixed(
     system: StageEquations, edges: Mapping[str, Array], elements: Mapping[str, tuple[Ints, Array]]
 ) -> None:
-    """Let terms go on with what is of edges, and of elements that stay: given by global numbers (E, n), on
-    any rank.
+    """Restore the state of edges, and of elements with fixed stencils.
+
+    ``elements`` has for each term the global numbers (E, n) of vertices and the values (E, m) of elements,
+    each on any rank.
     """
     for term in system.active.elastic:
         if term.registration.edge_state:
@@ -67,7 +69,7 @@ def restore_fixed(
 def restore_changing(
     system: StageEquations, arrays: Mapping[str, Array], elements: Mapping[str, tuple[Ints, Array]]
 ) -> None:
-    """Let them go on with what is of vertices, and of elements that come and go with what is near."""
+    """Restore the state of vertices, and of elements with changing stencils (pairs that are near)."""
     layout = system.points
     for term in system.active.elastic:
         if term.registration.state:
@@ -80,17 +82,17 @@ def restore_changing(
 
 
 def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:
-    """Elements of all ranks that have a vertex of this one."""
+    """Exchange elements so that each rank gets those with a vertex that it owns."""
     layout, comm = system.points, system.points.comm
     owner = np.searchsorted(layout.bounds, vertices, side="right") - 1
     sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
-    came = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
-    vertices, values = (np.concatenate(part) for part in zip(*came, strict=True))
+    received = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
+    vertices, values = (np.concatenate(part) for part in zip(*received, strict=True))
     return vertices, values
 
 
 def _restore_edges(system: StageEquations, term: Elastic, edges: Mapping[str, Array]) -> None:
-    """Let a term go on with what is of edges, those of ghosts too."""
+    """Restore a term's state of edges, ghosts included."""
     layout, state = system.points, {}
     for name in term.registration.edge_state:
         rows = np.zeros((layout.n_local, 3))
@@ -101,10 +103,13 @@ def _restore_edges(system: StageEquations, term: Elastic, edges: Mapping[str, Ar
 
 
 def _restore_values(term: Elastic, own: Ints, vertices: Ints, values: Array) -> None:
-    """Let a term whose elements have these vertices (E, n) go on with values (k, m) of others (k, n), among
-    which they are; those that are not keep what they have.
+    """Restore the values of a term's elements.
+
+    ``own`` (E, n) are the vertices of its elements, ``vertices`` (k, n) and ``values`` (k, m) those of the
+    checkpoint, in another order. Elements that are not in the checkpoint keep their values.
     """
-    found, now = {tuple(key): row for row, key in enumerate(vertices.tolist())}, term.element_values().copy()
-    rows = np.array([found.get(tuple(key), -1) for key in own.tolist()], dtype=np.int64)
-    now[rows >= 0] = values[rows[rows >= 0]]
-    term.restore_values(now)
+    row_of = {tuple(key): row for row, key in enumerate(vertices.tolist())}
+    rows = np.array([row_of.get(tuple(key), -1) for key in own.tolist()], dtype=np.int64)
+    restored = term.element_values().copy()
+    restored[rows >= 0] = values[rows[rows >= 0]]
+    term.restore_values(restored)

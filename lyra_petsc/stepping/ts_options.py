@@ -1,7 +1,7 @@
-"""PETSc's options of the TS: which integrator and which control of the steps they choose.
+"""The integrator and the step control that PETSc's TS options choose.
 
-``-ts_type`` and ``-ts_adapt_type`` win over a scene's ``time``. The TS itself only solves for the stage of
-the integrator, so that it must not see them (`hidden_options`).
+``-ts_type`` and ``-ts_adapt_type`` override a scene's ``time``. The TS itself only solves for the stage of
+the integrator, so it must not read them (`hidden_options`).
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ ALLOWED = (
     "beuler, theta (-ts_theta_theta 0.5: midpoint, 1: beuler), bdf (-ts_bdf_order 2: bdf2) and alpha2; "
     "without -ts_type it is the scene's time.integrator"
 )
-"""What -ts_type may be."""
+"""The values of ``-ts_type`` that are accepted, for a message."""
 
 TOLERANCE = 1e-3
-"""Of ``-ts_adapt_type basic`` where the scene has no ``time.tolerance``."""
+"""Tolerance for ``-ts_adapt_type basic`` if the scene has no ``time.tolerance``."""
 
 STEP_OPTIONS = ("ts_dt", "ts_time_step")
-"""Names of Δt: that of PETSc up to 3.24, and that of PETSc from 3.25 on."""
+"""Names of the option for Δt: in PETSc up to 3.24, and from 3.25 on."""
 
 OWN_OPTIONS = ("ts_type", "ts_theta_theta", "ts_bdf_order", "ts_adapt_type", *STEP_OPTIONS)
-"""Options that are not for the TS that solves the stages."""
+"""Options that the TS which solves the stages must not read."""
 
 
 def step_option() -> str:
-    """Which of `STEP_OPTIONS` is in the database; the first where none is.
+    """The one of `STEP_OPTIONS` that is set, or the first if none is.
 
     Raises
     ------
     InputError
-        If both are.
+        If both are set.
     """
     given = [name for name in STEP_OPTIONS if is_set(name)]
     if len(given) > 1:
@@ -48,12 +48,12 @@ def step_option() -> str:
 
 
 def with_ts_options(scene: Scene) -> Scene:
-    """The scene with the integrator and the kind of steps that PETSc's options ask for.
+    """The scene with the integrator and the step control of the PETSc options.
 
     Raises
     ------
     InputError
-        For what no integrator of ours is.
+        If there is no such integrator or step control.
     """
     if is_set("ts_theta_endpoint"):
         raise InputError("has no meaning for the stage equations; leave it out", key="-ts_theta_endpoint")
@@ -72,6 +72,7 @@ def with_ts_options(scene: Scene) -> Scene:
 
 
 def _integrator(time: Time) -> dict[str, Any]:
+    """Entries of ``time`` that ``-ts_type`` changes."""
     kind = PETSc.Options().getString("ts_type", "")
     if not is_set("ts_type"):
         for name, type_ in (("ts_theta_theta", "theta"), ("ts_bdf_order", "bdf")):
@@ -96,6 +97,7 @@ def _integrator(time: Time) -> dict[str, Any]:
 
 
 def _steps(time: Time) -> dict[str, Any]:
+    """Entries of ``time`` that ``-ts_adapt_type`` changes."""
     if not is_set("ts_adapt_type"):
         return {}
     kind = PETSc.Options().getString("ts_adapt_type", "")
@@ -119,7 +121,7 @@ def _steps(time: Time) -> dict[str, Any]:
 
 @contextmanager
 def hidden_options() -> Iterator[None]:
-    """Keep `OWN_OPTIONS` from a TS that reads its options meanwhile."""
+    """A context in which `OWN_OPTIONS` are not in the database, so that a TS does not read them."""
     database = PETSc.Options()
     kept = {name: database.getString(name, "") for name in OWN_OPTIONS if is_set(name)}
     for name in kept:
@@ -129,4 +131,4 @@ def hidden_options() -> Iterator[None]:
     finally:
         for name, value in kept.items():
             database.setValue(name, value)
-            database.getString(name, "")  # it was used
+            database.getString(name, "")  # marks the option as used

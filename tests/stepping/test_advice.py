@@ -66,9 +66,9 @@ def advised(
         (replace(DIAGNOSIS, triangle=replace(TRIANGLE, aspect=1e3)), NOW, "aspect ratio of 1e+03"),
         (replace(DIAGNOSIS, vertex=replace(VERTEX, forces={"wind": 10.0})), replace(NOW, dt=0.1),
          "less wind.velocity, or a smaller time.step (wind alone would move vertex 4 by 0.1 m"),
-        (replace(DIAGNOSIS, norm=1e-5), NOW, "solver.force_tolerance: 1e-05, if that will do"),
+        (replace(DIAGNOSIS, norm=1e-5), NOW, "solver.force_tolerance: 1e-05, if that is accurate enough"),
         (replace(DIAGNOSIS, norm=1e-7, scale=1.0), NOW, "solver.step_tolerance above 1e-09"),
-        (replace(DIAGNOSIS, norm=1e-11), NOW, "little more than round-off"),
+        (replace(DIAGNOSIS, norm=1e-11), NOW, "the residual is near its round-off"),
         (DIAGNOSIS, replace(NOW, dt=0.005), "-ts_adapt_dt_min below 0.005"),
     ],
 )  # fmt: skip

@@ -49,7 +49,7 @@ def test_the_obstacle_that_blocks_a_sheet_is_named(comm: MPI.Comm) -> None:
     assert 0.0 < failure.near.gap < 1e-3
     assert f"{failure.near.text} {failure.near.gap:.3g} m apart" in text
     assert f"and the obstacle '{failure.near.obstacle}', around (" in text
-    assert "try more room for the sheet: obstacles.plate.motion must leave it some" in text
+    assert "try more space for the sheet, which is squeezed: change obstacles.plate.motion" in text
     assert len(failure.advice) == 1  # no number is absurd where there is no room
     assert failure.content()["near"]["obstacle"] == failure.near.obstacle
     assert simulation.energy_balance.columns()["smallest_gap"] > 0.0

@@ -1,4 +1,4 @@
-"""Time integrators: one module and one line in ``CLASSES`` each; what a scene names is imported."""
+"""Time integrators: each has a module, imported only if a scene names it, and a line in ``CLASSES``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ CLASSES = {
     "bdf2": ("bdf2", "Bdf2"),
     "static": ("static", "Static"),
 }
-"""A scene's ``time.integrator`` to module and class."""
+"""Module and class of each value of a scene's ``time.integrator``."""
 
 
 def integrator_of(integrator: str, radius: float | None) -> Integrator:
-    """The integrator of a scene's ``time.integrator``; ``radius`` is for ``alpha2``."""
+    """The integrator of this name; ``radius`` is the spectral radius of ``alpha2``, else None."""
     module, name = CLASSES[integrator]
     kind: Callable[..., Integrator] = getattr(
         import_module(f"lyra_petsc.stepping.integrators.{module}"), name

@@ -12,12 +12,12 @@ from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
 
 
 class GeneralisedAlpha(Integrator):
-    """Generalised-α: second order, high frequencies damped to ``radius`` a step.
+    """Generalised-α: second order, with numerical damping of high frequencies.
 
     Parameters
     ----------
     radius : float
-        Spectral radius at infinite frequency, 0 (gone in a step) to 1 (kept).
+        Spectral radius at infinite frequency, from 0 (gone after one step) to 1 (undamped).
     """
 
     name = "alpha2"
@@ -36,7 +36,7 @@ class GeneralisedAlpha(Integrator):
 
     @property
     def error_constant(self) -> float:
-        # the accelerations it keeps lag by (γ − ½) Δt
+        # the stored accelerations lag by (γ − ½) Δt
         return abs(1.0 / 6.0 - self._beta + 0.5 * (self._gamma - 0.5))
 
     @property
@@ -66,8 +66,8 @@ class GeneralisedAlpha(Integrator):
         gamma, beta = self._gamma, self._beta
         change = (stage_velocity - v) / ((1.0 - self._af) * dt)
         self._next = (change - (1.0 - gamma) * self._a) / gamma
-        moved = x + dt * v + dt * dt * ((0.5 - beta) * self._a + beta * self._next)
-        return moved, v + dt * ((1.0 - gamma) * self._a + gamma * self._next)
+        x_end = x + dt * v + dt * dt * ((0.5 - beta) * self._a + beta * self._next)
+        return x_end, v + dt * ((1.0 - gamma) * self._a + gamma * self._next)
 
     def record_step(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         assert self._next is not None

@@ -13,12 +13,12 @@ from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
 
 
 class Bdf2(Integrator):
-    """Backward differentiation: second order, stiff motions damped.
+    """Backward differentiation formula of second order, which damps stiff motions.
 
-    Over two past states; over three where the steps are equal, then with 48 % of the third-order formula,
-    which keeps the second-order one's damping (L-stable) and halves its error: BDF2OPT, Vatsa, Carpenter &
-    Lockard, AIAA 2010-122. The first step, and that after a jump of the forces, is one of generalised-α with
-    spectral radius 0.
+    Its history has two states. If the last steps are equal it has three, with 48 % of the third-order formula
+    added: that is still L-stable and halves the error (BDF2OPT; Vatsa, Carpenter & Lockard, AIAA 2010-122).
+    The first step, and the first after a jump of the forces, is a step of generalised-α with spectral
+    radius 0.
     """
 
     name = "bdf2"
@@ -27,10 +27,10 @@ class Bdf2(Integrator):
     gain_window = 4
 
     SHARE = 0.48
-    """Of the third-order formula; up to 0.5 is A-stable."""
+    """Weight of the third-order formula; A-stable up to 0.5."""
 
     SAME = 1e-6
-    """Steps that differ by less than this fraction are equal."""
+    """Relative difference below which two steps count as equal."""
 
     def __init__(self) -> None:
         self._starter = GeneralisedAlpha(0.0)
@@ -63,7 +63,7 @@ class Bdf2(Integrator):
         return dt
 
     def weights(self, dt: float) -> tuple[float, list[float]]:
-        """σ [1/s], and the weights of the present and the past states in the history (their sum is 1)."""
+        """σ [1/s], and the weights, with sum 1, of the present and the past states in the history."""
         r = dt / self._past[0][2]
         if len(self._past) > 1 and all(abs(dt / step - 1.0) < self.SAME for _, _, step in self._past):
             second, third = (1.5, -2.0, 0.5, 0.0), (11.0 / 6.0, -3.0, 1.5, -1.0 / 3.0)
@@ -75,6 +75,7 @@ class Bdf2(Integrator):
         return lead / dt, [(1.0 + r) ** 2 / (1.0 + 2.0 * r), -r * r / (1.0 + 2.0 * r)]
 
     def _history(self, x: Array, v: Array, dt: float) -> tuple[float, Array, Array]:
+        """σ [1/s] and the histories x_h [m] and v_h [m/s]."""
         sigma, (now, *before) = self.weights(dt)
         x_h, v_h = now * x, now * v
         for weight, (past_x, past_v, _) in zip(before, self._past, strict=False):

@@ -7,7 +7,7 @@ from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
 
 
 class BackwardEuler(Integrator):
-    """x_{n+1} = x_n + Δt v_{n+1}: first order, damps every motion it does not resolve."""
+    """x_{n+1} = x_n + Δt v_{n+1}: first order; damps every motion that the steps do not resolve."""
 
     name = "beuler"
     error_constant = 0.5
@@ -23,7 +23,7 @@ class BackwardEuler(Integrator):
 
 
 class SemiImplicit(BackwardEuler):
-    """One Newton iteration of backward Euler from the start of the step, the paper's method."""
+    """The paper's method: one Newton iteration of backward Euler, from the state at the start of the step."""
 
     name = "semi-implicit"
     lagged_loads = True
@@ -31,6 +31,6 @@ class SemiImplicit(BackwardEuler):
 
 
 class LaggedBackwardEuler(BackwardEuler):
-    """All Newton iterations of a step whose first one the semi-implicit method takes."""
+    """Backward Euler with the loads of `SemiImplicit`, for steps in which one iteration is not enough."""
 
     lagged_loads = True

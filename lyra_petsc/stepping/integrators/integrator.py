@@ -1,11 +1,11 @@
-"""What every integrator is: one implicit solve a step, for the velocity of its stage.
+"""Base class of the integrators: one implicit solve per step, for the velocities of its stage.
 
-Every integrator is a choice of what the stage's accelerations and positions are in its velocities v::
+An integrator defines accelerations and positions of the stage as functions of its velocities v::
 
     v̇ = σ (v − v_h)        x = x_h + c v
 
-with the history v_h, x_h and the numbers σ [1/s], c [s] of the step; and of what the stage says about
-the end of the step. Arrays only, rows of the owned vertices.
+with the history x_h, v_h and the numbers σ [1/s], c [s] of the step, and the state at the end of the step as
+a function of the stage. All arrays have a row for each owned block row.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ class Stage:
 
 
 class NeedsAcceleration(Protocol):
-    """What depends on the accelerations at the start of a step."""
+    """An object that needs the accelerations at the start of some steps."""
 
     @property
     def needs_acceleration(self) -> bool:
-        """Whether it must be told them now."""
+        """Whether `set_acceleration` must be called before the step."""
 
     def set_acceleration(self, acceleration: Array) -> None:
-        """Take them, (n_owned, 3) [m/s²]."""
+        """Set the accelerations (n_owned, 3) [m/s²] at the start of the step."""
 
     def restart(self) -> None:
-        """Forces jump at the start of the coming step."""
+        """Prepare for a jump of the forces at the start of the next step."""
 
 
 class NoHistory:
@@ -69,24 +69,25 @@ class NoHistory:
         return False
 
     def set_acceleration(self, acceleration: Array) -> None:
-        """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
+        """Set the accelerations (n_owned, 3) [m/s²] at the start of the step."""
 
     def restart(self) -> None:
-        """Forces jump at the start of the coming step: forget accelerations."""
+        """Discard the history, as forces jump at the start of the next step."""
 
     def record_step(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
-        """Remember the step that led from x, v; ``free`` marks the coordinates nothing prescribed."""
+        """Add the accepted step from x, v to the history; ``free`` marks the unknowns not prescribed."""
 
     def shift_past_positions(self, change: Array) -> None:
-        """Add ``change`` (n_owned, 3) [m] to remembered positions, as their reference is another."""
+        """Add ``change`` (n_owned, 3) [m] to the past positions, after a change of their reference."""
 
     def shift_past_velocities(self, change: Array) -> None:
-        """Velocities jump by ``change`` (n_owned, 3) [m/s] at the end of the step: change what is remembered
-        as if they had been so before, too.
+        """Add ``change`` (n_owned, 3) [m/s] to the past velocities, and adapt the past positions.
+
+        It is for a jump of the velocities at the end of the step, so that the history has no jump.
         """
 
     def saved_state(self) -> tuple[Arrays, dict[str, float]]:
-        """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
+        """Arrays (n_owned, 3) and numbers of the history, for checkpoints and `restore`."""
         return {}, {}
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
@@ -94,35 +95,36 @@ class NoHistory:
 
 
 class Integrator(NoHistory, ABC):
-    """One integrator and what it remembers between steps.
+    """An integrator and its history.
 
     Attributes
     ----------
     name : str
-        As in a scene's ``time.integrator``.
+        Its name in a scene's ``time.integrator``.
     order : int
-        Of the positions at a fixed time in Δt.
+        Order of accuracy of the positions.
     ts_type : str
-        The TS that solves the stage: ``theta`` (½) for the midpoint rule, else ``beuler``, which is given the
-        history in place of the last velocities.
+        The TS that solves the stage: ``theta`` (½) for the midpoint rule, else ``beuler`` with the history in
+        place of the last velocities.
     lagged_loads : bool
-        Velocity-dependent loads are taken at the start of the step.
+        Whether velocity-dependent loads are those at the start of the step.
     iterates : bool
-        Newton's method solves for the stage; else one linear solve does.
+        Whether Newton's method solves for the stage, not a single linear solve.
     dynamic : bool
-        It is a motion in time, with damping.
+        Whether it is a motion in time; False for static analyses.
     centred : bool
-        What is frozen during a step is frozen at the extrapolated stage, as second order needs.
+        Whether data are frozen at the extrapolated stage, as second order requires.
     gain_window : int
-        Steps over which its gain of energy is averaged before it is judged: a scheme of several steps gives
-        back in the next ones what it has taken in one.
+        Number of steps over which the energy guard averages gains: multistep methods alternate between gains
+        and losses.
     exact_work : bool
-        Kinetic energy changes by just the work of the stage's forces, so that it is known what contact adds.
+        Whether the change of kinetic energy is exactly the work of the stage's forces, so that the energy
+        that contact adds is known.
     surplus : float
-        Energy [J] that it has added and not yet lost again, where that is known.
+        Energy [J] that contact has added and that is not yet removed, if ``exact_work``.
     handles_at_stage : bool
-        Prescribed coordinates take part in the stage with their exact position and velocity at its
-        time; else with the velocity that the integrator gives them for their position at the end.
+        Whether prescribed unknowns have their exact positions and velocities at the time of the stage. If
+        not, they have the velocity with which the integrator reaches their position at the end of the step.
     """
 
     name: ClassVar[str]
@@ -139,13 +141,13 @@ class Integrator(NoHistory, ABC):
 
     @property
     def starts_at_rest(self) -> bool:
-        """Whether a solve starts where the sheet is, at rest."""
+        """Whether a solve starts from the positions at the start of the step, at rest."""
         return not (self.iterates and self.dynamic)
 
     @property
     @abstractmethod
     def error_constant(self) -> float:
-        """Local error of the positions in the last step over Δt² ẍ (order 1) or Δt³ x⃛ (order 2)."""
+        """Local error of the positions in a step over Δt² ẍ (order 1) or Δt³ x⃛ (order 2)."""
 
     @abstractmethod
     def stage_offset(self, dt: float) -> float:

@@ -9,7 +9,7 @@ from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
 
 
 class Midpoint(Integrator):
-    """Implicit midpoint rule: second order, keeps energy, damps nothing."""
+    """Implicit midpoint rule: second order, conserves energy, without numerical damping."""
 
     name = "midpoint"
     order = 2

@@ -1,4 +1,4 @@
-"""The proximal step of a static analysis, in the form of a integrator."""
+"""The proximal step of a static analysis, in the form of an integrator."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
 
 
 class Static(Integrator):
-    """Not a motion: the proximal step of `stepping.equilibrium`, backward Euler from rest.
+    """The proximal step of `stepping.equilibrium`: backward Euler from rest in a pseudo time.
 
     Attributes
     ----------
     pseudo_dt : float
-        Pseudo time step [s]: the larger, the closer to equilibrium a solve gets.
+        Pseudo time step [s]: the larger it is, the closer a solve gets to equilibrium.
     predicted : (n_owned, 3) or None
-        Way [m] that the next solve is expected to go; where Newton's method starts.
+        Displacement [m] predicted for the next solve, from which Newton's method starts.
     alternatives : list of (n_owned, 3)
-        Other ways [m] that may be better.
+        Other predictions [m], which may be better.
     """
 
     name = "static"
