@@ -15,7 +15,7 @@ from lyra_petsc.cli.progress import ProgressBar, duration
 from lyra_petsc.cli.run import petsc_prints, warn_unused
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
-from lyra_petsc.experiments.fit.estimate import Trial
+from lyra_petsc.experiments.fit.estimate import Evaluation
 from lyra_petsc.experiments.fit.fit_report import Fit, FitOutcome, outcome_of
 from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene, unknowns_of
 from lyra_petsc.experiments.results import Results
@@ -35,8 +35,8 @@ class FitProgress(ProgressBar, Observer):
     def progress(self, number: int, part: float) -> None:
         self._show(min(part, 0.999), f"evaluation {number}{self._cost}")
 
-    def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
-        self._cost = f"  sum of squares {2.0 * trial.cost:.5g}"
+    def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
+        self._cost = f"  sum of squares {2.0 * evaluation.cost:.5g}"
         source = " (from before)" if resumed else ""
         self._print_line(f"evaluation {number}{self._cost}{source}")
 
@@ -103,7 +103,7 @@ def fit(
         outcome = results.outcomes[0]
         for line in view.terminal(outcome):
             click.echo(line)
-        evaluations = f"{len(outcome.fitted.trials)} evaluations in {duration(outcome.fitted.seconds)}"
+        evaluations = f"{len(outcome.fitted.evaluations)} evaluations in {duration(outcome.fitted.seconds)}"
         click.echo(f"{evaluations}; results: {folder}")
         if note:
             click.echo(f"note: {note}")

@@ -71,7 +71,7 @@ class Unknown:
 
 
 @dataclass
-class Trial:
+class Evaluation:
     """Residuals (m,) and their derivatives (m, n) at the numbers (n,)."""
 
     numbers: StoredArray
@@ -132,15 +132,15 @@ class Conclusion:
     words: list[str] = field(default_factory=list)
 
 
-Evaluate = Callable[[Array], Trial]
+Evaluate = Callable[[Array], Evaluation]
 
 
 class _StalledError(Exception):
     """Ends a search that is near the minimum but makes no progress."""
 
 
-def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]:
-    """Minimise the cost; returns the best trial and why the search ended, the same on every rank.
+def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation, str]:
+    """Minimise the cost; returns the best evaluation and why the search ended, the same on every rank.
 
     Parameters
     ----------
@@ -158,16 +158,18 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     n = len(unknowns)
     size = np.array([unknown.size for unknown in unknowns])
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
-    known: dict[bytes, Trial] = {}
+    known: dict[bytes, Evaluation] = {}
     failure: list[BaseException] = []
 
     def is_stalled() -> bool:
-        costs = [trial.cost for trial in known.values()]
+        costs = [evaluation.cost for evaluation in known.values()]
         if len(costs) <= STALL or min(costs[:-STALL]) - min(costs) >= DECREASE:
             return False
-        return _gauss_newton_step(min(known.values(), key=lambda trial: trial.cost), low, high) <= NEAR
+        return (
+            _gauss_newton_step(min(known.values(), key=lambda evaluation: evaluation.cost), low, high) <= NEAR
+        )
 
-    def at(y: PETSc.Vec) -> Trial:
+    def at(y: PETSc.Vec) -> Evaluation:
         numbers = np.clip(np.array(y.getArray(readonly=True)) * size, low, high)
         key = numbers.tobytes()
         if key not in known:
@@ -201,9 +203,9 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
         matrix.assemble()
 
     def cost(tao: PETSc.TAO, y: PETSc.Vec, out: PETSc.Vec) -> float:
-        trial = at(y)
-        out.setArray(size * (trial.jacobian.T @ trial.residuals))
-        return trial.cost
+        evaluation = at(y)
+        out.setArray(size * (evaluation.jacobian.T @ evaluation.residuals))
+        return evaluation.cost
 
     start, lower, upper, values = (PETSc.Vec().createSeq(k, comm=comm) for k in (n, n, n, m))
     start.setArray(first.numbers / size)
@@ -215,11 +217,11 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
 
     def ended(tao: PETSc.TAO) -> int | None:
         y = tao.getSolution()
-        trial = at(y)
-        left = _gauss_newton_step(trial, low, high)
-        stalled = bool(before) and np.all(np.abs(trial.numbers - before[-1]) <= STALLED * size)
-        if not before or not np.array_equal(before[-1], trial.numbers):
-            before.append(trial.numbers)
+        evaluation = at(y)
+        left = _gauss_newton_step(evaluation, low, high)
+        stalled = bool(before) and np.all(np.abs(evaluation.numbers - before[-1]) <= STALLED * size)
+        if not before or not np.array_equal(before[-1], evaluation.numbers):
+            before.append(evaluation.numbers)
         if left <= CONVERGED or (stalled and len(before) > 1):
             return int(PETSc.TAO.Reason.CONVERGED_USER)
         if tao.getIterationNumber() >= tao.getMaximumIterations():
@@ -255,9 +257,9 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
             raise failure[0] from None
         raise InputError(f"PETSc cannot: {error_message(error)}", key=culprits(error)) from None
     finally:
-        for thing in (tao, matrix, start, lower, upper, values):
-            thing.destroy()
-    best = min(known.values(), key=lambda trial: trial.cost)
+        for each in (tao, matrix, start, lower, upper, values):
+            each.destroy()
+    best = min(known.values(), key=lambda evaluation: evaluation.cost)
     left = _gauss_newton_step(best, low, high)
     if left <= CONVERGED or (reason > 0 and left <= NEAR):
         return (
@@ -275,20 +277,20 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     )
 
 
-def _has_full_rank(trial: Trial, size: Array) -> bool:
+def _has_full_rank(evaluation: Evaluation, size: Array) -> bool:
     """Whether the Jacobian has full rank: the data determine all combinations of the numbers."""
-    values = np.linalg.svd(trial.jacobian * size, compute_uv=False)
+    values = np.linalg.svd(evaluation.jacobian * size, compute_uv=False)
     return len(values) == len(size) and bool(values[-1] > 1e-6 * values[0])
 
 
-def _gauss_newton_step(trial: Trial, low: Array, high: Array) -> float:
-    """Length of the Gauss-Newton step from a trial, in standard deviations of the numbers."""
-    gradient = trial.jacobian.T @ trial.residuals
-    free = ~_at_bounds(trial.numbers, gradient, low, high)
+def _gauss_newton_step(evaluation: Evaluation, low: Array, high: Array) -> float:
+    """Length of the Gauss-Newton step from an evaluation, in standard deviations of the numbers."""
+    gradient = evaluation.jacobian.T @ evaluation.residuals
+    free = ~_at_bounds(evaluation.numbers, gradient, low, high)
     if not free.any():
         return 0.0
-    jacobian = trial.jacobian[:, free]
-    step = np.linalg.lstsq(jacobian, trial.residuals, rcond=1e-10)[0]
+    jacobian = evaluation.jacobian[:, free]
+    step = np.linalg.lstsq(jacobian, evaluation.residuals, rcond=1e-10)[0]
     # norm of J × step, which is finite also for combinations that the data do not determine
     return float(np.linalg.norm(jacobian @ step)) / math.sqrt(free.sum())
 
@@ -299,7 +301,7 @@ def _at_bounds(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
     return ((numbers <= low + slack) & (gradient > 0.0)) | ((numbers >= high - slack) & (gradient < 0.0))
 
 
-def refuse_insensitive(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:
+def refuse_insensitive(unknowns: Sequence[Unknown], evaluation: Evaluation, file: object = None) -> None:
     """Refuse numbers that do not influence any measurement.
 
     Raises
@@ -307,7 +309,7 @@ def refuse_insensitive(unknowns: Sequence[Unknown], trial: Trial, file: object =
     InputError
     """
     size = np.array([unknown.size for unknown in unknowns])
-    largest = np.abs(trial.jacobian * size).max(axis=0)
+    largest = np.abs(evaluation.jacobian * size).max(axis=0)
     for unknown, own in zip(unknowns, largest, strict=True):
         if own <= max(NO_INFLUENCE * largest.max(), INVISIBLE):
             raise InputError(
@@ -317,13 +319,13 @@ def refuse_insensitive(unknowns: Sequence[Unknown], trial: Trial, file: object =
             )
 
 
-def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
-    """Estimates, covariance and notes at the numbers of a trial."""
-    n, m = len(unknowns), len(trial.residuals)
+def conclude(unknowns: Sequence[Unknown], evaluation: Evaluation) -> Conclusion:
+    """Estimates, covariance and notes at the numbers of an evaluation."""
+    n, m = len(unknowns), len(evaluation.residuals)
     size = np.array([unknown.size for unknown in unknowns])
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
-    at_bound = _at_bounds(trial.numbers, trial.jacobian.T @ trial.residuals, low, high)
-    scaled = trial.jacobian * size
+    at_bound = _at_bounds(evaluation.numbers, evaluation.jacobian.T @ evaluation.residuals, low, high)
+    scaled = evaluation.jacobian * size
     _, values, directions = np.linalg.svd(scaled, full_matrices=m < n)
     values = np.concatenate([values, np.zeros(n - len(values))])
     covariance = np.full((n, n), np.nan)
@@ -340,10 +342,10 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
         correlation = covariance * np.outer(size, size) / np.outer(deviation, deviation)
     estimates = [
         Estimate(u.key, u.start, u.low, u.high, float(value), float(own), bool(bound))
-        for u, value, own, bound in zip(unknowns, trial.numbers, deviation, at_bound, strict=True)
+        for u, value, own, bound in zip(unknowns, evaluation.numbers, deviation, at_bound, strict=True)
     ]
     freedom = m - len(free)
-    misfit = float(trial.residuals @ trial.residuals) / freedom if freedom > 0 else math.nan
+    misfit = float(evaluation.residuals @ evaluation.residuals) / freedom if freedom > 0 else math.nan
     words = _notes(estimates, values, directions, correlation)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     if freedom > 0 and misfit > 1.0 + 3.0 * spread:

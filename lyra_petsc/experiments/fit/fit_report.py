@@ -83,7 +83,7 @@ class Fit(View[FitOutcome]):
             "directions": conclusion.directions,
             "words": conclusion.words,
             "search": fitted.words,
-            "evaluations": len(fitted.trials),
+            "evaluations": len(fitted.evaluations),
             "simulations": fitted.runs,
             "seconds": fitted.seconds,
             "measurements": [
@@ -148,7 +148,7 @@ class Fit(View[FitOutcome]):
             caption="Combinations of parameters, in units of their sizes, from the best known to the least.",
         )
         report.paragraph(
-            f"{len(fitted.trials)} evaluations, {fitted.runs} simulations, {fitted.seconds:.1f} s."
+            f"{len(fitted.evaluations)} evaluations, {fitted.runs} simulations, {fitted.seconds:.1f} s."
         )
 
     def terminal(self, outcome: FitOutcome) -> list[str]:
@@ -177,7 +177,7 @@ def _residuals(fitted: Fitted) -> Drawing:
 def _costs(fitted: Fitted) -> Drawing:
     figure = empty_figure(2.8)
     axes = figure.add_subplot(xlabel="evaluation", ylabel="sum of squares", yscale="log")
-    costs = [max(2.0 * trial.cost, 1e-300) for trial in fitted.trials]
+    costs = [max(2.0 * evaluation.cost, 1e-300) for evaluation in fitted.evaluations]
     axes.plot(range(1, len(costs) + 1), costs, color=colour(0), marker="o", ms=4)
     axes.grid(True, color="#dfe3e8", lw=0.8)
     return make_drawing(figure, f"{PLOTS}/search", "Sum of squares over the evaluations.")

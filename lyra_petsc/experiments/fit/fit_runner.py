@@ -25,7 +25,7 @@ from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import (
     Conclusion,
-    Trial,
+    Evaluation,
     Unknown,
     conclude,
     refuse_insensitive,
@@ -60,23 +60,24 @@ FIT = FolderKind(
 
 
 @dataclass
-class Trials:
+class StoredEvaluations:
     """The evaluations of a fit as stored in its folder.
 
     Attributes
     ----------
     fingerprint : str
         Digest of everything that they depend on.
+    trials : list of Evaluation
     """
 
     fingerprint: str
-    trials: list[Trial] = field(default_factory=list)
+    trials: list[Evaluation] = field(default_factory=list)
 
 
 class Observer:
     """Is notified of the progress of a fit; to be overridden."""
 
-    def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+    def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
         """An evaluation has ended, or was found on disk."""
 
     def progress(self, number: int, part: float) -> None:
@@ -94,7 +95,7 @@ class Fitted:
     readings : list of Reading
     before, after : (m,)
         Values of the readings at the start and at the end.
-    trials : list of Trial
+    evaluations : list of Evaluation
     words : str
         How the search ended.
     shapes : tuple of (V, 3) or None
@@ -112,7 +113,7 @@ class Fitted:
     readings: list[Reading]
     before: Array
     after: Array
-    trials: list[Trial]
+    evaluations: list[Evaluation]
     words: str
     shapes: tuple[Array | None, Array | None]
     triangles: Ints | None
@@ -148,7 +149,7 @@ class Fitted:
     def sensitivity(self) -> Array:
         """Derivatives (m, n) of each value over its uncertainty, by each number over its size."""
         size = np.array([unknown.size for unknown in self.unknowns])
-        best = min(self.trials, key=lambda trial: trial.cost)
+        best = min(self.evaluations, key=lambda evaluation: evaluation.cost)
         return best.jacobian * size
 
 
@@ -227,50 +228,50 @@ def fit_scene(
             file=scene.source,
             key="fit.measurements",
         )
-    kept = Trials(_fingerprint(scene, target, sigma))
+    kept = StoredEvaluations(_fingerprint(scene, target, sigma))
     if folder is not None:
         path = folder / TRIALS_FILE
         kept = on_root(comm, lambda: _read(path, kept))
-    stored = {trial.numbers.tobytes(): trial for trial in kept.trials}
-    trials: list[Trial] = []
+    stored = {evaluation.numbers.tobytes(): evaluation for evaluation in kept.trials}
+    evaluations: list[Evaluation] = []
     shapes: dict[bytes, Array | None] = {}
 
-    def evaluate(numbers: Array) -> Trial:
+    def evaluate(numbers: Array) -> Evaluation:
         numbers = comm.bcast(numbers)
-        number = len(trials) + 1
-        trial = stored.get(numbers.tobytes())
-        resumed = trial is not None
-        if trial is None:
+        number = len(evaluations) + 1
+        evaluation = stored.get(numbers.tobytes())
+        resumed = evaluation is not None
+        if evaluation is None:
             found = model.evaluate(numbers.tolist(), progress=lambda part: listener.progress(number, part))
             assert found.jacobian is not None
             # all ranks use the numbers of rank 0, bit by bit
-            trial = comm.bcast(
-                Trial(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
+            evaluation = comm.bcast(
+                Evaluation(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
             if number == 1:
-                refuse_insensitive(unknowns, trial, scene.source)
-                _refuse_large_residuals(model.readings, trial, scene)
+                refuse_insensitive(unknowns, evaluation, scene.source)
+                _refuse_large_residuals(model.readings, evaluation, scene)
             if folder is not None:
-                kept.trials.append(trial)
+                kept.trials.append(evaluation)
                 on_root(comm, lambda: save_record(folder / TRIALS_FILE, kept))
-        trials.append(trial)
-        listener.trial(number, trial, resumed=resumed)
-        return trial
+        evaluations.append(evaluation)
+        listener.evaluated(number, evaluation, resumed=resumed)
+        return evaluation
 
     best, words = search(unknowns, evaluate)
-    first = trials[0]
-    for trial in (first, best):
-        if trial.numbers.tobytes() not in shapes:
-            model.evaluate(trial.numbers.tolist(), derivatives=False)
-            shapes[trial.numbers.tobytes()] = model.shape
+    first = evaluations[0]
+    for evaluation in (first, best):
+        if evaluation.numbers.tobytes() not in shapes:
+            model.evaluate(evaluation.numbers.tolist(), derivatives=False)
+            shapes[evaluation.numbers.tobytes()] = model.shape
     return Fitted(
         unknowns,
         conclude(unknowns, best),
         model.readings,
         first.residuals * sigma + target,
         best.residuals * sigma + target,
-        trials,
+        evaluations,
         words,
         (shapes[first.numbers.tobytes()], shapes[best.numbers.tobytes()]),
         None if model.mesh is None else model.mesh.triangles,
@@ -279,13 +280,13 @@ def fit_scene(
     )
 
 
-def _refuse_large_residuals(readings: Sequence[Reading], trial: Trial, scene: Scene) -> None:
+def _refuse_large_residuals(readings: Sequence[Reading], evaluation: Evaluation, scene: Scene) -> None:
     """Refuse measurements whose residuals at the start are not finite, or dominate all others."""
     keys = [reading.key for reading in readings for _ in reading.parts]
-    worst = int(np.argmax(np.abs(trial.residuals)))
-    if not abs(trial.residuals[worst]) < LARGEST_RESIDUAL:
+    worst = int(np.argmax(np.abs(evaluation.residuals)))
+    if not abs(evaluation.residuals[worst]) < LARGEST_RESIDUAL:
         raise InputError(
-            f"is missed by {abs(trial.residuals[worst]):.2g} uncertainties; check value and uncertainty, "
+            f"is missed by {abs(evaluation.residuals[worst]):.2g} uncertainties; check value, uncertainty "
             "and their units",
             file=scene.source,
             key=keys[worst],
@@ -297,12 +298,12 @@ def _fingerprint(scene: Scene, target: Array, sigma: Array) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _read(path: Path, new: Trials) -> Trials:
+def _read(path: Path, new: StoredEvaluations) -> StoredEvaluations:
     """Read the stored evaluations, which must be of the same fit."""
     if not path.is_file():
         return new
     try:
-        found = load_record(path, Trials)
+        found = load_record(path, StoredEvaluations)
     except (OSError, ValueError):
         raise InputError("cannot be read; begin anew with --force", file=path) from None
     if found.fingerprint != new.fingerprint:

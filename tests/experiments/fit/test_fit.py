@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.fit.estimate import Trial, Unknown, conclude, search
+from lyra_petsc.experiments.fit.estimate import Evaluation, Unknown, conclude, search
 from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene
 from lyra_petsc.experiments.fit.readings import Positions
 
@@ -101,7 +101,7 @@ def test_search_and_conclusion(kind: str) -> None:
     matrix, right = rng.standard_normal((12, 3)), rng.standard_normal(12)
     unknowns = [Unknown(name, 0.5, -10.0, 10.0) for name in "abc"]
     PETSc.Options()["tao_type"] = kind
-    best, words = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
+    best, words = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
     exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
     covariance = np.linalg.inv(matrix.T @ matrix)
     deviation = np.sqrt(np.diag(covariance))
@@ -119,11 +119,11 @@ def test_a_search_ends_beside_a_jump() -> None:
     best = np.linalg.lstsq(matrix, right, rcond=None)[0]
     matrix, right, made = np.vstack([matrix, [0.0, 0.0]]), np.append(right, 0.0), []
 
-    def jumps(numbers: np.ndarray) -> Trial:
+    def jumps(numbers: np.ndarray) -> Evaluation:
         made.append(numbers)
         missed = matrix @ numbers - right
         missed[-1] = 9.0 * (numbers[0] > best[0] - 0.04)
-        return Trial(numbers, missed, matrix)
+        return Evaluation(numbers, missed, matrix)
 
     found, words = search([Unknown("a", best[0] - 0.1, -9.0, 9.0), Unknown("b", best[1], -9.0, 9.0)], jumps)
     assert words.startswith("the search ended")
@@ -135,7 +135,7 @@ def test_bound_and_what_is_not_told() -> None:
     matrix = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
     right = np.array([1.0, 2.0, 5.0, 10.0])
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
-    best, _ = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
+    best, _ = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
     found = conclude(unknowns, best)
     told = " ".join(found.words)
     assert "the data cannot tell a and b apart" in told
@@ -148,14 +148,14 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
     scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
 
     class Stops(Observer):
-        def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+        def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
             if number == 2:
                 raise KeyboardInterrupt
 
     class Counts(Observer):
         made = resumed = 0
 
-        def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+        def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
             self.made, self.resumed = self.made + (not resumed), self.resumed + resumed
 
     comm = MPI.COMM_SELF
