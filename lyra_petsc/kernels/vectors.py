@@ -89,16 +89,16 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     return _without_result(write, blocks=blocks, columns=columns, out=out, lo=lo, hi=hi, factors=factors)
 
 
-def _gather_edges(typing: Any, blocks: Any, places: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
-    """Sum of blocks[k] x[places[k]] for lo ≤ k < hi, three numbers; x in its flat form.
+def _gather_edges(typing: Any, blocks: Any, indices: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
+    """Sum of blocks[k] x[indices[k]] for lo ≤ k < hi, three numbers; x in its flat form.
 
-    A block (3 × 4), row by row, couples a point with four edges, whose unknowns are at ``places`` (n, 4).
+    A block (3 × 4), row by row, couples a point with four edges, whose unknowns are at ``indices`` (n, 4).
     """
     _check(blocks, x)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = CodeBuilder(context, builder, signature, arguments, "blocks places x lo hi ahead")
-        block_rows, numbers, vectors = map(code.array_pointer, ("blocks", "places", "x"))
+        code = CodeBuilder(context, builder, signature, arguments, "blocks indices x lo hi ahead")
+        block_rows, numbers, vectors = map(code.array_pointer, ("blocks", "indices", "x"))
         ahead = code.integer("ahead")
         zero = ir.Constant(code.vector4, [0.0] * WIDTH)
         sums = [cgutils.alloca_once_value(builder, zero) for _ in range(3)]  # type: ignore[no-untyped-call]
@@ -118,15 +118,15 @@ def _gather_edges(typing: Any, blocks: Any, places: Any, x: Any, lo: Any, hi: An
         return context.make_tuple(builder, signature.return_type, found)
 
     three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
-    return three(blocks, places, x, lo, hi, ahead), generate
+    return three(blocks, indices, x, lo, hi, ahead), generate
 
 
-def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
-    """out[places[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; blocks and places as for ``gather_edges``."""
+def _scatter_edges(typing: Any, blocks: Any, indices: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
+    """out[indices[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; blocks and indices as for ``gather_edges``."""
     _check(blocks, out)
 
     def write(code: CodeBuilder) -> None:
-        block_rows, numbers, vectors = map(code.array_pointer, ("blocks", "places", "out"))
+        block_rows, numbers, vectors = map(code.array_pointer, ("blocks", "indices", "out"))
         factors = [code.splat(number) for number in code.tuple_values("factors")]
         with code.loop() as (k, _):
             block, four = code.row_pointer(block_rows, k, 12), code.row_pointer(numbers, k, WIDTH)
@@ -137,7 +137,7 @@ def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi:
                 more = code.builder.extract_element(total, LANE(i))
                 code.builder.store(code.add(code.builder.load(target), more), target)
 
-    return _without_result(write, blocks=blocks, places=places, out=out, lo=lo, hi=hi, factors=factors)
+    return _without_result(write, blocks=blocks, indices=indices, out=out, lo=lo, hi=hi, factors=factors)
 
 
 def _add_outers(typing: Any, blocks: Any, at: Any, diagonal: Any, pairs: Any) -> Any:

@@ -8,7 +8,7 @@ be zero, and 70 % of those that couple edges with edges. So one half of the symm
 - *numbers*: scalar entries of pairs of edges.
 
 Couplings to ghosts are few, and stay 3 × 3 blocks of the pattern. One array of values holds blocks, groups
-and numbers in this order. A *place* is the index of an edge's unknown in a flattened array of local rows.
+and numbers in this order. The column of an edge's unknown is its index in a flattened array of local rows.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class Groups(NamedTuple):
     Attributes
     ----------
     indptr : (n_vertices + 1,)
-    places : (n_groups, 4) int32
-        Places of the edges.
+    columns : (n_groups, 4) int32
+        Columns of the four edges.
     """
 
     indptr: Ints
-    places: NDArray[np.int32]
+    columns: NDArray[np.int32]
 
 
 class Numbers(NamedTuple):
@@ -59,12 +59,11 @@ class Numbers(NamedTuple):
     Attributes
     ----------
     indptr : (n_edges + 1,) int32, or int64 if needed
-    places : (n_numbers,) int32
-        Places of the columns' edges.
+    columns : (n_numbers,) int32
     """
 
     indptr: NDArray[Any]
-    places: NDArray[np.int32]
+    columns: NDArray[np.int32]
 
 
 class EdgeValues(NamedTuple):
@@ -73,9 +72,9 @@ class EdgeValues(NamedTuple):
     Attributes
     ----------
     blocks : (n_blocks, 9)
-        Each column by column.
+        Each block column by column.
     groups : (n_groups, 12)
-        Each row by row.
+        Each block row by row.
     numbers : (n_numbers, 1)
     """
 
@@ -103,33 +102,33 @@ class EdgeCouplings:
 
     def __init__(self, elements: Sequence[MixedStencil], n_owned: int) -> None:
         self._n, beyond = n_owned, 3 * n_owned
-        least = (int(part.edges.min(initial=beyond)) for part in elements)
-        self.n_vertices = first = min(beyond, *least) // 3
+        first_columns = (int(part.edges.min(initial=beyond)) for part in elements)
+        self.n_vertices = first = min(beyond, *first_columns) // 3
 
         def keys(part: MixedStencil) -> tuple[list[Ints], list[Ints]]:
-            """Keys of vertex-edge and edge-edge couplings: row · ``beyond`` + place of the column."""
+            """Keys of vertex-edge and edge-edge couplings: row · ``beyond`` + column."""
             mixed, edges = [], []
-            places = part.edges.astype(np.int64)
-            for b, place in enumerate(places.T):
+            columns = part.edges.astype(np.int64)
+            for b, column in enumerate(columns.T):
                 for vertex in part.vertices.T:
-                    owned = (place < beyond) & (vertex < n_owned)
-                    mixed.append(vertex[owned].astype(np.int64) * beyond + place[owned])
-                for other in places.T[:b]:
-                    owned = (place < beyond) & (other < beyond)
-                    lesser, greater = np.minimum(place, other)[owned], np.maximum(place, other)[owned]
+                    owned = (column < beyond) & (vertex < n_owned)
+                    mixed.append(vertex[owned].astype(np.int64) * beyond + column[owned])
+                for other in columns.T[:b]:
+                    owned = (column < beyond) & (other < beyond)
+                    lesser, greater = np.minimum(column, other)[owned], np.maximum(column, other)[owned]
                     edges.append(lesser * beyond + greater)
             return mixed, edges
 
         found = [keys(part) for part in elements]
-        vertex, place = np.divmod(union(*(key for mixed, _ in found for key in mixed)), max(beyond, 1))
+        vertex, column = np.divmod(union(*(key for mixed, _ in found for key in mixed)), max(beyond, 1))
         count = np.bincount(vertex, minlength=first)
         groups = row_pointers(-(-count // GROUP))
         at = GROUP * groups[vertex] + np.arange(len(vertex)) - row_pointers(count)[vertex]
-        places = np.full(GROUP * groups[-1], -1, dtype=np.int32)
-        places[at] = place
+        columns = np.full(GROUP * groups[-1], -1, dtype=np.int32)
+        columns[at] = column
         # padding refers to an edge of the group, whose cache line is needed anyway
-        places = places.reshape(-1, GROUP)
-        self.groups = Groups(groups, np.where(places < 0, places[:, :1], places))
+        columns = columns.reshape(-1, GROUP)
+        self.groups = Groups(groups, np.where(columns < 0, columns[:, :1], columns))
 
         diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
         one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
@@ -141,7 +140,7 @@ class EdgeCouplings:
     @property
     def n_values(self) -> int:
         """Stored values of groups and numbers."""
-        return int(3 * self.groups.places.size + len(self.numbers.places))
+        return int(3 * self.groups.columns.size + len(self.numbers.columns))
 
     @property
     def n_entries(self) -> int:
@@ -154,7 +153,7 @@ class EdgeCouplings:
 
     def first_number(self, n_blocks: int) -> int:
         """Position of the first number."""
-        return self.first_group(n_blocks) + 3 * self.groups.places.size
+        return self.first_group(n_blocks) + 3 * self.groups.columns.size
 
     def n_stored(self, n_blocks: int) -> int:
         """Number of 3 × 3 blocks that take as much memory as all values."""
@@ -169,7 +168,7 @@ class EdgeCouplings:
         """Views of values (n_stored, 3, 3)."""
         flat, first, last = values.reshape(-1), self.first_group(n_blocks), self.first_number(n_blocks)
         blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
-        return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
+        return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.columns)].reshape(-1, 1))
 
     def offsets_of(self, elements: MixedStencil, pattern: BlockPattern) -> Offsets:
         """Positions of the couplings (a, b), b ≥ a, of elements for edges b; edges come after vertices.
@@ -192,12 +191,12 @@ class EdgeCouplings:
         """Positions ``zeros``, ``edges`` and ``row_edges`` of `ConstrainedEntries`; mask (n_local, 3)."""
         held = mask.ravel()
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
-        coupled = mask[vertex][:, :, None] | held[self.groups.places][:, None, :]
+        coupled = mask[vertex][:, :, None] | held[self.groups.columns][:, None, :]
         of_groups = self.first_group(n_blocks) + np.flatnonzero(coupled)
-        indptr, places = self.numbers
+        indptr, columns = self.numbers
         edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(indptr))
         own = self.diagonal(n_blocks)
-        of_numbers = held[edge] | held[places]
+        of_numbers = held[edge] | held[columns]
         of_numbers[indptr[:-1]] = False
         zeros = np.concatenate([of_groups, self.first_number(n_blocks) + np.flatnonzero(of_numbers)])
         edges: Ints = np.flatnonzero(held[3 * self.n_vertices : 3 * self._n])
@@ -210,13 +209,13 @@ class EdgeCouplings:
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
         shape = (len(vertex), 3, GROUP)
         row = np.broadcast_to((3 * vertex[:, None] + np.arange(3))[:, :, None], shape).ravel()
-        column = np.broadcast_to(self.groups.places[:, None, :], shape).ravel()
+        column = np.broadcast_to(self.groups.columns[:, None, :], shape).ravel()
         edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(self.numbers.indptr))
-        return row, column.astype(np.int64), edge, self.numbers.places.astype(np.int64)
+        return row, column.astype(np.int64), edge, self.numbers.columns.astype(np.int64)
 
     def whole(self, pattern: BlockPattern) -> BlockPattern:
         """The equivalent pattern of 3 × 3 blocks only, in which rows of owned edges hold three edges."""
-        row, column, edge, other = (place // 3 for place in self._coupled())
+        row, column, edge, other = (index // 3 for index in self._coupled())
         keys = union(
             pattern.keys(pattern.n_local), row * pattern.n_local + column, edge * pattern.n_local + other
         )
@@ -248,9 +247,12 @@ class EdgeCouplings:
 
 @cached()
 def _look_up(  # type: ignore[no-untyped-def]
-    indptr, columns, group_ptr, places, number_ptr, others, first_group, first_number, stencil, edges, out
+    indptr, columns, group_ptr, columns4, number_ptr, columns1, first_group, first_number, stencil, edges, out
 ):
-    """Positions (`offsets_of`) of elements whose stencil (E, n + m) ends with the rows of edges (E, m)."""
+    """Positions (`offsets_of`) of elements whose stencil (E, n + m) ends with the rows of edges (E, m).
+
+    ``columns4`` and ``columns1`` are the columns of groups and of numbers.
+    """
     n_owned, n_vertices = len(indptr) - 1, len(group_ptr) - 1
     n = stencil.shape[1] - edges.shape[1]
     for e in range(len(stencil)):
@@ -264,19 +266,17 @@ def _look_up(  # type: ignore[no-untyped-def]
                     if column >= n_owned:
                         found = block_of(indptr, columns, row, column)
                         if found >= 0:
-                            place = edges[e, b - n] % 3
+                            c_b = edges[e, b - n] % 3
                             if a < n:
-                                found = (
-                                    4 * (9 * found + 3 * place) if one == row else 4 * (9 * found + place) + 2
-                                )
+                                found = 4 * (9 * found + 3 * c_b) if one == row else 4 * (9 * found + c_b) + 2
                             else:
-                                before = edges[e, a - n] % 3
-                                i, j = (before, place) if one == row else (place, before)
+                                c_a = edges[e, a - n] % 3
+                                i, j = (c_a, c_b) if one == row else (c_b, c_a)
                                 found = 9 * found + 3 * j + i
                     elif a < n:
                         found = MISSING
                         for k in range(4 * group_ptr[one], 4 * group_ptr[one + 1]):
-                            if places[k // 4, k % 4] == edges[e, b - n]:
+                            if columns4[k // 4, k % 4] == edges[e, b - n]:
                                 found = 4 * (first_group + 12 * (k // 4) + k % 4) + 3
                                 break
                     else:
@@ -286,7 +286,7 @@ def _look_up(  # type: ignore[no-untyped-def]
                         found = MISSING
                         edge = lesser - 3 * n_vertices
                         for k in range(number_ptr[edge], number_ptr[edge + 1]):
-                            if others[k] == greater:
+                            if columns1[k] == greater:
                                 found = first_number + k
                                 break
                 out[e, pair] = found
@@ -295,7 +295,7 @@ def _look_up(  # type: ignore[no-untyped-def]
 
 @cached(fastmath={"contract", "nsz"})
 def multiply(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, number_ptr, others, blocks, groups, numbers, x, sums, out
+    indptr, ends, columns, group_ptr, columns4, number_ptr, columns1, blocks, groups, numbers, x, sums, out
 ):
     """out (n_owned, 3) = A x for x (n_local, 3); sums (n_vertices, 4) is scratch."""
     n, n_owned = Index(len(sums)), Index(len(ends))
@@ -307,8 +307,8 @@ def multiply(  # type: ignore[no-untyped-def]
         mine = x[row, 0], x[row, 1], x[row, 2]
         scatter(blocks, columns, sums, lo + Index(1), Index(ends[row]), mine)
         lo, hi = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
-        t0, t1, t2 = gather_edges(groups, places, x, lo, hi, AHEAD_EDGES)
-        scatter_edges(groups, places, out, lo, hi, mine)
+        t0, t1, t2 = gather_edges(groups, columns4, x, lo, hi, AHEAD_EDGES)
+        scatter_edges(groups, columns4, out, lo, hi, mine)
         out[row, 0], out[row, 1] = s0 + t0 + sums[row, 0], s1 + t1 + sums[row, 1]
         out[row, 2] = s2 + t2 + sums[row, 2]
     first, flat, to = Index(3) * n, x.reshape(-1), out.reshape(-1)
@@ -317,7 +317,7 @@ def multiply(  # type: ignore[no-untyped-def]
         mine = flat[first + edge]
         s0 = numbers[lo, 0] * mine
         for k in range(lo + Index(1), hi):
-            other = Index(others[k])
+            other = Index(columns1[k])
             s0 += numbers[k, 0] * flat[other]
             to[other] += numbers[k, 0] * mine
         to[first + edge] += s0

@@ -74,8 +74,8 @@ def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
 
 
 @cached(fastmath=True)
-def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
-    """``gauss_seidel.backward`` over the owned edges, from place ``first`` on, in x and r (n_local, 3).
+def backward_edges(first, indptr, columns, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+    """``gauss_seidel.backward`` over the owned edges, from index ``first`` on, in x and r (n_local, 3).
 
     An edge depends on the edge processed before it, which is mostly its first coupling: that one is added
     last, here and in ``forward_edges``, so that the processor need not wait.
@@ -87,16 +87,16 @@ def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: igno
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
         s = rest[at]
         for k in range(hi - lo):
-            s -= numbers[hi - Index(1) - k, 0] * flat[Index(others[hi - Index(1) - k])]
+            s -= numbers[hi - Index(1) - k, 0] * flat[Index(columns[hi - Index(1) - k])]
         y = flushed(inverses[edge] * s)
         decrement = flat[at] - y
         flat[at], rest[at] = y, 0.0
         for k in range(lo, hi):
-            rest[Index(others[k])] += numbers[k, 0] * decrement
+            rest[Index(columns[k])] += numbers[k, 0] * decrement
 
 
 @cached(fastmath=True)
-def forward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+def forward_edges(first, indptr, columns, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
     """``gauss_seidel.forward`` over the owned edges; couplings to ghosts are already subtracted from r."""
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     first = Index(first)
@@ -104,11 +104,11 @@ def forward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignor
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
         s = numbers.dtype.type(0.0)
         for k in range(lo, hi):
-            s += numbers[k, 0] * flat[Index(others[k])]
+            s += numbers[k, 0] * flat[Index(columns[k])]
         y = flushed(inverses[edge] * (rest[at] - s))
         flat[at] = y
         for k in range(lo, hi):
-            rest[Index(others[k])] -= numbers[k, 0] * y
+            rest[Index(columns[k])] -= numbers[k, 0] * y
 
 
 @cached(fastmath=True)
@@ -122,7 +122,7 @@ def correct_edges(first, inverse, x, r):  # type: ignore[no-untyped-def]
 
 @cached(fastmath=True)
 def backward_vertices(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, x, r, of_edges
+    indptr, ends, columns, group_ptr, columns4, blocks, groups, inverse, x, r, of_edges
 ):
     """``gauss_seidel.backward`` over the owned vertices, after that over the edges."""
     n = Index(len(inverse))
@@ -131,19 +131,19 @@ def backward_vertices(  # type: ignore[no-untyped-def]
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
-        t0, t1, t2 = gather_edges(groups, places, x, first, last, -AHEAD_EDGES)
+        t0, t1, t2 = gather_edges(groups, columns4, x, first, last, -AHEAD_EDGES)
         r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
         y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
         decrement = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
         scatter(blocks, columns, r, lo, hi, decrement)
-        scatter_edges(groups, places, of_edges, first, last, decrement)
+        scatter_edges(groups, columns4, of_edges, first, last, decrement)
 
 
 @cached(fastmath=True)
 def forward_vertices(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r, of_edges
+    indptr, ends, columns, group_ptr, columns4, blocks, groups, inverse, b, x, r, of_edges
 ):
     """``gauss_seidel.forward`` over the owned vertices; r and of_edges become b − L x.
 
@@ -159,18 +159,18 @@ def forward_vertices(  # type: ignore[no-untyped-def]
         lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
-        t0, t1, t2 = gather_edges(groups, places, x, first, last, AHEAD_EDGES)
+        t0, t1, t2 = gather_edges(groups, columns4, x, first, last, AHEAD_EDGES)
         r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
         y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
         if of_edges is not None:
-            scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
+            scatter_edges(groups, columns4, of_edges, first, last, (-y0, -y1, -y2))
 
 
 @cached(fastmath=True)
 def backward_again(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, increment, x, r, of_edges
+    indptr, ends, columns, group_ptr, columns4, blocks, groups, inverse, increment, x, r, of_edges
 ):
     """Like ``backward_vertices``, but r and of_edges are the full residual b − A x.
 
@@ -189,7 +189,7 @@ def backward_again(  # type: ignore[no-untyped-def]
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
         scatter(blocks, columns, r, lo, hi, (-y0, -y1, -y2))
         first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
-        scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
+        scatter_edges(groups, columns4, of_edges, first, last, (-y0, -y1, -y2))
 
 
 class SweepsWithEdges:

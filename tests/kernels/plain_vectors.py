@@ -52,12 +52,12 @@ def scatter(blocks, columns, out, lo, hi, factors):  # type: ignore[no-untyped-d
 
 
 @njit
-def gather_edges(blocks, places, x, lo, hi, ahead):  # type: ignore[no-untyped-def]
+def gather_edges(blocks, indices, x, lo, hi, ahead):  # type: ignore[no-untyped-def]
     flat = x.reshape(-1)
     a = b = c = blocks.dtype.type(0.0)
     for k in range(lo, hi):
         for i in range(4):
-            factor = flat[places[k, i]]
+            factor = flat[indices[k, i]]
             a += blocks[k, i] * factor
             b += blocks[k, 4 + i] * factor
             c += blocks[k, 8 + i] * factor
@@ -65,12 +65,12 @@ def gather_edges(blocks, places, x, lo, hi, ahead):  # type: ignore[no-untyped-d
 
 
 @plain
-def scatter_edges(blocks, places, out, lo, hi, factors):  # type: ignore[no-untyped-def]
+def scatter_edges(blocks, indices, out, lo, hi, factors):  # type: ignore[no-untyped-def]
     flat = out.reshape(-1)
     f0, f1, f2 = factors
     for k in range(lo, hi):
         for i in range(4):
-            flat[places[k, i]] += blocks[k, i] * f0 + blocks[k, 4 + i] * f1 + blocks[k, 8 + i] * f2
+            flat[indices[k, i]] += blocks[k, i] * f0 + blocks[k, 4 + i] * f1 + blocks[k, 8 + i] * f2
 
 
 @plain

@@ -67,23 +67,23 @@ def test_products_are_those_of_plain_numba(kind: type, index: type) -> None:
 def test_products_with_edges_are_those_of_plain_numba(kind: type) -> None:
     random = np.random.default_rng(5)
     blocks = random.normal(size=(3 * N, 12)).astype(kind)
-    x, places = random.normal(size=(N, 3)).astype(kind), random.integers(0, 3 * N, (3 * N, 4))
-    places[::5, 3] = places[::5, 2]  # an edge may be there twice
-    places = places.astype(np.int32)
+    x, indices = random.normal(size=(N, 3)).astype(kind), random.integers(0, 3 * N, (3 * N, 4))
+    indices[::5, 3] = indices[::5, 2]  # an edge may be there twice
+    indices = indices.astype(np.int32)
 
     def results(module: Any) -> list[np.ndarray]:
         gather_edges, scatter_edges = module.gather_edges, module.scatter_edges
 
         @njit
-        def products(blocks, places, x, gathered, scattered):  # type: ignore[no-untyped-def]
+        def products(blocks, indices, x, gathered, scattered):  # type: ignore[no-untyped-def]
             for row in range(gathered.shape[0]):
                 lo, hi = 3 * row, 3 * row + row % 4
-                a, b, c = gather_edges(blocks, places, x, lo, hi, 8)
+                a, b, c = gather_edges(blocks, indices, x, lo, hi, 8)
                 gathered[row, 0], gathered[row, 1], gathered[row, 2] = a, b, c
-                scatter_edges(blocks, places, scattered, lo, hi, (x[row, 0], x[row, 1], x[row, 2]))
+                scatter_edges(blocks, indices, scattered, lo, hi, (x[row, 0], x[row, 1], x[row, 2]))
 
         out = [np.zeros((N, 3), dtype=kind) for _ in range(2)]
-        products(blocks, places, x, *out)
+        products(blocks, indices, x, *out)
         return out
 
     for ours, plain in zip(results(vectors), results(plain_vectors), strict=True):
