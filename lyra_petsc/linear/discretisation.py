@@ -155,9 +155,9 @@ class Discretisation:
             stencils = [stencil for stencil, _ in self._global_elements.values()]
             beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil in stencils]
             more = np.setdiff1d(np.concatenate(beyond), fixed)
-        lacking = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
+        missing = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
         any_here = any(len(stencil) for stencil, _ in self._global_elements.values())
-        others, self.has_near_elements = (flag > 0.0 for flag in layout.global_max(lacking, any_here))
+        others, self.has_near_elements = (flag > 0.0 for flag in layout.global_max(missing, any_here))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()

@@ -215,10 +215,10 @@ class AssembledMatrix:
                 self._storage = Storage(self.mat, self.kind, pattern, self._stored)
 
     def _set_from_options(self, prefix: str) -> None:
-        asked = PETSc.Options(prefix).getString("mat_type", self.mat.getType())
+        kind = PETSc.Options(prefix).getString("mat_type", self.mat.getType())
         self.mat.setOptionsPrefix(prefix)
         # checked first, as PETSc crashes with some types
-        fits = asked.removeprefix("seq").removeprefix("mpi") in ASSEMBLED
+        fits = kind.removeprefix("seq").removeprefix("mpi") in ASSEMBLED
         try:
             if fits:
                 self.mat.setFromOptions()
@@ -228,7 +228,7 @@ class AssembledMatrix:
             self.mat.destroy()
             allowed = ", ".join(ASSEMBLED)
             raise InputError(
-                f"'{asked}' cannot be filled by blocks here; take {allowed}", key=f"-{prefix}mat_type"
+                f"'{kind}' cannot be filled by blocks here; take {allowed}", key=f"-{prefix}mat_type"
             )
 
     @property

@@ -172,7 +172,7 @@ class Storage:
     def __init__(self, mat: PETSc.Mat, kind: str, pattern: BlockPattern, stored: StoredRows) -> None:
         library, name = ctypes.CDLL(PETSc.__file__), KINDS[kind]
         self._get = getattr(library, f"MatSeq{name}GetArray")
-        self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
+        self._restore = getattr(library, f"MatSeq{name}RestoreArray")
         self._mat = mat
         self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
         self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
@@ -187,7 +187,7 @@ class Storage:
         arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]
         self._fill(*self._rows, values, *arrays, *[np.empty(0)] * (2 - len(arrays)))
         for part in parts:
-            self._give_back(part, ctypes.byref(ctypes.c_void_p()))
+            self._restore(part, ctypes.byref(ctypes.c_void_p()))
         self._mat.assemble()
 
     def _array(self, part: ctypes.c_void_p, size: int) -> Array:

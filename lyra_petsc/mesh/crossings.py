@@ -254,9 +254,9 @@ def _morton_codes(low: Array, high: Array) -> NDArray[np.uint64]:
     centres = 0.25 * low + 0.25 * high
     if not len(centres):
         return np.empty(0, np.uint64)
-    least = centres.min(axis=0)
-    extent = (centres.max(axis=0) - least).max()
-    bits = ((centres - least) * (1.0 / extent if extent > 1e-300 else 0.0) * (2**21 - 1)).astype(np.uint64)
+    lowest = centres.min(axis=0)
+    extent = (centres.max(axis=0) - lowest).max()
+    bits = ((centres - lowest) * (1.0 / extent if extent > 1e-300 else 0.0) * (2**21 - 1)).astype(np.uint64)
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -329,22 +329,22 @@ def _search(
     leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
     for i in range(len(queries)):
         a, b, c = queries[i, 0], queries[i, 1], queries[i, 2]
-        least, most = np.minimum(points[a], points[b]), np.maximum(points[a], points[b])
-        least, most = np.minimum(least, points[c]), np.maximum(most, points[c])
+        lowest, highest = np.minimum(points[a], points[b]), np.maximum(points[a], points[b])
+        lowest, highest = np.minimum(lowest, points[c]), np.maximum(highest, points[c])
         stack[0], top = 1, 1
         while top > 0:
             top -= 1
             node = stack[top]
-            if _are_disjoint(least, most, node_low[node], node_high[node]):
+            if _are_disjoint(lowest, highest, node_low[node], node_high[node]):
                 continue
             if node < leaves:
                 stack[top], stack[top + 1] = 2 * node, 2 * node + 1
                 top += 2
                 continue
             first = (node - leaves) * LEAF
-            for place in range(first, min(first + LEAF, len(order))):
-                j = order[place]
-                if (within and j <= i) or _are_disjoint(least, most, low[place], high[place]):
+            for k in range(first, min(first + LEAF, len(order))):
+                j = order[k]
+                if (within and j <= i) or _are_disjoint(lowest, highest, low[k], high[k]):
                     continue
                 d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
                 found = _crossing(points, a, b, c, d, e, f)

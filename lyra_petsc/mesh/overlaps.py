@@ -116,14 +116,14 @@ def inside_box(points: Array, triangles: Ints, corners: Array) -> Overlaps:
         sides = np.roll(shapes, -1, axis=1) - shapes
         axes = [np.cross(sides[:, 0], sides[:, 1])]
         axes += [np.cross(edge, sides[:, k]) for edge, k in itertools.product(np.eye(3), range(3))]
-        meets = np.ones(len(shapes), dtype=bool)
+        overlaps = np.ones(len(shapes), dtype=bool)
         for axis in axes:
             projected = np.einsum("nkx,nx->nk", shapes, axis)
             extent = np.abs(axis) @ half
             separated = (projected.min(axis=1) >= extent) | (projected.max(axis=1) <= -extent)
             # an axis is zero for a side parallel to an edge, and for a triangle without area
-            meets &= ~(separated & axis.any(axis=1))
-        inside[inside] = meets
+            overlaps &= ~(separated & axis.any(axis=1))
+        inside[inside] = overlaps
         return inside
 
     return _select(overlap, points, triangles)

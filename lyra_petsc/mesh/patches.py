@@ -70,7 +70,7 @@ class FlatPatches(NamedTuple):
     inverse : (F, 2, 2)
         Inverse of the matrix of the two sides at the first corner of each triangle, in the material plane
         [1/m].
-    beside : (k, 2)
+    neighbours : (k, 2)
         Pairs of neighbouring patches, or of a patch with itself: the lower number first, in ascending order.
     pairs : (m, 2)
         Those of them that have a region C: a box around both without boundary edges.
@@ -82,7 +82,7 @@ class FlatPatches(NamedTuple):
     order: Ints
     first: Ints
     inverse: Array
-    beside: Ints
+    neighbours: Ints
     pairs: Ints
     around: Ints
     height: Array
@@ -137,7 +137,7 @@ def flat_patches(triangles: Ints, uv: Array, patch: Ints) -> FlatPatches:
     crosses = _cross_interior(*segments, *(part[near_boundary[:, 0], :2] for part in regions))
     kept = np.ones(len(pairs), dtype=np.bool_)
     kept[near_boundary[crosses, 0]] = False
-    beside, regions, pairs = pairs, (regions[0][kept], regions[1][kept]), pairs[kept]
+    neighbours, regions, pairs = pairs, (regions[0][kept], regions[1][kept]), pairs[kept]
     reached_pairs = near_pairs(regions, boxes)
     reached_pairs = reached_pairs[np.lexsort(reached_pairs.T[::-1])]
     around = np.searchsorted(reached_pairs[:, 0], np.arange(len(pairs) + 1))
@@ -148,7 +148,7 @@ def flat_patches(triangles: Ints, uv: Array, patch: Ints) -> FlatPatches:
     usable, sizes = np.asarray(height > 0.0), np.diff(around)
     around = np.append(0, np.cumsum(sizes[usable]))
     reached = reached_pairs[np.repeat(usable, sizes), 1]
-    return FlatPatches(order, first, inverse, beside, pairs[usable], around, height[usable], reached)
+    return FlatPatches(order, first, inverse, neighbours, pairs[usable], around, height[usable], reached)
 
 
 def _add_second_neighbours(pairs: Ints, boxes: tuple[Array, Array], radius: float) -> tuple[Ints, Ints]:
@@ -166,8 +166,8 @@ def _add_second_neighbours(pairs: Ints, boxes: tuple[Array, Array], radius: floa
     close_row = np.repeat(np.arange(len(close)), sizes)
     shift = np.repeat(begin[close[:, 0]] - np.cumsum(sizes) + sizes, sizes)
     between = both[np.arange(len(close_row)) + shift, 1]
-    meets = np.isin(close[close_row, 1] * n + between, both @ [n, 1])
-    close_row, between = close_row[meets], between[meets]
+    touches = np.isin(close[close_row, 1] * n + between, both @ [n, 1])
+    close_row, between = close_row[touches], between[touches]
     three = np.column_stack([close[close_row], between]).T
     extent = (np.maximum.reduce(boxes[1][three]) - np.minimum.reduce(boxes[0][three])).max(axis=1)
     order = np.lexsort((extent, close_row))
@@ -208,8 +208,8 @@ def _singular_values(m):  # type: ignore[no-untyped-def]
     """Largest and smallest singular value of a matrix (3, 2), given as its six entries row by row."""
     a, b = m[0] * m[0] + m[2] * m[2] + m[4] * m[4], m[0] * m[1] + m[2] * m[3] + m[4] * m[5]
     c = m[1] * m[1] + m[3] * m[3] + m[5] * m[5]
-    middle, apart = 0.5 * (a + c), math.sqrt(0.25 * (a - c) ** 2 + b * b)
-    return math.sqrt(middle + apart), math.sqrt(max(middle - apart, 0.0))
+    middle, radius = 0.5 * (a + c), math.sqrt(0.25 * (a - c) ** 2 + b * b)
+    return math.sqrt(middle + radius), math.sqrt(max(middle - radius, 0.0))
 
 
 @cached()

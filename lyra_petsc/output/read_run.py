@@ -473,8 +473,8 @@ def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
         header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
         if not header or any(len(row) != len(header) for row in rows):
             raise ValueError("rows of different lengths")
-        if lacking := [name for name in needed if name not in header]:
-            raise ValueError(f"no column {lacking[0]}")
+        if missing := [name for name in needed if name not in header]:
+            raise ValueError(f"no column {missing[0]}")
         columns: Columns = {}
         for i, name in enumerate(header):
             column = np.array([row[i] for row in rows], dtype=None if name in TEXT_COLUMNS else "U64")

@@ -269,11 +269,11 @@ class Recorder:
         It is also due if its cost is negligible compared with the time since the last one, so that a step
         of minutes is not lost if the launcher kills the run a second after its signal.
         """
-        asked = self._simulation.scene.output.checkpoint
-        if asked.steps is not None and self._steps_since_checkpoint >= asked.steps:
+        checkpoint = self._simulation.scene.output.checkpoint
+        if checkpoint.steps is not None and self._steps_since_checkpoint >= checkpoint.steps:
             return True
         elapsed = clock.monotonic() - self._last_checkpoint
-        return elapsed >= asked.seconds or elapsed >= MIN_COST_RATIO * self._checkpoint_seconds
+        return elapsed >= checkpoint.seconds or elapsed >= MIN_COST_RATIO * self._checkpoint_seconds
 
     def _write_row(self, report: StepReport) -> bool:
         """Write the step's rows to all tables; returns whether a checkpoint is due by rank 0's clock."""

@@ -71,7 +71,7 @@ class FolderKind:
         Names of the result files; ``--force`` removes no other file.
     resumable : callable
         Returns the files from which a folder can be resumed; empty if there are none.
-    lack : str
+    missing : str
         Text for messages: the file that is missing if a folder cannot be resumed.
     check : callable, optional
         Further check of a folder to be resumed, which raises InputError.
@@ -84,7 +84,7 @@ class FolderKind:
     lock: str
     result: re.Pattern[str]
     resumable: Callable[[Path], list[Path]]
-    lack: str
+    missing: str
     check: Callable[[Path], None] | None = None
     folders: tuple[str, ...] = ()
 
@@ -221,7 +221,7 @@ def _check_choice(choice: FolderChoice, key: str) -> None:
                 f"does not exist, so there is no {kind.noun} to resume", file=path, key="--resume"
             )
         if not kind.resumable(path):
-            raise InputError(f"holds {kind.lack}; run without --resume", file=path, key="--resume")
+            raise InputError(f"holds {kind.missing}; run without --resume", file=path, key="--resume")
         if kind.check is not None:
             kind.check(path)
     elif choice.given and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
@@ -328,7 +328,7 @@ class RunDirectory:
                 if fresh and os.listdir(path) != [kind.lock]:
                     raise FileExistsError
                 if choice.resume and not kind.resumable(path):  # another process has replaced it
-                    raise InputError(f"holds {kind.lack}; run without --resume", file=path)
+                    raise InputError(f"holds {kind.missing}; run without --resume", file=path)
                 return path, self._lock.held
             except (FileExistsError, FolderLocked) as error:
                 self.release()

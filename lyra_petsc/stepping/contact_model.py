@@ -149,11 +149,11 @@ class ContactModel:
 
         ``excess`` (m,) [N] are the spring forces minus those expected by the matrix.
         """
-        there = remaining.duplicate()
-        self._linear.operator.mat.mult(z, there)
-        remaining.axpy(-1.0, there)
+        product = remaining.duplicate()
+        self._linear.operator.mat.mult(z, product)
+        remaining.axpy(-1.0, product)
         remaining.setArray(remaining.getArray(readonly=True) - self._forces(excess).ravel())
-        there.destroy()
+        product.destroy()
 
     def _elongations(self, y: PETSc.Vec) -> Array:
         """Elongations [m] of all springs in a step y; collective."""

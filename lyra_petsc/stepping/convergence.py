@@ -80,14 +80,14 @@ class Convergence:
         break_even_iterations: float,
     ) -> None:
         self._system, self._tolerances, self.spacing = system, tolerances, spacing
-        self._floor = self._least_floor = floor
+        self._floor = self._minimum_floor = floor
         self._break_even_iterations = break_even_iterations
         self.mean_iterations, self.max_displacement = 0.0, np.inf
         self.begin_solve()
 
     def begin_solve(self) -> None:
         """Prepare for a new solve."""
-        self.norm, self.fell_fast, self.at_roundoff, self._floor = 0.0, False, False, self._least_floor
+        self.norm, self.fell_fast, self.at_roundoff, self._floor = 0.0, False, False, self._minimum_floor
         self.halved = True
         self.remaining, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
@@ -131,7 +131,7 @@ class Convergence:
             self.mean_iterations += RECENT * (spent - self.mean_iterations)
         slow = iteration > 0 and residual > STALLED * before
         if slow and self._system.discretisation.has_near_elements:
-            self._floor = max(self._least_floor, contact_roundoff(self._system))
+            self._floor = max(self._minimum_floor, contact_roundoff(self._system))
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0

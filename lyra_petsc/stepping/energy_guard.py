@@ -271,7 +271,7 @@ class EnergyGuard:
         system, self._next_pull = self._system, None
         at = system.prescribed.indices
         displacement = moved.take(at)
-        if not displacement.any():  # most handles stand still
+        if not displacement.any():  # max_gain handles stand still
             return 0.0
         n = system.points.n_owned
         if self._pull is None or self._pull[0] != system.t0:
@@ -311,10 +311,10 @@ class EnergyGuard:
         of_steps = max(new.total, math.fsum(new.recent))
         self._judged = of_step, of_steps, new.scale
         impact = strict and self._system.has_active_pairs and self._system.integrator.order > 1
-        most, most_in_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
-        accepted = of_step <= max(most * new.scale, step.noise)
+        max_gain, max_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
+        accepted = of_step <= max(max_gain * new.scale, step.noise)
         # repeating a step without a gain would not reduce the sum
-        accepted &= of_steps <= max(most_in_sum * new.scale, step.noise) or new.recent[-1] <= 0.0
+        accepted &= of_steps <= max(max_sum * new.scale, step.noise) or new.recent[-1] <= 0.0
         accepted = bool(self._system.points.comm.bcast(accepted, root=0))
         if accepted:
             self.gains, self._pull = new, self._next_pull

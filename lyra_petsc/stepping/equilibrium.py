@@ -543,8 +543,8 @@ def _note(found: Stability, followed: int, message: str) -> str:
     if found.stable is None:
         return f"whether the equilibrium is stable is not known: {found.reason}"
     if not found.stable:
-        ways = "1 way" if found.negative == 1 else f"{found.negative} ways"
-        return f"the equilibrium is unstable, it gives way in {ways} (negative pivots): {message}"
+        modes = "1 way" if found.negative == 1 else f"{found.negative} ways"
+        return f"the equilibrium is unstable, it gives way in {modes} (negative pivots): {message}"
     notes = []
     if followed:
         times = "once" if followed == 1 else f"{followed} times"
@@ -563,10 +563,10 @@ def _history_entry(force: float, attempt: Attempt | None) -> Iteration:
 
 def _last_progress(forces: list[float]) -> int:
     """Index of the last force that was notably less than all before."""
-    last, least = 0, np.inf
+    last, smallest = 0, np.inf
     for number, force in enumerate(forces):
-        if force < PROGRESS * least:
-            last, least = number, force
+        if force < PROGRESS * smallest:
+            last, smallest = number, force
     return last
 
 

@@ -367,12 +367,12 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     for term in system.active.elastic:
         if term.registration.coarse:
             entry, name = registration_of(term.registration.coarse), f"coarse {term.name}"
-            # which are for forces and files, as the angles at rest, that regularised Hessians do not know
+            # regularised Hessians do not depend on these data, nor on the rest angle
             elements = part.elements[name].without("length", "rest_height")
             data = {**elements.data, "rest_angle": elements.data["k"]}
             elements = replace(elements, data=data, index=np.empty(0, dtype=np.int32))
             coarse = cast("Elastic", make_term(entry, elements, scene, on_vertices))
-            coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
+            coarse.registration = replace(entry, name=name)  # another sheet may have this term
             system.active.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     system.x[rows] = data["position"]
@@ -418,16 +418,16 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: flo
     near = nearest_pair(system, system.x)
     if near is None or near.gap > minimum:
         return
-    apart, remedy = "not apart", "move them apart"
+    distance, remedy = "not apart", "move them apart"
     if near.gap > 0.0:
-        apart = f"{near.gap:.3g} m apart" + (", beside contact.thickness" if near.kept else "")
-        apart += ", less than a thousandth of contact.gap, which would throw them from each other"
+        distance = f"{near.gap:.3g} m apart" + (", beside contact.thickness" if near.kept else "")
+        distance += ", less than a thousandth of contact.gap, which would throw them from each other"
         remedy += f", best by {minimum / TOO_NEAR:.3g} m"
     elif near.kept > 0.0:
-        apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
-        apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
+        distance = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
+        distance, remedy = f"{distance} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
     raise InputError(
-        f"{when} {near.text} are {apart}; {remedy}",
+        f"{when} {near.text} are {distance}; {remedy}",
         file=scene.source,
         key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
     )
@@ -453,12 +453,12 @@ def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> 
 def _check_indices(points: Layout, n_blocks: int) -> None:
     """Refuse more unknowns, or more matrix entries on a rank, than PETSc's integers count; collective."""
     largest = int(np.iinfo(PETSc.IntType).max)
-    most_entries = 9 * points.comm.allreduce(n_blocks, MPI.MAX)
-    if 3 * points.n_global <= largest and most_entries <= largest:
+    n_entries = 9 * points.comm.allreduce(n_blocks, MPI.MAX)
+    if 3 * points.n_global <= largest and n_entries <= largest:
         return
     remedy = "a PETSc with 64-bit indices" if 3 * points.n_global > largest else "more ranks"
     raise InputError(
-        f"{points.n_global} vertices make {3 * points.n_global} unknowns and up to {most_entries} matrix "
+        f"{points.n_global} vertices make {3 * points.n_global} unknowns and up to {n_entries} matrix "
         f"entries on a rank, of which this PETSc counts {largest}; take {remedy}, or make the mesh coarser",
         key="mesh",
     )

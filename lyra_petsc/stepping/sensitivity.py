@@ -371,7 +371,7 @@ class Sensitivities:
         tangent.v = _difference(neighbours, delta, lambda each: each.system.v[:n])
         names = neighbours[0].system.integrator.saved_state()[0].keys()
         tangent.history = {
-            name: _difference(neighbours, delta, partial(_memory_array, name)) for name in names
+            name: _difference(neighbours, delta, partial(_history_array, name)) for name in names
         }
 
     def _change_frames(self, system: StageEquations) -> None:
@@ -540,7 +540,7 @@ class Sensitivities:
             collective=True,
         )
 
-    # -- what comes out ----------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------
 
     def derivatives(self, quantity: Callable[[Problem, EnergyBalance | None], Array]) -> Array:
         """Derivatives (m, n) of a quantity (m,) of the present state with respect to the n numbers.
@@ -572,7 +572,7 @@ def _difference(neighbours: Neighbours, delta: float, of: Callable[[Neighbour], 
     return np.asarray(total)
 
 
-def _memory_array(name: str, each: Neighbour) -> Array:
+def _history_array(name: str, each: Neighbour) -> Array:
     """The array ``name`` of the integrator's history."""
     return each.system.integrator.saved_state()[0][name]
 

@@ -191,7 +191,7 @@ class SteppedScene:
         if self.problem.points.n_edges_global and not self.stepper.balance_edge_moments(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
         for term in system.active.elastic:
-            if term.registration.element_vertices:  # friction, which knows of no way before the start
+            if term.registration.element_vertices:  # friction has no contacts from an earlier step
                 term.initialise(system.x)
         self._equilibrium: Equilibrium | None = None
         if scene.time.static:
@@ -439,16 +439,16 @@ class SteppedScene:
             stage_at_end = system.stage.offset == system.dt
             unresolved = dt > UNRESOLVED_SKINS * self._time_through_skin()
             if stage_at_end or self.scene.time.adaptive or not unresolved:
-                return self._switch_to_backward_euler(dt, "finds no way")
-            from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # of use for nothing else
+                return self._switch_to_backward_euler(dt, "finds no collision-free step")
+            from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # needed at impacts only
 
             system.integrator = Bdf2()
-            self._note_impact("finds no way", "bdf2")
+            self._note_impact("finds no collision-free step", "bdf2")
             return True
         if system.integrator is usual or system.integrator.order == 1:
             return False
         system.integrator = usual
-        return self._switch_to_backward_euler(dt, "finds no way")
+        return self._switch_to_backward_euler(dt, "finds no collision-free step")
 
     def _switch_to_backward_euler(self, dt: float, why: str, *, last: bool = False) -> bool:
         """Let backward Euler repeat a short step that failed in contact; return whether it does.
@@ -475,7 +475,7 @@ class SteppedScene:
         where = f"step {self.step_number + 1} ({self._time_text()}): {self._scene_integrator.name} {why}"
         self._note_once(
             "impact" if by == "backward Euler" else f"impact {by}",
-            f"{where} where something touches; such steps are repeated by {by}",
+            f"{where} in contact; such steps are repeated by {by}",
         )
 
     def _halve_step(self, dt: float, halvings: int) -> None:

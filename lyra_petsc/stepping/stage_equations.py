@@ -193,10 +193,10 @@ class StageEquations:
 
         Without it the rows of edges whose triangles have lost their area would be zero.
         """
-        least = np.zeros((self.points.n_local, 3))
+        stiffness = np.zeros((self.points.n_local, 3))
         for term in self.active.with_edges:
-            least.reshape(-1)[term.edge_indices] = MIN_EDGE_STIFFNESS * term.edge_stiffness
-        return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
+            stiffness.reshape(-1)[term.edge_indices] = MIN_EDGE_STIFFNESS * term.edge_stiffness
+        return stiffness[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
     def set_references(self, time: float) -> None:
         """Take the present positions as reference of handles that start to act by ``time`` [s]."""

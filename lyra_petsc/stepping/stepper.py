@@ -204,7 +204,7 @@ class Stepper:
         if system.discretisation.stencils_change or (system.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
         if PETSc.Options().getBool("contact_monitor", False) and system.discretisation.limits_motion:
-            from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
+            from lyra_petsc.stepping.contact_monitor import ContactMonitor  # needed with the option only
 
             snes.setMonitor(ContactMonitor(system, lambda: newton.step_fraction))
         if self._iterates:

@@ -65,7 +65,7 @@ class SheetSearch:
         found, corner = np.unique(patch_corners, axis=0, return_index=True)
         self._corners, self._n_own = corner, len(corner)
         self._own_first = np.searchsorted(found[:, 0], np.arange(self._n + 1))
-        self._bounds = DistanceBounds(self._flat.beside, self._own_first)
+        self._bounds = DistanceBounds(self._flat.neighbours, self._own_first)
         self._same_patch = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
         self._triangles: Ints | None = None
         self._capacity = 1024

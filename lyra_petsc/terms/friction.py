@@ -387,8 +387,8 @@ class CoulombFriction(Elastic):
         owed = self._vertex_data[:, OWED] / dt + acted + damping[: len(acted)] - given
         paid = np.where(slid > 0.0, np.where(acted > 0.0, PAID_FRACTION, 1.0) * owed, 0.0)
         # sticking pairs are owed nothing, new contacts get everything later
-        goes_on = (acted > 0.0) & ((slid > 0.0) | (given == 0.0))
-        self._next_owed = np.where(goes_on, dt * (owed - paid), 0.0)
+        is_owed = (acted > 0.0) & ((slid > 0.0) | (given == 0.0))
+        self._next_owed = np.where(is_owed, dt * (owed - paid), 0.0)
         paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
         missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
         # sticking pairs are stopped at once: oscillating springs would pull with twice the static force

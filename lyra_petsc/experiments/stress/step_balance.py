@@ -113,9 +113,9 @@ def force_work(
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
     # a barrier is as wide as its gap; second derivatives jump where the nearest feature changes
     largest_dx, skin = largest(comm, dx[:n]), min((term.skin for term in contact), default=0.0)
-    panels, most = CONTACT_PANELS
+    panels, max_contact = CONTACT_PANELS
     panels = max(panels, math.ceil(largest_dx / skin)) if skin > 0.0 else panels
-    for part, refine, first, last in ((hinges, smooth, 1, MAX_PANELS), (contact, True, panels, most)):
+    for part, refine, first, last in ((hinges, smooth, 1, MAX_PANELS), (contact, True, panels, max_contact)):
         if part:
             integral = refined(part, first, last) if refine else None
             if integral is None:
@@ -286,14 +286,14 @@ class BalanceRecorder:
         external = {term: frozen for term, frozen in self._sheet.items() if _acts_from_outside(term)}
         external_gradient = gradient(external, x1)[:n]
         external_damping = self._damping(external, v1)[:n]
-        energy_now, energy_then = energy(self._sheet, x1), energy({**self._sheet, **self._start_frames}, x0)
-        target_work = energy_then - self._energy
+        end_energy, start_energy = energy(self._sheet, x1), energy({**self._sheet, **self._start_frames}, x0)
+        target_work = start_energy - self._energy
         mass, size_of_g = system.mass[:, None], float(np.linalg.norm(self._simulation.scene.gravity or 0.0))
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
          free_dx, all_dx, energy_noise, forces, powers, heights) = system.points.global_sum(
             0.5 * float(np.sum(mass * v0[:n] ** 2)),
             0.5 * float(np.sum(mass * v1[:n] ** 2)),
-            energy_now - energy_then,
+            end_energy - start_energy,
             target_work,
             sum(load.potential(x0) for load in system.active.loads),
             sum(load.potential(x1) for load in system.active.loads),
@@ -728,11 +728,11 @@ def judge_run(record: RunRecord) -> Verdict:
 def judge_momentum(record: RunRecord) -> Verdict:
     """Whether linear and angular momentum change by external forces only: internal forces sum to zero."""
     at, line = _worst_step(record, lambda b: ratio(b.momentum, b.momentum_tolerance))
-    turn_at, turn = _worst_step(record, lambda b: ratio(b.angular, b.angular_tolerance))
+    turn_step, turn = _worst_step(record, lambda b: ratio(b.angular, b.angular_tolerance))
     text = f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
     if turn.angular_tolerance:
         text += (
-            f"; angular in step {turn_at}: {short(turn.angular)} N m s, "
+            f"; angular in step {turn_step}: {short(turn.angular)} N m s, "
             f"tolerance {short(turn.angular_tolerance)} N m s"
         )
     good = line.momentum <= line.momentum_tolerance and turn.angular <= turn.angular_tolerance

@@ -436,7 +436,7 @@ def severity(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
 
 
 def _aligned_cells(texts: Sequence[str]) -> str:
-    widths = [max(len(name), least) for name, least in HEADINGS.items()]
+    widths = [max(len(name), minimum) for name, minimum in HEADINGS.items()]
     first, *others = zip(texts, widths, strict=True)
     return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
 

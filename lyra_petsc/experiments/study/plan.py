@@ -117,8 +117,8 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     axes: dict[str, Axis] = {}
     for text in texts:
         axis = _parse_axis(text)
-        if twin := axes.get(axis.path):
-            message = f"varies what {twin.key} varies already; give all values at once"
+        if earlier := axes.get(axis.path):
+            message = f"varies what {earlier.key} varies already; give all values at once"
             raise InputError(message, key=_option(text))
         axes[axis.path] = axis
     if {"time.step", "time.tolerance"} <= set(axes):

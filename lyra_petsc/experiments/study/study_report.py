@@ -274,12 +274,12 @@ def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
         "pareto": row.on_front,
         "recommended": row.recommended,
     }
-    lacking = set() if row.passed else {"dt_mean", "dt_min", "dt_max", *COUNTS}
-    lacking |= set() if result.vertices else {"h", "vertices", "triangles"}
-    lacking |= {
+    missing = set() if row.passed else {"dt_mean", "dt_min", "dt_max", *COUNTS}
+    missing |= set() if result.vertices else {"h", "vertices", "triangles"}
+    missing |= {
         key for key, value in columns.items() if isinstance(value, float) and not math.isfinite(value)
     }
-    return columns | dict.fromkeys(lacking)
+    return columns | dict.fromkeys(missing)
 
 
 BELOW = "below what the reference can tell"

@@ -175,10 +175,10 @@ def _reference_run(plan: Plan, folder: Path, key: str) -> Reference:
                 file=folder,
                 key=key,
             )
-    lacking = [each.probe for each in plan.quantities if each.probe and each.probe not in samples.probes]
-    if lacking and plan.request.quantities:
-        raise InputError(f"has no probe '{lacking[0]}'", file=folder, key=key)
-    notes = [f"the reference run has no probe '{name}': its error is not known" for name in lacking]
+    missing = [each.probe for each in plan.quantities if each.probe and each.probe not in samples.probes]
+    if missing and plan.request.quantities:
+        raise InputError(f"has no probe '{missing[0]}'", file=folder, key=key)
+    notes = [f"the reference run has no probe '{name}': its error is not known" for name in missing]
     return Reference("run", f"run {folder}", folder=folder, notes=[*notes, *_scene_differences(plan, folder)])
 
 

@@ -274,13 +274,13 @@ def _rejected_steps(facts: Facts) -> Iterator[str]:
     if facts.n_steps == 0 or facts.rejected <= MANY_REJECTED * facts.n_steps:
         return
     seen = f"{facts.rejected} attempts at a step were rejected over {facts.n_steps} accepted steps"
-    time, usual = facts.run.scene.time, float(np.median(facts.steps("dt")))
+    time, median = facts.run.scene.time, float(np.median(facts.steps("dt")))
     if time.adaptive:
         yield f"{seen}: each costs a solve. A larger time.tolerance rejects fewer."
     elif facts.static:
         yield f"{seen}. A smaller time.step (first increment of the load factor) saves the attempts."
-    elif usual < 0.99 * float(time.step):
-        yield f"{seen}. Set time.step to {short(usual)} s, the median of the steps that were accepted."
+    elif median < 0.99 * float(time.step):
+        yield f"{seen}. Set time.step to {short(median)} s, the median of the steps that were accepted."
     else:
         yield f"{seen}, a few hard moments of the motion. time.step: auto takes small steps only there."
 
@@ -342,11 +342,11 @@ def _compilation(facts: Facts) -> Iterator[str]:
     wall = facts.steps("wall_seconds")
     if len(wall) < 3:
         return
-    first, usual = float(wall[0]), float(np.median(wall))
-    if first - usual > SLOW_FIRST_STEP:
+    first, median = float(wall[0]), float(np.median(wall))
+    if first - median > SLOW_FIRST_STEP:
         yield (
-            f"The first step took {seconds(first)}, a later one {seconds(usual)}: kernels were compiled. The "
-            "next run loads them."
+            f"The first step took {seconds(first)}, a later one {seconds(median)}: kernels were compiled. "
+            "The next run loads them."
         )
 
 
@@ -394,8 +394,6 @@ RULES: tuple[Rule, ...] = (
 
 SLOWEST = 5
 """Number of the slowest steps that are listed."""
-
-PICTURES = 3
 
 
 def run_page(run: StoredRun, pictures: Sequence[Drawing]) -> Report:
@@ -519,8 +517,8 @@ def _steps(page: Report, facts: Facts) -> None:
     }
     for column, name in names.items():
         values = facts.steps(column)
-        least, usual, most = (float(f(values)) for f in (np.min, np.median, np.max))
-        rows.append([name, least, usual, most, None if column == "residual" else float(values.sum())])
+        minimum, median, maximum = (float(f(values)) for f in (np.min, np.median, np.max))
+        rows.append([name, minimum, median, maximum, None if column == "residual" else float(values.sum())])
     page.table(["of a step", "least", "median", "most", "in all"], rows)
     slow = np.argsort(-facts.steps("wall_seconds"), kind="stable")[:SLOWEST]
     listed: dict[str, tuple[str, type]] = {

@@ -179,10 +179,10 @@ def _contacts(trial: Trial) -> tuple[int, float]:
 
 def _judge_many(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
     crossings, contacts = zip(*record.observed, strict=True)
-    most = max(contacts)
+    largest = max(contacts)
     return {
         **_judge(setting, bench, replace(record, observed=list(crossings))),
-        "contacts": Verdict(most >= MANY, f"{most:.6g} contacts at most, asked for {MANY}"),
+        "contacts": Verdict(largest >= MANY, f"{largest:.6g} contacts at most, asked for {MANY}"),
     }
 
 
