@@ -65,13 +65,13 @@ def find_launcher(ranks: int) -> list[str]:
         raise InputError(
             "starts one mpirun per case and cannot be used under mpirun; leave one of them out", key="--ranks"
         )
-    words = shlex.split(os.environ.get("MPIRUN", ""))
-    if not words:
+    command = shlex.split(os.environ.get("MPIRUN", ""))
+    if not command:
         beside = Path(sys.executable).with_name("mpirun")
-        words = [str(beside) if beside.exists() else "mpirun"]
-    if shutil.which(words[0]) is None:
-        raise InputError(f"{words[0]} not found; install it or set MPIRUN", key="--ranks")
-    return [*words, "-n", str(ranks)]
+        command = [str(beside) if beside.exists() else "mpirun"]
+    if shutil.which(command[0]) is None:
+        raise InputError(f"{command[0]} not found; install it or set MPIRUN", key="--ranks")
+    return [*command, "-n", str(ranks)]
 
 
 def environment() -> dict[str, str]:
@@ -94,13 +94,13 @@ def environment() -> dict[str, str]:
 
 
 def run_launched(
-    words: Sequence[str], watch: Callable[[], None], keep_open: Sequence[int] = ()
+    command: Sequence[str], watch: Callable[[], None], keep_open: Sequence[int] = ()
 ) -> tuple[int, str]:
     """Run a command with a launcher to its end; returns its exit code and its standard error.
 
     Parameters
     ----------
-    words : sequence of str
+    command : sequence of str
         The command.
     watch : callable
         Called repeatedly; if it raises, the process is terminated.
@@ -115,7 +115,7 @@ def run_launched(
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors_file:
         try:
             process = subprocess.Popen(
-                words,
+                command,
                 env=environment(),
                 stdin=subprocess.DEVNULL,
                 stderr=errors_file.fileno(),
@@ -124,7 +124,7 @@ def run_launched(
                 pass_fds=tuple(keep_open),
             )
         except OSError as error:
-            raise OutputError(f"{words[0]} cannot be started: {reason(error)}") from error
+            raise OutputError(f"{command[0]} cannot be started: {reason(error)}") from error
         try:
             while process.poll() is None:
                 time.sleep(POLL)

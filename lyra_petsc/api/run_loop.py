@@ -123,7 +123,7 @@ class _RunLoop:
         try:
             return on_root(self._comm, lambda: read_summary(self._folder / "summary.json")) or {}
         except InputError as error:
-            self._simulation.notes.append(f"{error}; what it told of earlier resumptions is lost")
+            self._simulation.notes.append(f"{error}; its entries on earlier resumptions are lost")
             return {}
 
     def run(self, stop: SignalCheck) -> None:

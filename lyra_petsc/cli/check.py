@@ -119,19 +119,19 @@ def _contact(scene: Scene) -> list[tuple[str, str]]:
     if contact is None:
         return []
     gap = f"gap {contact.gap:g} m" if contact.gap is not None else "gap by the mesh"
-    words = [gap, f"thickness {contact.thickness:g} m", f"friction {_friction(contact.friction)}"]
-    words += [] if contact.self else ["with obstacles alone"]
-    return [("contact", ", ".join(words)), *_obstacles(scene, contact)]
+    parts = [gap, f"thickness {contact.thickness:g} m", f"friction {_friction(contact.friction)}"]
+    parts += [] if contact.self else ["with obstacles alone"]
+    return [("contact", ", ".join(parts)), *_obstacles(scene, contact)]
 
 
 def _obstacles(scene: Scene, contact: Contact) -> list[tuple[str, str]]:
     rows = []
     for name, obstacle in (scene.obstacles or {}).items():
         friction = contact.friction if obstacle.friction is None else obstacle.friction
-        words = [f"inside of a {obstacle.shape}" if obstacle.inside else obstacle.shape]
+        parts = [f"inside of a {obstacle.shape}" if obstacle.inside else obstacle.shape]
         if obstacle.motion is not None:
-            words.append(f"moves by {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "moves")
-        rows.append((one_line(f"obstacle {name}"), ", ".join([*words, f"friction {_friction(friction)}"])))
+            parts.append(f"moves by {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "moves")
+        rows.append((one_line(f"obstacle {name}"), ", ".join([*parts, f"friction {_friction(friction)}"])))
     return rows
 
 

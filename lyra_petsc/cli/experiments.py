@@ -54,10 +54,10 @@ def petsc_arguments() -> list[str]:
     return split(sys.argv[1:])[1]
 
 
-def command(comm: MPI.Comm, verb: str, words: Sequence[str]) -> list[str]:
+def command(comm: MPI.Comm, verb: str, arguments: Sequence[str]) -> list[str]:
     """The command line that repeats a verb."""
     launcher = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
-    return [*launcher, "python", "-m", "lyra_petsc", verb, *words, *petsc_arguments()]
+    return [*launcher, "python", "-m", "lyra_petsc", verb, *arguments, *petsc_arguments()]
 
 
 def to_arguments(options: Mapping[str, Any]) -> list[str]:
@@ -225,8 +225,8 @@ def stress(
         outcome = run(cases[0])
         on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.saved()))
         return 0 if outcome.passed else FAILED
-    words = [*asked, *to_arguments({"--only": ",".join(names), "--ranks": ranks})]
-    again, view = command(comm, "stress", words), Stress(setting, len(cases))
+    arguments = [*asked, *to_arguments({"--only": ",".join(names), "--ranks": ranks})]
+    again, view = command(comm, "stress", arguments), Stress(setting, len(cases))
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, known)
 

@@ -65,10 +65,10 @@ def fit(
     """
     if scene is None:
         raise InputError("needs a scene with a block fit, as in: fit strip.yaml", key="SCENE")
-    words = [str(scene), *to_arguments({"--set": settings, "--trust-mesh": trust_mesh})]
+    arguments = [str(scene), *to_arguments({"--set": settings, "--trust-mesh": trust_mesh})]
     if ranks is not None:
-        words += to_arguments({"--out": out, "--force": force, "--resume": resume})
-        return _launched(comm, ranks, words)
+        arguments += to_arguments({"--out": out, "--force": force, "--resume": resume})
+        return _launched(comm, ranks, arguments)
 
     def read() -> Scene:
         loaded = load_scene(scene, settings)
@@ -96,7 +96,7 @@ def fit(
                 return outcome_of(fit_scene(comm, loaded, folder=folder, watch=watch, observer=progress))
 
         results: Results[FitOutcome] = Results(
-            comm, folder, view, ranks=comm.size, command=command(comm, "fit", words), force=True
+            comm, folder, view, ranks=comm.size, command=command(comm, "fit", arguments), force=True
         )
         note = results.run([Case("fit", "numbers from measurements")], work)
     if comm.rank == 0:
@@ -111,7 +111,7 @@ def fit(
     return 0
 
 
-def _launched(comm: MPI.Comm, ranks: int, words: list[str]) -> int:
+def _launched(comm: MPI.Comm, ranks: int, arguments: list[str]) -> int:
     """Run the same command on ``ranks`` ranks, with this process's streams; returns the exit code."""
     program = [*on_root(comm, lambda: find_launcher(ranks)), sys.executable, "-m", "lyra_petsc", "fit"]
-    return subprocess.call([*program, *words, *petsc_arguments()], env=environment())
+    return subprocess.call([*program, *arguments, *petsc_arguments()], env=environment())

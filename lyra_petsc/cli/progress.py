@@ -237,7 +237,7 @@ def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | st
     folder : path
         The run's folder.
     outcome : str
-        How the run ended, in words.
+        Text on how the run ended.
     """
     if comm.rank > 0:
         return

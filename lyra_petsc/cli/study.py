@@ -93,8 +93,8 @@ def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
         print(f"report       {folder / 'report.html'}", flush=True)
         warn_unused([])
     if not done:
-        words = f"all {len(rows)} combinations failed; the first: {rows[0].result.problem}"
-        raise SolverError(words, collective=True)
+        message = f"all {len(rows)} combinations failed; the first: {rows[0].result.problem}"
+        raise SolverError(message, collective=True)
     for lost in (known for known in view.runner.references.values() if known.kind == "none"):
-        words = f"{lost.description} ({'; '.join(lost.notes)}); run times are in {folder / 'study.csv'}"
-        raise SolverError(words, collective=True)
+        message = f"{lost.description} ({'; '.join(lost.notes)}); run times are in {folder / 'study.csv'}"
+        raise SolverError(message, collective=True)

@@ -44,12 +44,12 @@ class Served:
 
     @classmethod
     def of(cls, host: str | None, port: int | None, no_browser: bool) -> Served:
-        """From the options."""
+        """The address that the options name."""
         return cls("127.0.0.1" if host is None else host, port or 0, not no_browser)
 
     @classmethod
     def of_live(cls, live: bool, host: str | None, port: int | None, no_browser: bool) -> Served | None:
-        """From the options of ``run``; None without ``--live``.
+        """The address that the options of ``run`` name; None without ``--live``.
 
         Raises
         ------

@@ -203,7 +203,7 @@ class Solution:
 
 
 SOLUTIONS: dict[str, Solution] = {}
-"""By name."""
+"""Exact solutions by name."""
 
 Motion = Callable[[Body], ExactMotion]
 

@@ -58,7 +58,7 @@ class View(ABC, Generic[O]):
     title : str
         Title of the page.
     pictures : str
-        What the page lacks if the plotting packages are not installed, for the note about it.
+        Name of the figures, for the note that the page lacks them without the plotting packages.
     columns : sequence of str
         Columns of the CSV file.
     entry : str

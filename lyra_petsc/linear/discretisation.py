@@ -80,14 +80,14 @@ class Discretisation:
     Parameters
     ----------
     layout : Layout
-        With the ghosts that fixed stencils need.
+        Layout with the ghosts that fixed stencils need.
     terms : iterable of Term
         Terms whose Hessians are assembled into the matrix.
 
     Attributes
     ----------
     layout : Layout
-        With the ghosts that all stencils need.
+        Layout with the ghosts that all stencils need.
     fixed, rows : BlockRows
         Block rows of fixed stencils only, and of all stencils; the same object if stencils do not change.
     fixed_positions : (n,) int64 or None

@@ -97,7 +97,7 @@ class Level:
     turns : DirectorRotations or None
         Interpolation from displacements of vertices to the unknowns of edges.
     memory : (n,) float64 or None
-        With unknowns on edges, work array of the sweeps, and before them of the next level's block rows.
+        If edges have unknowns: work array of the sweeps, and before them of the next level's block rows.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: DirectorRotations | None = None) -> None:
@@ -124,7 +124,7 @@ class Hierarchy:
     ----------
     levels : list of Level
     rows : (n_stored, 3, 3) or None
-        With ``below`` and ``spare``: array for the finest level's block rows, within its memory.
+        If ``below`` and ``spare`` are given: array for the finest level's block rows, within its memory.
     """
 
     def __init__(
@@ -182,9 +182,9 @@ class Hierarchy:
         Parameters
         ----------
         values : (n_blocks, 3, 3)
-            Of the finest level.
+            Block rows of the finest level.
         held : (n_local, 3)
-            Mask of its prescribed coordinates.
+            Mask of the prescribed coordinates of the finest level.
 
         Yields
         ------

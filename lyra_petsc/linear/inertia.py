@@ -47,7 +47,7 @@ class Inertia:
     layout : Layout
     pattern : BlockPattern
     values : (n_stored, 3, 3)
-        Its block rows, prescribed unknowns decoupled with a positive diagonal.
+        Block rows of the matrix, prescribed unknowns decoupled with a positive diagonal.
     """
 
     def __init__(self, layout: Layout, pattern: BlockPattern, values: Array) -> None:

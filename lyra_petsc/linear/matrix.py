@@ -102,7 +102,7 @@ class BlockMatrix:
     Attributes
     ----------
     mat : PETSc.Mat
-        Of type ``python``.
+        A matrix of type ``python``.
     rows : (n_stored, 3, 3) float64
         The block rows; ``set`` tells PETSc that they changed.
     observers : list of callables

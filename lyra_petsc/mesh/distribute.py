@@ -26,9 +26,9 @@ class GlobalMesh:
     ----------
     n_vertices : int
     triangles : (F, 3) int64
-        Make the graph for the partitioner.
+        Vertices of the triangles, for the graph of the partitioner.
     elements : dict of name → Elements
-        In the numbering of the mesh.
+        Elements in the numbering of the mesh.
     vertex_data : dict of name → (V, …) array
     edges : (N, 2) int64 or None
         Vertices of the edges of the mesh; needed where elements couple unknowns of edges.
@@ -55,7 +55,7 @@ class LocalMesh:
     ----------
     layout : Layout
     elements : dict of name → Elements
-        In local numbering; counted elements first.
+        Elements in local numbering, those that this rank counts first.
     vertex_data : dict of name → (n_vertices, …) array
     partitioner : str
         Name of the partitioner.

@@ -72,7 +72,7 @@ class Mesh:
     has_uv : bool
         Whether any sheet has ``vt``.
     sources : list of Source
-        In the order of the vertices.
+        Sources in the order of their vertices.
     tags : (V,) int64 or None
         Node tags of .msh files, 0 for other sources; None if all tags are 1, 2, 3, ….
     obstacles : dict of str to TriangleSurface

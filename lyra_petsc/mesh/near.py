@@ -109,7 +109,7 @@ def near_pairs(
     Parameters
     ----------
     boxes, others : pairs of (n, 3), (k, 3)
-        Their low and high corners [m]. Without others: pairs of the boxes, the lower number first.
+        Low and high corners [m] of the boxes. Without others: pairs of boxes, the lower number first.
     """
     same = others is None
     low, high = boxes

@@ -63,11 +63,11 @@ class Solid(_RigidBody):
     ----------
     name : str
     points : (n, 3) float64
-        At t = 0 [m].
+        Points at t = 0 [m].
     edges : (m, 2) int64
-        Each once; for a box without the diagonals of its sides.
+        Each edge once; for a box without the diagonals of its sides.
     triangles : (k, 3) int64
-        For a box anticlockwise seen from outside, for a mesh as in its file.
+        Triangles of a box are anticlockwise seen from outside, those of a mesh as in its file.
     radius : float
         Distance [m] of the surface from points, edges and triangles: of a sphere (one point) and a capsule
         (two points, one edge); otherwise 0.
@@ -97,11 +97,11 @@ class Container(_RigidBody):
         ``planes``: the side of all planes to which their normals point; ``ball``: at most ``radius`` from the
         segment between the first and the last point (for a sphere there is only one).
     points : (n, 3) float64
-        At t = 0 [m]: one on each plane, or the ends of the segment.
+        Points at t = 0 [m]: one on each plane, or the ends of the segment.
     normals : (n, 3) float64
-        At t = 0, unit vectors; (0, 3) for a ball.
+        Unit normals at t = 0; (0, 3) for a ball.
     radius : float
-        Of a ball [m], otherwise 0.
+        Radius of a ball [m], otherwise 0.
     friction : (float, float)
         Static and kinetic coefficient.
     motion : RigidMotion or None
@@ -157,7 +157,7 @@ def build_obstacles(
     ----------
     scene : Scene
     surfaces : mapping of str to TriangleSurface
-        Those that are meshes, at t = 0.
+        Surfaces at t = 0 of the obstacles that are meshes, by name.
     motion : callable
         `terms.motion.Motion`.
     """

@@ -240,7 +240,7 @@ def refuse_crossings(
     Parameters
     ----------
     scene : Scene
-        With ``contact``.
+        A scene with ``contact``.
     mesh : Mesh
     positions : (V, 3) float64
         Positions at t = 0 [m].

@@ -73,7 +73,7 @@ class FlatPatches(NamedTuple):
     neighbours : (k, 2)
         Pairs of neighbouring patches, or of a patch with itself: the lower number first, in ascending order.
     pairs : (m, 2)
-        Those of them that have a region C: a box around both without boundary edges.
+        The neighbours with a region C: a box around both patches without boundary edges.
     around, height : (m + 1,), (m,)
         Where the patches that this region overlaps begin in ``reached``, and their smallest altitude [m].
     reached : (k,)

@@ -235,7 +235,7 @@ class Layout(Points):
 
     @property
     def vertex_bounds(self) -> Ints:
-        """As ``bounds`` (ranks + 1,), where only vertices are numbered and not rows of edges."""
+        """First vertex of each rank (ranks + 1,), if only vertices are numbered and not rows of edges."""
         return np.concatenate([[0], np.cumsum(self.unknowns.n_vertices)]).astype(np.int64)
 
     def vertex_numbers(self, rows: Ints) -> Ints:

@@ -53,7 +53,7 @@ class StoredRun:
     Parameters
     ----------
     folder : path
-        As in ``runs/flag``.
+        The run's folder, such as ``runs/flag``.
 
     Attributes
     ----------

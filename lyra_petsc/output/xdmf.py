@@ -32,7 +32,7 @@ class StoredField:
     Attributes
     ----------
     name : str
-        Its name in the state's group.
+        Name of the dataset in the state's group.
     on : str
         ``"vertex"`` or ``"triangle"``: what its rows belong to.
     shape : tuple of int

@@ -54,7 +54,7 @@ class Arcs:
     Parameters
     ----------
     system : StageEquations
-        Those of a scene with directors on edges and without changing stencils.
+        System of a scene with directors on edges and without changing stencils.
     """
 
     def __init__(self, system: StageEquations) -> None:

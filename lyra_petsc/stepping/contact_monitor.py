@@ -24,7 +24,7 @@ class ContactMonitor:
     Parameters
     ----------
     system : StageEquations
-        Those of a scene with contact.
+        System of a scene with contact.
     step_fraction : callable
         Returns the fraction of the last Newton step that was allowed.
     """

@@ -222,7 +222,7 @@ class EnergyGuard:
         return {term: term.freeze(step) for term in terms}
 
     def _target_energies(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
-        """Of this rank's terms with targets [J]: the change of energy, the work of the targets' motion, and
+        """Energies [J] of this rank's terms with targets: their change, the work of the targets' motion, and
         the energy of springs at both ends.
         """
         system, rise, springs = self._system, 0.0, [0.0, 0.0]
@@ -368,7 +368,7 @@ class EnergyGuard:
 
     @property
     def remedy(self) -> str:
-        """What to use instead of the integrator."""
+        """Advice for a message: another integrator, or a change of steps, damping or mesh."""
         name = self._system.integrator.name
         other = ALTERNATIVES.get(name)
         if other:

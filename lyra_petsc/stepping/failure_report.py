@@ -120,7 +120,7 @@ class Failure:
         found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
         found += [line for line in (self._linear(), self._earlier()) if line]
         found += self._worst_elements()
-        return (*found, *(f"or try {words}" for words in self.advice[1:4]))
+        return (*found, *(f"or try {change}" for change in self.advice[1:4]))
 
     @property
     def text(self) -> str:
@@ -135,7 +135,7 @@ class Failure:
             rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
         rows += ["", "Where (vertices and triangles are counted from 0, in file order):"]
         rows += [f"  {line}" for line in self._worst_elements()]
-        rows += ["", "What to try:", *(f"  {words}" for words in self.advice)]
+        rows += ["", "What to try:", *(f"  {change}" for change in self.advice)]
         if self._linear():
             rows += ["", "The last linear solve, residual norm by iteration:"]
             norms = self.failed_solve.linear_residuals
@@ -201,9 +201,9 @@ class Failure:
     def _vertex(self) -> str:
         vertex = self.diagnosis.vertex
         label, number = self._within(vertex.number, [each.n_vertices for each in self.sources])
-        words = [f"node {vertex.tag}"] if vertex.tag else []
-        words += [f"vertex {number}"] if len(self.sources) > 1 and not vertex.tag else []
-        more = f" ({words[0]} of {label})" if words else ""
+        labels = [f"node {vertex.tag}"] if vertex.tag else []
+        labels += [f"vertex {number}"] if len(self.sources) > 1 and not vertex.tag else []
+        more = f" ({labels[0]} of {label})" if labels else ""
         return f"vertex {vertex.number}{more}"
 
     def _triangle(self) -> str:

@@ -36,9 +36,9 @@ class Watchdog:
     Attributes
     ----------
     best : PETSc.Vec or None
-        The iterate of least energy.
+        The iterate with the lowest objective.
     energy : float
-        That energy [W].
+        Objective [W] at the best iterate.
     must_return : bool
         Whether the next step must return to the best iterate.
     """

@@ -372,7 +372,7 @@ class Newton:
         return self.convergence.test(snes, iteration, norms[2], spent)
 
     def saved_state(self) -> dict[str, float]:
-        """What a checkpoint must hold for the next steps to be solved as they would be."""
+        """Entries of a checkpoint, so that a resumed run solves the next steps alike."""
         return {
             "convex": self._convex_at_start,
             "tolerance": self.forcing.tolerance,

@@ -24,7 +24,7 @@ class VertexEquations:
     Parameters
     ----------
     system : StageEquations
-        Those of a scene with terms in ``active.coarse``.
+        System of a scene with terms in ``active.coarse``.
 
     Attributes
     ----------

@@ -115,7 +115,7 @@ class ObstaclePositions(NamedTuple):
     Attributes
     ----------
     start, stage, end : (m, 3)
-        Their points [m], and normals of planes, at the start of the step, at its stage and at its end.
+        Points of all obstacles [m], and normals of planes, at the start, the stage and the end of the step.
     stage_motions, end_motions : list of (3, 3) and (3,)
         Rotation and translation [m] of each obstacle from the start to the stage, and to the end.
     """
@@ -135,7 +135,7 @@ class ActivePairs(NamedTuple):
     lower_bound : (E,)
         Lower bound of the distance less offset [m] of every pair, exact below the gap.
     pair, weight, owned_weight, beta, energy, derivatives : (m, …)
-        Of the active pairs, as `contact_pairs.find_active` writes them.
+        Data of the active pairs, as `contact_pairs.find_active` writes them.
     """
 
     lower_bound: Array

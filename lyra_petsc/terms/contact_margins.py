@@ -31,7 +31,7 @@ class DistanceBounds:
     Attributes
     ----------
     bounds : (T, 2)
-        For distances [m] of vertices and triangles, and of edges, at the end of the last displacements.
+        Bounds of distances [m] of vertices and triangles, and of edges, after the last displacements.
     """
 
     def __init__(self, pairs: Ints, first: Ints) -> None:

@@ -52,7 +52,7 @@ class SheetSearch:
     Attributes
     ----------
     vertices, edges, triangles : Simplices
-        Of the last search.
+        Simplices of the last search.
     """
 
     def __init__(self, surface: Ints, uv: Array) -> None:

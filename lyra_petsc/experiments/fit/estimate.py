@@ -120,7 +120,7 @@ class Conclusion:
         Right singular vectors, in rows.
     misfit : float
         rᵀr over the degrees of freedom; expected value 1.
-    words : list of str
+    notes : list of str
         Notes for the user.
     """
 
@@ -129,7 +129,7 @@ class Conclusion:
     singular_values: Array
     directions: Array
     misfit: float
-    words: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 Evaluate = Callable[[Array], Evaluation]
@@ -346,44 +346,44 @@ def conclude(unknowns: Sequence[Unknown], evaluation: Evaluation) -> Conclusion:
     ]
     freedom = m - len(free)
     misfit = float(evaluation.residuals @ evaluation.residuals) / freedom if freedom > 0 else math.nan
-    words = _notes(estimates, values, directions, correlation)
+    notes = _notes(estimates, values, directions, correlation)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     if freedom > 0 and misfit > 1.0 + 3.0 * spread:
-        words.append(
+        notes.append(
             f"the scene misses the measurements by {math.sqrt(misfit):.2g} times their uncertainties: these "
             "are too small, or something that acts is not in the scene; the intervals are then too narrow"
         )
     if freedom > 0 and misfit < 1.0 - 3.0 * spread:
-        words.append(
+        notes.append(
             f"the scene meets the measurements {1.0 / math.sqrt(misfit):.2g} times better than their "
             "uncertainties say; if these are too large, so are the intervals"
             if misfit > 0.0
             else "the scene meets the measurements exactly"
         )
-    return Conclusion(estimates, correlation, values, directions, misfit, words)
+    return Conclusion(estimates, correlation, values, directions, misfit, notes)
 
 
 def _notes(estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array) -> list[str]:
-    keys, words = [estimate.key for estimate in estimates], []
+    keys, notes = [estimate.key for estimate in estimates], []
     for estimate in estimates:
         if estimate.at_bound:
-            words.append(f"{estimate.key} is at its bound {estimate.value:.6g}: the data ask for more")
+            notes.append(f"{estimate.key} is at its bound {estimate.value:.6g}: the data ask for more")
     for value, direction in zip(values, directions, strict=True):
         if value > 0.0 and 1.0 / value < UNDETERMINED:
             continue
         share = [key for key, part in zip(keys, direction, strict=True) if abs(part) > 0.3]
         how = f"±{100.0 / value:.0f} %" if value > 1e-6 else "not at all"
         if len(share) == 1:
-            words.append(f"the data cannot tell {share[0]} ({how} of its size)")
+            notes.append(f"the data cannot tell {share[0]} ({how} of its size)")
         else:
-            words.append(
+            notes.append(
                 f"the data cannot tell {' and '.join(share)} apart: one combination of them is known {how}"
             )
     for i, one in enumerate(keys):
         for j in range(i):
             if abs(correlation[i, j]) > CORRELATED:
-                words.append(
+                notes.append(
                     f"{keys[j]} and {one} go together (correlation {correlation[i, j]:.3f}): "
                     "another measurement would tell them apart"
                 )
-    return words
+    return notes

@@ -30,9 +30,9 @@ class FitOutcome(Outcome[Case]):
 
 def outcome_of(fitted: Fitted) -> FitOutcome:
     """The outcome of a fit, which has a single case."""
-    passed = fitted.words.startswith("the search ended")
+    passed = fitted.ending.startswith("the search ended")
     case = Case("fit", "numbers from measurements")
-    return FitOutcome(case, {"search": Verdict(passed, fitted.words)}, fitted.seconds, fitted=fitted)
+    return FitOutcome(case, {"search": Verdict(passed, fitted.ending)}, fitted.seconds, fitted=fitted)
 
 
 def _deviation(estimate: Estimate) -> str:
@@ -81,8 +81,8 @@ class Fit(View[FitOutcome]):
             "correlation": conclusion.correlation,
             "singular_values": conclusion.singular_values,
             "directions": conclusion.directions,
-            "words": conclusion.words,
-            "search": fitted.words,
+            "words": conclusion.notes,
+            "search": fitted.ending,
             "evaluations": len(fitted.evaluations),
             "simulations": fitted.runs,
             "seconds": fitted.seconds,
@@ -107,7 +107,7 @@ class Fit(View[FitOutcome]):
             ],
             caption="Intervals hold for the uncertainties given, where values depend linearly on parameters.",
         )
-        report.bullets([*conclusion.words, fitted.words])
+        report.bullets([*conclusion.notes, fitted.ending])
         if not math.isnan(conclusion.misfit):
             report.paragraph(
                 f"Sum of squares over degrees of freedom: {short(conclusion.misfit)} (1 is expected)."
@@ -155,7 +155,7 @@ class Fit(View[FitOutcome]):
         """Lines of the terminal at the end."""
         fitted = outcome.fitted
         table = self.summary_table([outcome])
-        return [*align_columns(table, len(table[0])), *fitted.conclusion.words, fitted.words]
+        return [*align_columns(table, len(table[0])), *fitted.conclusion.notes, fitted.ending]
 
 
 def _residuals(fitted: Fitted) -> Drawing:

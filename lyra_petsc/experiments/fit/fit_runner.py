@@ -96,8 +96,8 @@ class Fitted:
     before, after : (m,)
         Values of the readings at the start and at the end.
     evaluations : list of Evaluation
-    words : str
-        How the search ended.
+    ending : str
+        Text on how the search ended.
     shapes : tuple of (V, 3) or None
         Positions [m] at the last measurement, before and after, on rank 0.
     triangles : (F, 3) or None
@@ -114,7 +114,7 @@ class Fitted:
     before: Array
     after: Array
     evaluations: list[Evaluation]
-    words: str
+    ending: str
     shapes: tuple[Array | None, Array | None]
     triangles: Ints | None
     runs: int
@@ -259,7 +259,7 @@ def fit_scene(
         listener.evaluated(number, evaluation, resumed=resumed)
         return evaluation
 
-    best, words = search(unknowns, evaluate)
+    best, ending = search(unknowns, evaluate)
     first = evaluations[0]
     for evaluation in (first, best):
         if evaluation.numbers.tobytes() not in shapes:
@@ -272,7 +272,7 @@ def fit_scene(
         first.residuals * sigma + target,
         best.residuals * sigma + target,
         evaluations,
-        words,
+        ending,
         (shapes[first.numbers.tobytes()], shapes[best.numbers.tobytes()]),
         None if model.mesh is None else model.mesh.triangles,
         model.runs,

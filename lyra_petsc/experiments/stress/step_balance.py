@@ -527,7 +527,7 @@ class RunRecord:
     last : (V, 3) array or None
         Positions [m] after the last step, on rank 0; None if they were not gathered or have been freed.
     triangles : (F, 3) array or None
-        On rank 0.
+        Vertices of the triangles, on rank 0.
     """
 
     planned: int = 0

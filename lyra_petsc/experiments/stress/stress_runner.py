@@ -446,13 +446,13 @@ def _figures(report: Report, outcome: StressOutcome) -> None:
     case, record = outcome.case, outcome.record
     if record.last is not None and record.triangles is not None:
         when = f"t = {seconds(record.times[-1])}" if record.times else "the start"
-        words, name = f"{case.name}: {case.title}, {when}", f"{PLOTS}/{case.name}-shape"
-        report.figure(surface(record.last, record.triangles, name=name, caption=words))
+        caption, name = f"{case.name}: {case.title}, {when}", f"{PLOTS}/{case.name}-shape"
+        report.figure(surface(record.last, record.triangles, name=name, caption=caption))
     if len(record.times) > 1:
         times = [0.0, *record.times]
         curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
         if record.balances and record.integrator == "beuler":
             work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
             curves.append(Series("energy at the start + work done", times, list(work)))
-        words, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
-        report.figure(over_time(curves, name=name, caption=words, y_label="energy [J]"))
+        caption, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
+        report.figure(over_time(curves, name=name, caption=caption, y_label="energy [J]"))

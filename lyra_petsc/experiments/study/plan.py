@@ -670,8 +670,8 @@ def _note_numbered_vertices(base: Scene) -> list[str]:
     picked = [f"handles[{i}]" for i, handle in enumerate(base.handles) if handle.nodes is not None]
     picked += [f"loads[{i}]" for i, load in enumerate(base.loads) if load.nodes is not None]
     picked += [f"probes.{name}" for name, probe in base.probes.items() if probe.nodes is not None]
-    words = "vertices picked by number are others on another mesh; use group or box"
-    return [f"{', '.join(picked)}: {words}"] if picked else []
+    reason = "vertices picked by number are others on another mesh; use group or box"
+    return [f"{', '.join(picked)}: {reason}"] if picked else []
 
 
 def _refuse_overridden(axis: Axis) -> None:

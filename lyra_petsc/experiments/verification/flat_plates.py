@@ -214,7 +214,7 @@ def lowest_modes(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, A
     frequencies : (count,) float64
         ω [rad/s], ascending; 0 for squares within round-off of 0.
     shapes : (count, V, 3) float64
-        In mesh order, φᵀMφ = 1.
+        Modes φ in mesh order, with φᵀMφ = 1.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def lowest_squares(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array,
     squares : (count,) float64
         ω² [1/s²], ascending; negative where the state is unstable.
     shapes : (count, V, 3) float64
-        In mesh order, φᵀMφ = 1.
+        Modes φ in mesh order, with φᵀMφ = 1.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class Cantilever:
     drop : float
         Vertical distance, over L.
     angle : float [rad]
-        Of the tip below the horizontal.
+        Angle of the tip below the horizontal.
     clamp_curvature : float
         θ' at the clamp, times L.
     """

@@ -34,7 +34,7 @@ class ErrorRow:
     n, h : float
         Resolution n, and the length or time h that decreases with it.
     value, exact : float
-        In ``unit``.
+        Measured and exact value, in ``unit``.
     error : float
         Error relative to the scale of the quantity.
     order : float
@@ -85,8 +85,8 @@ class Exact(Claim):
     def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
         worst = max(rows, key=_error_or_infinity)
         good = worst.error <= self.bound
-        words = f"largest error {worst.error:.1e}, " + ("within" if good else "above")
-        return Verdict(good, f"{words} {self.bound:.0e}")
+        text = f"largest error {worst.error:.1e}, " + ("within" if good else "above")
+        return Verdict(good, f"{text} {self.bound:.0e}")
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,13 @@ class Converges(Claim):
         last = rows[-1]
         bound = self.bound * max(1.0, last.h / finest) ** self.order
         small = last.error <= bound
-        words = [f"error {last.error:.1e} at n = {last.n:g}, {'within' if small else 'above'} {bound:.1e}"]
+        parts = [f"error {last.error:.1e} at n = {last.n:g}, {'within' if small else 'above'} {bound:.1e}"]
         right = True
         if len(rows) > 1 and self.slack < math.inf:
             right = abs(last.order - self.order) <= self.slack
             expected = f"{'as' if right else 'not the'} expected {self.order:g} ± {self.slack:g}"
-            words.append(f"order {last.order:.2f}, {expected}")
-        return Verdict(small and right, "; ".join(words))
+            parts.append(f"order {last.order:.2f}, {expected}")
+        return Verdict(small and right, "; ".join(parts))
 
 
 def at_finest(bound: float) -> Converges:
@@ -142,7 +142,7 @@ class Measured:
     ----------
     quantity : str
     value, exact : float
-        In ``unit``.
+        Measured and exact value, in ``unit``.
     unit : str
         ``1`` for a pure number.
     scale : float or None
@@ -426,8 +426,11 @@ class Verification(View[VerificationOutcome]):
             "scale where that is zero; the order is that between a row and the one before; the run time of "
             "a row is that of all its simulations, set-up included."
         )
-        heads, words = ["case", "what is compared", "verdict", "run time"], {True: "passed", False: "FAILED"}
-        table = [[o.case.name, o.case.title, words[o.passed], seconds(o.seconds)] for o in outcomes]
+        heads, verdicts = (
+            ["case", "what is compared", "verdict", "run time"],
+            {True: "passed", False: "FAILED"},
+        )
+        table = [[o.case.name, o.case.title, verdicts[o.passed], seconds(o.seconds)] for o in outcomes]
         report.table(heads, table, marked=[not o.passed for o in outcomes])
         for outcome in outcomes:
             case = outcome.case
@@ -454,11 +457,11 @@ def _figures(report: Report, outcome: VerificationOutcome) -> None:
         "h": ("convergence", "h", convergence),
         "wall_seconds": ("run-time", "run time", work_precision),
     }
-    for x, (file, words, draw) in drawn.items() if tables else ():
+    for x, (file, axis, draw) in drawn.items() if tables else ():
         lines = [
             Series(quantity, [getattr(row, x) for row in rows], [row.error for row in rows])
             for quantity, rows in tables.items()
         ]
-        about = {"name": f"{PLOTS}/{case.name}-{file}", "caption": f"{case.name}: error against {words}"}
-        label = words if x == "h" else f"{words} [s]"
+        about = {"name": f"{PLOTS}/{case.name}-{file}", "caption": f"{case.name}: error against {axis}"}
+        label = axis if x == "h" else f"{axis} [s]"
         report.figure(draw(lines, **about, x_label=label, y_label="relative error"))

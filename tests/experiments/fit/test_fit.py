@@ -137,7 +137,7 @@ def test_bound_and_what_is_not_told() -> None:
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
     best, _ = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
     found = conclude(unknowns, best)
-    told = " ".join(found.words)
+    told = " ".join(found.notes)
     assert "the data cannot tell a and b apart" in told
     assert found.estimates[2].at_bound
     assert found.estimates[2].value == pytest.approx(2.0)

@@ -91,9 +91,9 @@ def hinged(n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
 def directed(bench: Bench, n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
     """Pairs of a strip with directors and a load, for every kind of mesh and the loads of each width."""
     for kind in KINDS:
-        for words, some in loads.items():
-            scene = partial(_directed, bench, kind, n, WIDTHS[words])
-            made = Strip(f"{kind}, {words} wide", WIDTHS[words] or 1.0 / n, 1.0, scene)
+        for label, some in loads.items():
+            scene = partial(_directed, bench, kind, n, WIDTHS[label])
+            made = Strip(f"{kind}, {label} wide", WIDTHS[label] or 1.0 / n, 1.0, scene)
             yield from ((made, load) for load in some)
 
 
@@ -113,13 +113,13 @@ def _tip(trial: Trial) -> tuple[float, float]:
     return float(x), float(-z)
 
 
-def _compared(bench: Bench, scene: dict[str, Any], exact: Cantilever, words: str) -> Iterator[Measured]:
+def _compared(bench: Bench, scene: dict[str, Any], exact: Cantilever, label: str) -> Iterator[Measured]:
     """Drop and reach of the tip; errors are relative to the displacement of the tip."""
     with bench.simulation(scene) as trial:
         reach, drop = _tip(trial.run())
     tip_displacement = float(np.hypot(exact.drop, 1.0 - exact.reach))
-    yield Measured(f"drop / L, {words}", drop, exact.drop, scale=tip_displacement)
-    yield Measured(f"reach / L, {words}", reach, exact.reach, scale=tip_displacement)
+    yield Measured(f"drop / L, {label}", drop, exact.drop, scale=tip_displacement)
+    yield Measured(f"reach / L, {label}", reach, exact.reach, scale=tip_displacement)
 
 
 TIP_LOAD = (
@@ -290,11 +290,11 @@ def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
         exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / STIFF))
         reach, sideways, drop = exact
         tip_displacement = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
-        words = f"Γ = {weight:g}"
+        label = f"Γ = {weight:g}"
         found += [
-            Measured(f"drop / L, {words}", float(-z), drop, scale=tip_displacement),
-            Measured(f"reach / L, {words}", float(x), reach, scale=tip_displacement),
-            Measured(f"sideways / L, {words}", float(y) - 0.5 / n, sideways, scale=tip_displacement),
+            Measured(f"drop / L, {label}", float(-z), drop, scale=tip_displacement),
+            Measured(f"reach / L, {label}", float(x), reach, scale=tip_displacement),
+            Measured(f"sideways / L, {label}", float(y) - 0.5 / n, sideways, scale=tip_displacement),
         ]
     return found
 
@@ -391,7 +391,7 @@ def critical(lowest: Callable[[float], float], first: float, second: float) -> f
     counts="cells along the column",
 )
 def column(bench: Bench, n: float) -> Iterator[Measured]:
-    for words, (ends, exact) in COLUMNS.items():
+    for label, (ends, exact) in COLUMNS.items():
         for kind in KINDS:
             held = [{"group": "sheet", "axes": IN_PLANE}, *ends]
             mesh, material = strip_mesh(bench, kind, n, COLUMN), plate_material(COLUMN_MEMBRANE)
@@ -404,7 +404,7 @@ def column(bench: Bench, n: float) -> Iterator[Measured]:
 
                 # from below and from above
                 load = critical(lowest, 0.9 * exact, 1.1 * exact)
-            yield Measured(f"P L²/B, {words}, {kind}", load, exact)
+            yield Measured(f"P L²/B, {label}, {kind}", load, exact)
 
 
 # -- beyond the critical load ----------------------------------------------------------------------------
@@ -434,11 +434,11 @@ LOADS = {"below": 0.95, "above": 1.2}
 def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
     for kind in KINDS:
         strip = partial(scene, strip_mesh(bench, kind, n, COLUMN), plate_material(SOFTER))
-        for words in ("pinned", "clamped"):
+        for label in ("pinned", "clamped"):
             frames: list[dict[str, Any]] = [{"time": 0.0}, {"time": 0.1, "translate": [-0.02, 0.0, 0.0]}]
             for at, each in zip((0.5, 1.0), SHORTENINGS, strict=True):
                 frames.append({"time": at, "translate": [-each, 0.0, 0.0]})
-            left, right = COLUMNS[words][0]
+            left, right = COLUMNS[label][0]
             shortened = strip(
                 STATIC | {"step": 0.1},
                 handles=[left, right | {"motion": "push", "interpolation": "linear"}],
@@ -448,11 +448,11 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
             with bench.simulation(shortened) as trial:
                 for shortening, _ in zip(SHORTENINGS, trial.run_through((0.5, 1.0)), strict=True):
                     load, height = column_shape(shortening=shortening)
-                    load *= COLUMNS[words][1] / math.pi**2
-                    name = f"{words}, {kind}, shortened by {shortening:g} L"
+                    load *= COLUMNS[label][1] / math.pi**2
+                    name = f"{label}, {kind}, shortened by {shortening:g} L"
                     yield Measured(f"P L²/B, {name}", _push(trial), load)
                     yield Measured(f"height / L, {name}", _height(trial), height)
-        for words, part in LOADS.items():
+        for label, part in LOADS.items():
             load = part * math.pi**2
             held = [{"group": "left"}, {"group": "right", "axes": ["y", "z"]}]
             pushed = [{"group": "right", "force": [-load * COLUMN, 0.0, 0.0]}]
@@ -461,7 +461,7 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                 assert trial.simulation.stability["stable"] is not False
             height = column_shape(load=load)[1] if part > 1.0 else 0.0
             yield Measured(
-                f"height / L, pinned, {kind}, {words} the critical load", found, height, scale=height or 1.0
+                f"height / L, pinned, {kind}, {label} the critical load", found, height, scale=height or 1.0
             )
 
 

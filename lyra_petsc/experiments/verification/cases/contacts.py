@@ -152,7 +152,7 @@ FLOORS: dict[str, tuple[dict[str, Any], float, float]] = {
 def rest(bench: Bench, n: float) -> Iterator[Measured]:
     half = 0.5 * SIDE
     flat, faces = irregular_rectangle(round(n), round(n), SIDE, SIDE)
-    for words, (floor, tilt, gap) in FLOORS.items():
+    for label, (floor, tilt, gap) in FLOORS.items():
         turn = {"axis": [0.0, 1.0, 0.0], "degrees": tilt}
         middle = half * math.cos(math.radians(tilt))
         shift = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
@@ -161,7 +161,7 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
             "material": {"cloth": "gray-interlock"},
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": gap, "friction": 0.3, "self": False},
-            "obstacles": {words: floor},
+            "obstacles": {label: floor},
             # long steps of backward Euler damp the motion
             "time": {"end": 4.0, "step": 0.1},
         }
@@ -169,12 +169,12 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
         with bench.simulation(content) as trial:
             force = trial.run().simulation.energy_balance.obstacle_forces(1)[0, :3]
             weight = G * float(trial.mass.sum())
-            if words == "plane":
+            if label == "plane":
                 compute = FIELDS["contact_pressure"].compute
                 pressure = trial.gather(compute(trial.simulation.problem))
         error = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
-        yield Measured(f"force on the {words} besides the weight", error, 0.0, scale=1.0)
-        if words == "plane":
+        yield Measured(f"force on the {label} besides the weight", error, 0.0, scale=1.0)
+        if label == "plane":
             exact = weight / SIDE**2
             yield Measured("pressure on the plane", worst_value(pressure, exact), exact, "Pa")
 
@@ -251,8 +251,8 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
         with bench.simulation(content) as trial:
             pull = trial.gather(trial.run().simulation.energy_balance.reaction)[:, ::2]
         slack, tight = (float(np.linalg.norm(pull[end].sum(axis=0))) for end in ends)
-        words = f"T2/T1, φ = {turns:g} π, μ = {friction:g}"
-        yield Measured(words, tight / slack, math.exp(math.pi * turns * friction))
+        label = f"T2/T1, φ = {turns:g} π, μ = {friction:g}"
+        yield Measured(label, tight / slack, math.exp(math.pi * turns * friction))
 
 
 # -- sheets thrown at each other -------------------------------------------------------------------------
@@ -370,15 +370,15 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
 def collision(bench: Bench, n: float) -> Iterator[Measured]:
     for integrator, friction in THROWS:
         found = _thrown(bench, integrator, friction, n)
-        words = f"{integrator}, with friction" if friction else integrator
-        yield Measured(f"resultant, {words}", found.force, 0.0, scale=1.0)
-        yield Measured(f"moment, {words}", found.moment, 0.0, scale=1.0)
+        label = f"{integrator}, with friction" if friction else integrator
+        yield Measured(f"resultant, {label}", found.force, 0.0, scale=1.0)
+        yield Measured(f"moment, {label}", found.moment, 0.0, scale=1.0)
         if friction:
             yield Measured(f"resultant of friction, {integrator}", found.friction_force, 0.0, scale=1.0)
             yield Measured(f"moment of friction, {integrator}", found.friction_moment, 0.0, scale=1.0)
-        yield Measured(f"angular momentum, {words}", found.angular, 0.0, scale=1.0)
-        yield Measured(f"momentum, {words}", found.momentum, 0.0, scale=1.0)
-        yield Measured(f"energy, {words}", found.energy, 0.0, scale=1.0)
+        yield Measured(f"angular momentum, {label}", found.angular, 0.0, scale=1.0)
+        yield Measured(f"momentum, {label}", found.momentum, 0.0, scale=1.0)
+        yield Measured(f"energy, {label}", found.energy, 0.0, scale=1.0)
 
 
 # -- a block of layers -----------------------------------------------------------------------------------
@@ -512,12 +512,12 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
             z = trial.x[:, 2] - trial.x[ends[1], 2].mean()
             root = np.cbrt(z / z.max())
             foot = (root > FOOT[0]) & (root < FOOT[1])
-            words = f"P = {force:g} B/l²"
+            label = f"P = {force:g} B/l²"
             found += [
-                Measured(f"P l²/B, {words}", -float(push.sum()) * n / HALF, force),
-                Measured(f"height / l, {words}", float(z.max()), height),
+                Measured(f"P l²/B, {label}", -float(push.sum()) * n / HALF, force),
+                Measured(f"height / l, {label}", float(z.max()), height),
                 Measured(
-                    f"half length / l, {words}",
+                    f"half length / l, {label}",
                     float(np.polyfit(root[foot], along[foot], 1)[1]),
                     half_length,
                 ),
@@ -557,13 +557,13 @@ def _refined(
         # looser than the default of cases because of the impacts
         "solver": {"force_tolerance": 1e-8, "step_tolerance": 1e-8},
     }
-    for words in ("Δt", "h", "gap"):
+    for label in ("Δt", "h", "gap"):
         ends: list[Array] = []
         for part in (0.5 * n, n):
             # with long steps the friction of bouncing parts would hide the effect of the gap
-            step = STRIP_STEP / {"Δt": part, "h": 1.0, "gap": 4.0}[words]
-            gap = STRIP_GAP / part if words == "gap" else STRIP_GAP
-            cells = round(CELLS * part) if words == "h" else CELLS
+            step = STRIP_STEP / {"Δt": part, "h": 1.0, "gap": 4.0}[label]
+            gap = STRIP_GAP / part if label == "gap" else STRIP_GAP
+            cells = round(CELLS * part) if label == "h" else CELLS
             strip = scene(
                 grid(LENGTH, LENGTH / cells, cells, 1, "alternating") | {"transform": transform(gap)},
                 FABRIC,
@@ -574,7 +574,7 @@ def _refined(
             with bench.simulation(strip) as trial:
                 ends.append(trial.run().x[[0, cells]])
         change = float(np.abs(ends[1] - ends[0])[:, ::2].max())
-        yield Measured(f"change of the ends, {words} halved", change, 0.0, "m", scale=LENGTH)
+        yield Measured(f"change of the ends, {label} halved", change, 0.0, "m", scale=LENGTH)
 
 
 REFINED: dict[str, Any] = {

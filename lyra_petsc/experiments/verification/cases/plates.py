@@ -52,8 +52,8 @@ iterations, while two give nine digits."""
     claim=Converges(2.0, 2e-3, slack=0.4),
 )
 def plate(bench: Bench, n: float) -> Iterator[Measured]:
-    for words, exact in EXACT["deflection"].items():
-        edges, poisson = words.split()
+    for label, exact in EXACT["deflection"].items():
+        edges, poisson = label.split()
         material, load = plate_material(1.0, poisson=float(poisson)), [0.0, 0.0, LARGEST / exact["at"]]
         loaded = partial(scene, gravity=load, handles=held(edges), solver=FINE_ENOUGH)
         for kind in KINDS:
@@ -100,7 +100,7 @@ def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
             "bent": ([{"group": s, "moment": moment} for s in ("left", "right")], (1.0, -poisson, 0.0)),
             "twisted": ([_at(1.0, 1.0) | {"force": [0, 0, 2.0 * SMALL * (1.0 - poisson)]}], (0.0, 0.0, 1.0)),
         }
-        for words, (load, exact) in loads.items():
+        for label, (load, exact) in loads.items():
             for kind in KINDS:
                 mesh = flat_mesh(bench, kind, round(n), round(n))
                 body = [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS]
@@ -108,7 +108,7 @@ def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
                     found = _curvatures(bench, trial.run()) / SMALL
                 for k, name in enumerate(("κ11", "κ22", "κ12")):
                     value = worst_value(found[:, k], exact[k])
-                    yield Measured(f"{name}, {words}, ν = {poisson:g}, {kind}", value, exact[k], scale=1.0)
+                    yield Measured(f"{name}, {label}, ν = {poisson:g}, {kind}", value, exact[k], scale=1.0)
 
 
 def _curvatures(bench: Bench, trial: Trial) -> Array:
@@ -138,8 +138,8 @@ SHIFT = 400.0
 )
 def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
     for shape, (height, finer) in SHAPES.items():
-        for words, exact in VIBRATIONS[shape].items():
-            edges, poisson = words.split()
+        for label, exact in VIBRATIONS[shape].items():
+            edges, poisson = label.split()
             for kind in KINDS:
                 mesh = flat_mesh(bench, kind, round(finer * n), round(finer * n * height), 1.0, height)
                 across = [{"group": "sheet", "axes": ["x", "y"]}, *held(edges)]

@@ -52,7 +52,7 @@ end of the second strip, and the displacement of this end over P L³/B."""
 )
 def frames(bench: Bench, n: float) -> Iterator[Measured]:
     width, force = 0.25, 1e-5
-    for words, (section, axis, exact) in FRAMES.items():
+    for label, (section, axis, exact) in FRAMES.items():
         for pattern in PATTERNS:
             rows = max(1, round(n * width))
             vertices, faces = walls(section, round(n), rows, width, alternating=pattern == "alternating")
@@ -68,7 +68,7 @@ def frames(bench: Bench, n: float) -> Iterator[Measured]:
             )
             with bench.simulation(content) as trial:
                 deflection = float((trial.run().x - vertices)[end, axis].mean()) / force
-            yield Measured(f"displacement over P L³/B, {words}, {pattern}", deflection, exact)
+            yield Measured(f"displacement over P L³/B, {label}, {pattern}", deflection, exact)
 
 
 def _legs(*degrees: float) -> Section:
@@ -120,7 +120,7 @@ def flange(length: float, poisson: float) -> float:
     counts="cells across each wall",
 )
 def sections(bench: Bench, n: float) -> Iterator[Measured]:
-    for words, (section, length, straight) in SECTIONS.items():
+    for label, (section, length, straight) in SECTIONS.items():
         rows = round(n * length)
         vertices, faces = walls(section, round(n), rows, length)
         lines = [np.isclose(vertices[:, [0, 2]], place).all(axis=1) for place in straight]
@@ -143,4 +143,4 @@ def sections(bench: Bench, n: float) -> Iterator[Measured]:
                 return float(lowest_squares(trial, 1, shift)[0][0])
 
             load = critical(lowest, 0.8 * exact, 0.95 * exact)
-        yield Measured(f"N b²/D, {words}", load, exact)
+        yield Measured(f"N b²/D, {label}", load, exact)
