@@ -1,10 +1,4 @@
-"""The program with half of its imports done: forks for each command line that ``rank.py`` or a test asks for.
-
-It listens on the socket that is its standard input. A message holds arguments, folder and environment, and
-descriptors for stdout and stderr; the answer is the exit code, negative for a signal. Who closes the
-connection before has the process killed. Neither MPI nor PETSc have been loaded here: each of the forked
-processes starts them as any other does, also one of several under mpirun, and ends in no other way.
-"""
+"""The program with half of its imports done, forked for each command line of ``rank.py`` or of a test."""
 
 from __future__ import annotations
 
@@ -49,7 +43,7 @@ REPORTING = ("render", "report", "stress", "study", "verify")
 
 
 def load(*modules: str) -> None:
-    """Import modules, where they are installed, for all processes that are forked from now on."""
+    """Import modules that are installed, for all processes that are forked later."""
     if set(modules) <= set(sys.modules):
         return
     for module in modules:
@@ -61,7 +55,7 @@ def load(*modules: str) -> None:
 
 
 def become(asked: dict[str, Any], out: int, err: int) -> None:
-    """Make this process what the asked one is before its first import."""
+    """Take over environment, folder and streams of the requesting process."""
     os.setsid()
     os.chdir(asked["folder"])
     os.environ.clear()
@@ -73,7 +67,7 @@ def become(asked: dict[str, Any], out: int, err: int) -> None:
 
 
 def attend(connection: socket.socket, asked: dict[str, Any], out: int, err: int) -> None:
-    """Fork, wait and answer; returns in the forked process alone."""
+    """Fork, wait and answer; returns in the forked process only."""
     pid = os.fork()
     if pid == 0:
         connection.close()
@@ -91,7 +85,7 @@ def attend(connection: socket.socket, asked: dict[str, Any], out: int, err: int)
 
 
 def serve() -> None:
-    """Fork for each connection; returns in the forked processes alone."""
+    """Fork for each connection; returns in the forked processes only."""
     listener = socket.socket(fileno=os.dup(0))
     while True:
         connection, _ = listener.accept()

@@ -1,8 +1,4 @@
-"""Starts the program as a user does: another process, or several under mpirun.
-
-A run that nobody looks at before its end is forked, on each of its ranks, from a process that has done half
-of the imports (see ``forks``), which take longer than most of these runs.
-"""
+"""Starts the program as a user does, in another process or in several under mpirun."""
 
 from __future__ import annotations
 
@@ -64,7 +60,7 @@ PICTURES = ("matplotlib", "jinja2")
 
 @dataclass
 class Left:
-    """What a process left behind."""
+    """Output and exit code of a process."""
 
     code: int
     out: str
@@ -72,7 +68,7 @@ class Left:
 
     @property
     def ours(self) -> list[str]:
-        """Lines on stderr that begin with our name; a launcher's banner does not."""
+        """Lines on stderr that begin with the program's name, without a launcher's banner."""
         return [line for line in self.err.splitlines() if line.startswith("lyra-petsc: ")]
 
 
@@ -90,14 +86,14 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What a JSON file holds."""
+    """Content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def command(
     arguments: Sequence[object], ranks: int = 1, program: Sequence[str] = ("-m", "lyra_petsc")
 ) -> list[str]:
-    """The words of a command line; skips the test where mpirun is needed and missing."""
+    """Words of a command line; skips the test if mpirun is needed and missing."""
     words = [sys.executable, *program, *map(str, arguments)]
     if ranks == 1:
         return words
@@ -108,7 +104,7 @@ def command(
 
 
 def environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment without what tells a process that it is one of a parallel job already."""
+    """Environment without the variables that mark a process as part of a parallel job."""
     ours = {
         name: value
         for name, value in os.environ.items()
@@ -153,7 +149,7 @@ def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
 def wait_until(
     condition: Callable[[], object], process: subprocess.Popen[str] | None = None, patience: float = PATIENCE
 ) -> None:
-    """Wait for what a started process does; it fails the test where it ends before, or takes too long."""
+    """Wait for an effect of a started process; fails if the process ends before, or takes too long."""
     deadline = time.monotonic() + patience
     while not condition():
         assert process is None or process.poll() is None, process.communicate()
@@ -162,14 +158,14 @@ def wait_until(
 
 
 class Forks:
-    """Starts ``forks`` and asks it for runs."""
+    """Starts ``forks`` and sends it command lines."""
 
     def __init__(self) -> None:
         self._name = ""
 
     @property
     def name(self) -> str:
-        """Of the socket on which it listens."""
+        """Name of the socket."""
         if not self._name:
             name = f"lyra-petsc-tests-{os.getpid()}"
             with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
@@ -191,7 +187,7 @@ class Forks:
     def run(
         self, arguments: Sequence[object], folder: Path, extra: Mapping[str, str] | None, patience: float
     ) -> Left:
-        """A run on one rank to its end; one that hangs is killed and fails the test."""
+        """Run on one rank to the end; a run that hangs is killed and fails the test."""
         words = [str(argument) for argument in arguments]
         asked = {"arguments": words, "folder": str(folder), "environment": environment(extra)}
         (out, to_out), (err, to_err) = os.pipe(), os.pipe()
@@ -210,7 +206,7 @@ class Forks:
 
 
 def heard(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
-    """What comes out of pipes until their other ends are closed, and whether they were in time."""
+    """Text from pipes until they are closed, and whether this happened in time."""
     pieces = {file: bytearray() for file in files}
     deadline = time.monotonic() + patience
     still = set(files)
@@ -230,7 +226,7 @@ FORKS = Forks()
 
 
 def heed_signals() -> None:
-    """Under nohup, or in the background, the tests ignore these, and the program would with them."""
+    """Restore default handlers: under nohup, or in the background, signals are ignored by inheritance."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -268,14 +264,14 @@ def done(
     extra: Mapping[str, str] | None = None,
     **keywords: Any,
 ) -> Left:
-    """Run the program and expect success."""
+    """Run the program and require success."""
     left = lyra(arguments, folder, ranks, extra, **keywords)
     assert left.code == 0, left.err + left.out
     return left
 
 
 def refused(arguments: Sequence[object], folder: Path, words: str, ranks: int = 1) -> None:
-    """Run the program and expect that it refuses in one line with these words, and leaves nothing."""
+    """Run the program and require a refusal in one line with these words, without any files."""
     before = sorted(os.listdir(folder))
     left = lyra(arguments, folder, ranks)
     refusal(left, words)
@@ -283,7 +279,7 @@ def refused(arguments: Sequence[object], folder: Path, words: str, ranks: int = 
 
 
 def refusal(left: Left, words: str) -> None:
-    """Exit code 2 and one line of ours with these words."""
+    """Check exit code 2 and one line of the program with these words."""
     assert left.code == 2, left.err
     assert len(left.ours) == 1, left.err
     assert len(left.ours[0]) < 800

@@ -1,7 +1,4 @@
-"""Has ``forks`` run a command line in its place, on one rank or as one of several that mpirun starts.
-
-Arguments: the name of the socket of ``forks``, then those of the command line.
-"""
+"""Lets ``forks`` run a command line instead of this process, on one rank or on several under mpirun."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Which words of a command line are ours and which are PETSc's."""
+"""Separation of a command line into options of the program and of PETSc."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lyra_petsc.cli.verbs import verbs
         ("", "", ""),
     ],
 )
-def test_splits(line: str, ours: str, petsc: str) -> None:
+def test_arguments_are_separated(line: str, ours: str, petsc: str) -> None:
     assert split(line.split()) == (ours.split(), petsc.split())
 
 
@@ -46,6 +46,6 @@ def test_help_of_every_verb_shows_an_example_that_can_be_parsed(verb: str | None
             pass
 
 
-def test_help_beside_a_scene_to_run_is_petscs() -> None:
+def test_help_after_a_scene_is_passed_to_petsc() -> None:
     assert move_help(*split(["run", "a.yaml", "-help"])) == (["run", "a.yaml"], ["-help"])
     assert move_help(*split(["render", "runs/a", "-help"])) == (["render", "--help"], [])

@@ -1,4 +1,4 @@
-"""Bad input from the command line: one line, exit 2, nothing written, on one rank and on two."""
+"""Bad input on the command line: one line, exit code 2, no files, on one rank and on two."""
 
 from __future__ import annotations
 
@@ -152,12 +152,12 @@ Listing = dict[Path, int]
 
 
 def listing(folder: Path) -> Listing:
-    """When what is in a folder was last changed."""
+    """Times of the last changes in a folder."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 def set_out(folder: Path, name: str) -> tuple[list[str], str]:
-    """Write what a mistake is made with; its command and the words of its line."""
+    """Write the files of a mistake; returns its command and the words of the expected line."""
     scene, arguments, words = MISTAKES[name]
     write_scene(folder, scene)
     (folder / "empty.obj").write_text(EMPTY)
@@ -210,7 +210,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["unknown key", "nothing to resume", "runn scene.yaml", *OF_PETSC])
-def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> None:
+def test_a_job_of_two_ranks_ends_with_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)
     refusal(lyra(arguments, tmp_path, 2, patience=30), words)
@@ -221,7 +221,7 @@ def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> N
 def together(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, tuple[Path, Listing, list[Left]]]:
-    """What every mistake but PETSc's left on each rank, made one after the other in one job."""
+    """Output on each rank for every mistake but PETSc's, made one after the other in one job."""
     ranks = request.param
     work = tmp_path_factory.mktemp("together")
     made = {}

@@ -1,4 +1,4 @@
-"""``check`` says what a run would do, and does nothing."""
+"""``check`` prints what a run would do, and has no effects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ output: {every: 0.1}
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
-def test_plan(tmp_path: Path, ranks: int) -> None:
+def test_the_plan_of_a_run(tmp_path: Path, ranks: int) -> None:
     (tmp_path / "plain.yaml").write_text(MEMBRANE)
     result = done(["check", "plain.yaml"], tmp_path, ranks=ranks)
     plan = result.out
@@ -33,8 +33,8 @@ def test_plan(tmp_path: Path, ranks: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
 
 
-def test_edges_with_an_unknown_are_counted_apart(tmp_path: Path) -> None:
-    """320 of them, three to a row of the matrix."""
+def test_edges_with_unknowns_are_counted_separately(tmp_path: Path) -> None:
+    """320 edges, three to a row of the matrix."""
     (tmp_path / "bends.yaml").write_text(MEMBRANE)
     bends = ["--set", "material.bending=1e-3", "--set", "material.bending_model=midedge"]
     result = done(["check", "bends.yaml", *bends], tmp_path, ranks=2)
@@ -68,7 +68,7 @@ def test_contact_and_obstacles_are_shown(tmp_path: Path) -> None:
 
 
 def test_obstacles_without_contact_are_refused(tmp_path: Path) -> None:
-    """On every rank alike, with the line to add, which makes a scene of it."""
+    """On every rank, with the line to add to the scene."""
     text = MEMBRANE + CONTACT.replace("contact: {gap: 0.01, friction: {static: 0.4, kinetic: 0.3}}", "")
     (tmp_path / "floor.yaml").write_text(text)
     result = lyra(["check", "floor.yaml"], tmp_path, ranks=2)
@@ -85,7 +85,7 @@ Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
 """
 
 
-def test_a_mesh_script_of_others_is_read_by_a_list_of_statements_unless_trusted(tmp_path: Path) -> None:
+def test_mesh_scripts_are_checked_unless_trusted(tmp_path: Path) -> None:
     mesh = MEMBRANE.replace("{grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}", "{file: m.geo}")
     (tmp_path / "scene.yaml").write_text(mesh)
     (tmp_path / "m.geo").write_text(SQUARE + 'Merge "x.msh";\n')
@@ -101,7 +101,7 @@ def test_a_mesh_script_of_others_is_read_by_a_list_of_statements_unless_trusted(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.geo", "scene.yaml", "x.msh"]
 
 
-def test_other_verbs_trust_mesh_scripts_where_asked_to_and_only_then(tmp_path: Path) -> None:
+def test_other_verbs_trust_mesh_scripts_on_request_only(tmp_path: Path) -> None:
     mesh = MEMBRANE.replace("{grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}", "{file: m.geo}")
     (tmp_path / "scene.yaml").write_text(mesh)
     (tmp_path / "m.geo").write_text(SQUARE + 'a = GetEnv("HOME");\n')
@@ -114,7 +114,7 @@ def test_other_verbs_trust_mesh_scripts_where_asked_to_and_only_then(tmp_path: P
     refused(["study", "--out", "studies/scene", "--resume"], tmp_path, "GetEnv")
 
 
-def test_titles_are_text_and_any_number_of_steps_is_told(tmp_path: Path) -> None:
+def test_titles_are_plain_text_and_all_numbers_of_steps_are_printed(tmp_path: Path) -> None:
     (tmp_path / "plain.yaml").write_text(
         'title: "[/red] :smile: \\e[31m"\n' + MEMBRANE.replace("0.01", "1e-7")
     )

@@ -1,4 +1,4 @@
-"""``check`` of a run's folder counts the triangles that cross."""
+"""``check`` of a run's folder counts crossing triangles."""
 
 from __future__ import annotations
 
@@ -117,8 +117,10 @@ def test_crossings_are_counted_on_any_number_of_ranks(
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("alone", [False, True])
-def test_obstacles(comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixture[str], alone: bool) -> None:
-    """Of the second state a vertex is below the floor; the ball comes to the third one and leaves."""
+def test_crossings_with_obstacles(
+    comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixture[str], alone: bool
+) -> None:
+    """In the second state a vertex is below the floor; the ball crosses in the third state only."""
     run = written(shared_tmp / "run", contact={"self": not alone}, obstacles=OBSTACLES)
     assert check_run(comm, run) == 1
     said = [line.split(maxsplit=7) for line in capsys.readouterr().out.splitlines()]
@@ -136,7 +138,7 @@ def test_obstacles(comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parallel(2)
-def test_a_damaged_state_is_told_by_all_ranks(comm: MPI.Comm, folder: Path) -> None:
+def test_a_damaged_state_is_reported_on_all_ranks(comm: MPI.Comm, folder: Path) -> None:
     if comm.rank == 0:
         (folder / "mesh.h5").write_bytes(b"none")
     comm.Barrier()
@@ -144,7 +146,7 @@ def test_a_damaged_state_is_told_by_all_ranks(comm: MPI.Comm, folder: Path) -> N
         check_run(comm, folder)
 
 
-def test_the_verb(folder: Path) -> None:
+def test_the_command(folder: Path) -> None:
     told = lyra(["check", "run"], folder.parent)
     assert (told.code, told.out) == (0, TABLE + NO_CONTACT)
     for ranks in (1, 2):
@@ -160,7 +162,7 @@ def test_the_verb(folder: Path) -> None:
         refused(["check", *words], folder.parent, why)
 
 
-def test_a_run_of_the_program_without_crossings(tmp_path: Path) -> None:
+def test_a_real_run_has_no_crossings(tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(json.dumps(BASE))
     assert lyra(["run", "scene.json", "--out", "run"], tmp_path).code == 0
     checked = done(["check", "run", "--crossings"], tmp_path)

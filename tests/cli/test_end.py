@@ -1,4 +1,4 @@
-"""After the last line a process has ended: Python does not take its objects apart first."""
+"""A process ends after its last line, without Python's garbage collection."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ main()
 """
 
 
-def test_objects_are_not_looked_through_at_the_end(tmp_path: Path) -> None:
+def test_no_garbage_collection_at_the_end(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     ended = subprocess.run(

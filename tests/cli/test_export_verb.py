@@ -1,4 +1,4 @@
-"""The command ``export``, on one rank and on two."""
+"""The command ``export`` on one rank and on two."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from written_run import position, written
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_states_are_written_and_named(tmp_path: Path, ranks: int) -> None:
+def test_states_are_exported_and_files_named(tmp_path: Path, ranks: int) -> None:
     written(tmp_path / "run", states=3)
     left = done(["export", "run", "--to", "npz", "--every", "2"], tmp_path, ranks)
     assert "2 states in run/npz: run.npz" in left.out
@@ -38,7 +38,7 @@ sys.exit(run_command_line(sys.argv))
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_leaves_nothing(tmp_path: Path, number: signal.Signals, code: int) -> None:
+def test_a_signal_leaves_no_files(tmp_path: Path, number: signal.Signals, code: int) -> None:
     written(tmp_path / "run")
     process = start(["export", "run", "--to", "obj", "--out", "out"], tmp_path, program=("-c", SLOW))
     wait_until((tmp_path / "out.part" / "run_0002.obj").exists)

@@ -1,4 +1,4 @@
-"""``fabric`` from the command line: table, folder, exit codes."""
+"""The command ``fabric``: table, folder, exit codes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ time: {end: 1, step: 0.1}
 """
 
 
-def test_a_test_leaves_table_curve_and_page(tmp_path: Path) -> None:
+def test_a_test_writes_table_curve_and_page(tmp_path: Path) -> None:
     (tmp_path / "cloth.yaml").write_text(SCENE, encoding="utf-8")
     left = done(["fabric", "tensile", "cloth.yaml", "--out", "out"], tmp_path)
     assert "2 of 2 cases passed" in left.out

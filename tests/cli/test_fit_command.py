@@ -1,4 +1,4 @@
-"""`fit` as a command: what it leaves, going on, bad input on one rank, a signal in the first evaluation."""
+"""The command ``fit``: results, resumption, bad input on one rank, a signal in the first evaluation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ fit:
 LONG = STRIP.replace("{analysis: static}", "{end: 1000.0, step: 0.001}")
 
 
-def test_it_leaves_its_numbers_and_goes_on(tmp_path: Path) -> None:
+def test_a_fit_writes_its_results_and_resumes(tmp_path: Path) -> None:
     asked = ["fit", write_scene(tmp_path, STRIP), "--out", "out"]
     left = done(asked, tmp_path)
     assert "material.bending" in left.out
@@ -32,7 +32,7 @@ def test_it_leaves_its_numbers_and_goes_on(tmp_path: Path) -> None:
     assert "from before" in again.err
 
 
-def test_a_signal_in_the_first_evaluation_leaves_nothing(tmp_path: Path) -> None:
+def test_a_signal_in_the_first_evaluation_leaves_no_results(tmp_path: Path) -> None:
     process = start(["fit", write_scene(tmp_path, LONG), "--out", "out"], tmp_path)
     wait_until((tmp_path / "out" / "fit.lock").exists, process)
     time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""`info`: what it reports here, and what it makes of installations that do not fit."""
+"""The command ``info``: its output here, and for installations whose parts do not fit together."""
 
 import builtins
 import os
@@ -12,7 +12,7 @@ from lyra_petsc.cli import info as module
 from lyra_petsc.cli.info import Installation, incompatibilities, info, launched_ranks
 
 
-def test_names_the_versions_in_use(comm):
+def test_info_lists_the_versions_in_use(comm):
     import numba
     import numpy as np
     from petsc4py import PETSc
@@ -49,7 +49,7 @@ def test_a_missing_part_is_named_with_its_remedy(comm, monkeypatch):
     assert "h5py is missing: install it from" in text
 
 
-def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
+def test_a_broken_part_is_one_line(comm, monkeypatch):
     def describe(facts):
         raise ImportError("libhdf5.so.103: cannot open\nshared object file")
 
@@ -57,7 +57,7 @@ def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
     assert "- h5py is there but fails: libhdf5.so.103: cannot open shared object file." in info(comm)
 
 
-def test_all_fits_when_nothing_is_wrong():
+def test_a_correct_installation_fits():
     facts = Installation(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
     assert incompatibilities(facts) == []
 
@@ -90,11 +90,11 @@ def test_each_misfit_is_one_line(facts, words):
         ({"OMPI_COMM_WORLD_SIZE": "many"}, 1),
     ],
 )
-def test_reads_the_launchers_count(environment, ranks):
+def test_the_number_of_ranks_of_the_launcher_is_read(environment, ranks):
     assert launched_ranks(environment) == ranks
 
 
-def test_importing_it_starts_neither_petsc_nor_mpi():
+def test_its_import_starts_neither_petsc_nor_mpi():
     code = (
         "import sys, lyra_petsc.cli.info;"
         "print([name for name in sys.modules if name.startswith(('petsc4py', 'mpi4py'))])"

@@ -1,4 +1,4 @@
-"""More ranks than vertices: some own none, and the run is the same."""
+"""More ranks than vertices: the run is the same."""
 
 from __future__ import annotations
 

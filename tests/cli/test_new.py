@@ -1,4 +1,4 @@
-"""``new`` writes scenes that can be checked and run as they stand, and never over a file."""
+"""The command ``new`` writes scenes that run unchanged, and never overwrites a file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MSH_GROUPS = (
 
 
 def uncommented(text: str) -> str:
-    """The starter with the blocks that it offers as comments switched on."""
+    """The starter scene with its commented blocks activated."""
     lines = []
     offered = ("# wind", "# motions", "#   ", "# loads", "# petsc")
     _, _, body = text.partition("\ntitle:")
@@ -36,7 +36,7 @@ def uncommented(text: str) -> str:
     return "\n".join(lines).replace("    # motion: swing", "    motion: swing") + "\n"
 
 
-def test_the_starter_runs_as_it_stands(tmp_path: Path) -> None:
+def test_the_starter_scene_runs_unchanged(tmp_path: Path) -> None:
     left = done(["new", "kite"], tmp_path, extra={"XDG_CACHE_HOME": str(tmp_path)})
     assert "kite.yaml written" in left.out
     done(["check", "kite.yaml"], tmp_path)
@@ -48,7 +48,7 @@ def test_the_starter_runs_as_it_stands(tmp_path: Path) -> None:
     assert schema.is_file()
 
 
-def test_what_it_offers_in_comments_is_right_too(tmp_path: Path) -> None:
+def test_blocks_in_its_comments_are_valid(tmp_path: Path) -> None:
     done(["new", "kite"], tmp_path)
     text = (tmp_path / "kite.yaml").read_text(encoding="utf-8")
     scene = Scene.model_validate(parse_yaml(uncommented(text), file=None))
@@ -59,7 +59,7 @@ def test_what_it_offers_in_comments_is_right_too(tmp_path: Path) -> None:
     assert scene.petsc == {"ksp_rtol": 1e-8}
 
 
-def test_the_starter_fits_the_schema(tmp_path: Path) -> None:
+def test_the_starter_scene_fits_the_schema(tmp_path: Path) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     done(["new", "kite"], tmp_path)
     schema = json.loads(done(["check", "--schema"], tmp_path).out)
@@ -101,13 +101,13 @@ def test_a_mesh_without_groups_is_held_by_its_upper_end(tmp_path: Path) -> None:
         ("lyra-petsc nonsense --f", ""),
     ],
 )
-def test_the_shell_can_complete(words: str, offered: str, tmp_path: Path) -> None:
+def test_completion_in_the_shell(words: str, offered: str, tmp_path: Path) -> None:
     asked = {"_LYRA_PETSC_COMPLETE": "bash_complete", "COMP_WORDS": words}
     left = done([], tmp_path, extra={**asked, "COMP_CWORD": str(len(words.split()) - 1)})
     assert left.out.strip() == offered
     assert left.err == ""
 
 
-def test_bash_gets_its_completion(tmp_path: Path) -> None:
+def test_completion_script_for_bash(tmp_path: Path) -> None:
     left = lyra([], tmp_path, extra={"_LYRA_PETSC_COMPLETE": "bash_source"})
     assert "complete -o nosort -F _lyra_petsc_completion lyra-petsc" in left.out

@@ -1,4 +1,4 @@
-"""PETSc's options do what they do in every PETSc program, and unused ones are named."""
+"""PETSc options work as in every PETSc program, and unused ones are reported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def ran(folder: Path, *options: str, scene: str = SCENE, ranks: int = 1, petsc_o
     return done(["run", write_scene(folder, scene), "--out", "out", *options], folder, ranks, extra)
 
 
-def test_monitors_print_and_a_direct_solver_is_taken(tmp_path: Path) -> None:
+def test_monitors_print_and_a_direct_solver_is_used(tmp_path: Path) -> None:
     left = ran(
         tmp_path, "-ts_monitor", "-snes_monitor", "-ksp_type", "cg", "-pc_type", "lu", "-ksp_rtol", "1e-6"
     )
@@ -38,7 +38,7 @@ def test_an_unused_option_of_the_scene_is_named_too(tmp_path: Path) -> None:
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo"]
 
 
-def test_petsc_prints_what_is_asked_for(tmp_path: Path) -> None:
+def test_petsc_prints_requested_output(tmp_path: Path) -> None:
     left = ran(tmp_path, "-options_left", "-options_view", "-log_view", "-ts_view", "-help")
     for words in (
         "There are no unused options", "-options_view", "PETSc Performance Summary", "TS Object", "-ksp_type"
@@ -86,7 +86,7 @@ def test_a_value_that_petsc_refuses_is_named(tmp_path: Path, options: list[str],
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_a_few_steps_says_so_and_goes_on(tmp_path: Path) -> None:
+def test_a_run_stopped_by_ts_max_steps_says_so_and_resumes(tmp_path: Path) -> None:
     left = ran(tmp_path, "-ts_max_steps", "1")
     assert left.out.splitlines()[-1].startswith(
         "outcome      stopped at step 1, t = 0.01 of 0.05 s, by -ts_max_steps"
@@ -117,8 +117,8 @@ def test_a_loose_relative_tolerance_is_noted(tmp_path: Path) -> None:
     assert "note: step 1 (t = 0.01 s): -snes_rtol stopped Newton's method at a residual of" in left.err
 
 
-def test_a_line_search_that_fails_ends_no_step(tmp_path: Path) -> None:
-    """PETSc takes a short direction for convergence then, here one that Richardson's iteration gave up."""
+def test_a_failed_line_search_does_not_end_a_step(tmp_path: Path) -> None:
+    """PETSc takes a short direction, here one by Richardson's method, for convergence."""
     scene = SCENE.replace("nx: 4, ny: 4", "nx: 8, ny: 8").replace("800", "100").replace("160", "0")
     ran(tmp_path, "-ksp_type", "richardson", scene=scene.replace("2.0e-5, damping: 0.005", "1.0e-4"))
     assert (
@@ -133,7 +133,7 @@ def test_a_step_longer_than_the_run_is_the_whole_run(tmp_path: Path, step: str) 
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_views_show_what_solves(tmp_path: Path, ranks: int) -> None:
+def test_views_show_the_solvers(tmp_path: Path, ranks: int) -> None:
     scene = SCENE.replace("nx: 4, ny: 4", "nx: 12, ny: 12").replace("end: 0.05", "end: 0.01")
     options = ["-pc_type", "mg", "-snes_view", "-ksp_view_mat", "binary:matrix", "-log_view"]
     out = ran(tmp_path, *options, scene=scene, ranks=ranks).out
@@ -152,7 +152,7 @@ def test_views_show_what_solves(tmp_path: Path, ranks: int) -> None:
     assert matrix.getInfo()["nz_used"] > 10_000
 
 
-def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_path: Path) -> None:
+def test_the_command_line_overrides_the_environment_which_overrides_the_scene(tmp_path: Path) -> None:
     scene = SCENE + "petsc: {ts_max_steps: 1, ts_dt: 0.001}\n"
 
     def steps(name: str, *options: str, petsc_options: str = "") -> tuple[int, float]:

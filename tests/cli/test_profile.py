@@ -1,4 +1,4 @@
-"""``-log_view`` shows our phases as stages and the assembly as events, with counts that are right."""
+"""``-log_view`` shows phases as stages and the assembly as events, with correct counts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|balance|output): +\
 
 
 def counts(log: str, name: str) -> list[int]:
-    """Calls of an event, one number for each stage in which it happened (largest number of any rank)."""
+    """Calls of an event in each stage in which it occurred (maximum over ranks)."""
     return [int(found) for found in re.findall(rf"^{name} +(\d+) 1\.0", log, re.M) if int(found)]
 
 
@@ -81,7 +81,7 @@ print(after[0] - before[0], after[1] > before[1])
     assert told.stdout.split() == ["1", "True"], told.stderr
 
 
-def test_stages_are_balanced_when_exceptions_pass(tmp_path: Path) -> None:
+def test_stages_are_closed_after_exceptions(tmp_path: Path) -> None:
     program = """
 from petsc4py import PETSc
 from lyra_petsc.phases import Phases

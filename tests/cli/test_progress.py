@@ -1,4 +1,4 @@
-"""What runs, films and studies show while they are at work."""
+"""Progress output of runs, films and studies."""
 
 import io
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ def run(stream, seconds_per_step, steps=100, comm=FIRST, **options):
     return stream.getvalue()
 
 
-def test_plain_lines_tell_everything():
+def test_plain_lines_have_all_quantities():
     lines = run(io.StringIO(), 0.5).splitlines()
     assert lines[0] == "  1%  t 0.04 of 4 s  step 1  Newton 3  linear 17  energy 0.25 J"
     assert lines[1] == "  6%  t 0.24 of 4 s  step 6  Newton 3  linear 17  energy 0.25 J  0:47 left"
@@ -48,18 +48,18 @@ def test_plain_lines_tell_everything():
         (120.0, 100),  # slow: each step after a minute
     ],
 )
-def test_plain_lines_are_few_but_steady(seconds_per_step, expected):
+def test_the_number_of_plain_lines_depends_little_on_the_speed(seconds_per_step, expected):
     assert len(run(io.StringIO(), seconds_per_step).splitlines()) == expected
 
 
-def test_a_bar_on_a_terminal_and_lines_beside_petsc_monitors():
+def test_a_bar_on_a_terminal_and_lines_with_petsc_monitors():
     drawn = run(Terminal(), 0.5)
     assert "\x1b[" in drawn
     assert "100%" in drawn
     assert "\x1b[" not in run(Terminal(), 0.5, plain=True)
 
 
-def test_a_message_between_steps_comes_through_as_it_is():
+def test_a_message_between_steps_is_printed_unchanged():
     for stream in (io.StringIO(), Terminal()):
         with Progress(FIRST, 1.0, stream=stream) as progress:
             progress.update(1, 0.5, 1, 1, 0.0)
@@ -76,7 +76,7 @@ def test_other_ranks_are_silent(capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_time_left_is_told_after_some_steps_and_forgets_the_first():
+def test_remaining_time_is_shown_after_some_steps_without_the_first():
     stream, clock = io.StringIO(), Clock()
     with Progress(FIRST, 10.0, stream=stream, clock=clock) as progress:
         for now, time in ((60.0, 1.0), (70.0, 2.0), (80.0, 3.0), (90.0, 4.0), (100.0, 5.0)):
@@ -86,7 +86,7 @@ def test_time_left_is_told_after_some_steps_and_forgets_the_first():
     assert told == ["energy 0 J"] * 3 + ["1:00 left", "0:50 left"]
 
 
-def test_time_left_on_resume_counts_from_where_it_goes_on():
+def test_remaining_time_of_a_resumed_run_counts_from_its_start():
     stream, clock = io.StringIO(), Clock()
     with Progress(FIRST, 4.0, start=3.0, stream=stream, clock=clock) as progress:
         for step in range(6):
@@ -110,7 +110,7 @@ def test_closing_table(capsys):
     assert f"paraview {folder}/states.xdmf" in text
 
 
-def test_duration():
+def test_durations_as_text():
     assert [duration(s) for s in (0, 65.4, 3909, float("nan"))] == ["0:00", "1:05", "1:05:09", "?"]
 
 
@@ -124,7 +124,7 @@ def test_a_film_has_a_bar_on_a_terminal_and_lines_elsewhere(stream):
     assert ("━" in stream.getvalue()) == stream.isatty()
 
 
-def test_lines_of_a_study_name_each_case_and_the_time_left():
+def test_lines_of_a_study_name_each_case_and_the_remaining_time():
     stream, clock = io.StringIO(), Clock()
     with StudyProgress(FIRST, lambda: None, 2, stream=stream, clock=clock) as progress:
         progress.case("bdf2, Δt 10 ms", resumed=True)
@@ -154,7 +154,7 @@ def test_the_bar_of_a_study():
     assert "1/1 [b]Δt 10 ms  1:30 left" in stream.getvalue()
 
 
-def test_a_stop_of_a_study_comes_through():
+def test_an_interrupt_of_a_study_is_passed_on():
     def stop():
         raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""The verb as a user meets it: what it says, what it leaves, how it leaves."""
+"""The command ``render``: messages, files, exit codes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("options", "words"), MISTAKES, ids=[words[:40] for _, words in MISTAKES])
-def test_bad_input_is_one_line_and_leaves_nothing(options, words, tmp_path, monkeypatch):
+def test_bad_input_is_one_line_without_files(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     written(tmp_path / "run")
     (tmp_path / "text.png").write_text("no picture")
@@ -63,7 +63,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(options, words, tmp_path, monk
 
 
 def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
-    """The camera of the scene is the one of the picture; without it another picture comes out."""
+    """The scene's camera is used; without it the picture differs."""
     camera = "render: {camera: {position: [0.5, -3, 0], target: [0.5, 0.5, 0], angle: 30}}\n"
     write_scene(tmp_path, SCENE + camera)
     left = done(["run", "scene.yaml", "--out", "run"], tmp_path)
@@ -77,7 +77,7 @@ def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_ranks_make_a_film_and_refuse_as_one(tmp_path):
+def test_two_ranks_make_a_film_and_refuse_with_one_line(tmp_path):
     written(tmp_path / "run", states=4)
     left = done(
         ["render", "run", "--film", "film.mp4", "--size", "160x120", "--fps", "10"], tmp_path, ranks=2
@@ -88,7 +88,7 @@ def test_two_ranks_make_a_film_and_refuse_as_one(tmp_path):
     assert left.ours == ["lyra-petsc: --at: 9 s is outside the run, whose states go from 0 to 0.3 s"]
 
 
-def test_a_signal_ends_a_film_without_a_trace(tmp_path):
+def test_a_signal_ends_a_film_without_files(tmp_path):
     written(tmp_path / "run", states=200)
     process = start(["render", "run", "--film", "film.mp4"], tmp_path)
     part = tmp_path / ".film.part.mp4"
@@ -101,7 +101,7 @@ def test_a_signal_ends_a_film_without_a_trace(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
+def test_an_unfinished_run_is_drawn_up_to_its_newest_state(tmp_path):
     writer = Writer(tmp_path / "run")
     for _ in range(3):
         writer.write()
@@ -111,7 +111,7 @@ def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
     assert make_plan(RenderOptions(tmp_path / "run")).states == [0, 1, 2, 3]
 
 
-def test_nothing_optional_is_imported_unless_something_is_drawn(tmp_path):
+def test_optional_packages_are_imported_for_drawing_only(tmp_path):
     written(tmp_path / "run")
     program = (
         "import sys; from lyra_petsc.cli.app import run_command_line;"
@@ -126,7 +126,7 @@ def test_nothing_optional_is_imported_unless_something_is_drawn(tmp_path):
 
 
 @pytest.mark.parametrize("fields", [True, False])
-def test_the_script_for_paraview_is_python_and_names_what_is_there(tmp_path, fields, monkeypatch):
+def test_the_script_for_paraview_is_valid_and_names_existing_files(tmp_path, fields, monkeypatch):
     path = write_script(written(tmp_path / "run with 'quotes'", fields=fields))
     text = path.read_text(encoding="utf-8")
     tree = compile(text, str(path), "exec")

@@ -1,4 +1,4 @@
-"""What a run leaves on disk, and what it shows."""
+"""Files and output of a run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return folder / "out"
 
 
-def test_the_files_have_their_names(full: Path) -> None:
+def test_a_run_writes_all_files(full: Path) -> None:
     names = {path.name for path in full.iterdir()}
     assert {"states.xdmf", "mesh.h5", "checkpoint.h5", "history.csv", "scene.yaml", "summary.json"} <= names
     assert {"probes.csv", "reactions.csv", "states-0000.h5"} <= names
@@ -52,7 +52,7 @@ def states(run: Path) -> dict[float, dict[str, np.ndarray]]:
     return found
 
 
-def test_states_stand_at_the_start_at_multiples_and_at_the_end(full: Path) -> None:
+def test_states_are_at_the_start_at_multiples_and_at_the_end(full: Path) -> None:
     found = states(full)
     assert sorted(found) == pytest.approx([0, 0.02, 0.04, 0.05], abs=1e-15)
     first = found[0.0]
@@ -91,7 +91,7 @@ def test_fields_agree_with_the_history(full: Path) -> None:
     assert fall == pytest.approx(float(row["potential_energy"]), rel=1e-9)
 
 
-def test_the_time_series_reads_back(full: Path) -> None:
+def test_the_time_series_can_be_read(full: Path) -> None:
     found = states(full)
     with meshio.xdmf.TimeSeriesReader(full / "states.xdmf") as reader:
         points, cells = reader.read_points_cells()
@@ -122,11 +122,11 @@ def test_probes_are_means_of_positions(full: Path) -> None:
         assert float(rows[-1][f"edge_{name}"]) == pytest.approx(last[[20, 24], axis].mean(), abs=1e-14)
 
 
-def test_the_scene_as_understood_loads_equal(full: Path) -> None:
+def test_the_written_scene_loads_as_the_same_scene(full: Path) -> None:
     assert load_scene(full / "scene.yaml", []) == load_scene(full.parent / "scene.yaml", [])
 
 
-def test_the_summary_says_how_it_went(full: Path) -> None:
+def test_the_summary_has_outcome_and_versions(full: Path) -> None:
     summary = read_json(full / "summary.json")
     assert summary["outcome"] == "done"
     assert summary["sizes"] == {"vertices": 25, "triangles": 32, "unknowns": 75}

@@ -1,4 +1,4 @@
-"""Steps that do not converge: retried with a smaller one, and given up with words."""
+"""Steps that do not converge: repeated with a smaller Δt, or ended with a message."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STIFF = SCENE.replace("end: 0.05, step: 0.01", "end: 0.4, step: 0.04").replace("
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks: int) -> None:
+def test_a_failed_run_ends_with_a_message_and_keeps_the_last_state(tmp_path: Path, ranks: int) -> None:
     scene = write_scene(tmp_path, STIFF)
     left = lyra(["run", scene, "--out", "out", "--set", "solver.max_iterations=1"], tmp_path, ranks)
     assert left.code == 3, left.err
@@ -55,7 +55,7 @@ def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks
     assert (tmp_path / "out/checkpoint.h5").exists()
 
 
-def test_a_run_resumed_with_success_leaves_no_failure(tmp_path: Path) -> None:
+def test_a_successful_resumed_run_removes_files_of_the_failure(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, STIFF)
     fails = "--set", "solver.max_iterations=1", "-ts_adapt_dt_min", "1"
     left = lyra(["run", scene, "--out", "out", *fails], tmp_path)
@@ -70,7 +70,7 @@ def test_a_run_resumed_with_success_leaves_no_failure(tmp_path: Path) -> None:
     assert not list((tmp_path / "out").glob("failure*"))
 
 
-def test_what_petsc_cannot_do_in_a_step_keeps_the_state(tmp_path: Path) -> None:
+def test_a_petsc_error_in_a_step_keeps_the_last_state(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     left = lyra(["run", scene, "--out", "out", "-ksp_converged_reason", "nonsense"], tmp_path, 2)
     assert left.code == 3, left.err
@@ -80,7 +80,7 @@ def test_what_petsc_cannot_do_in_a_step_keeps_the_state(tmp_path: Path) -> None:
     assert read_json(tmp_path / "out/summary.json")["outcome"] in line
 
 
-def test_a_step_that_fails_is_retried_smaller_and_recovers(tmp_path: Path) -> None:
+def test_a_failed_step_is_repeated_with_a_smaller_dt(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, STIFF)
     few = ["--set", "solver.max_iterations=6", "--set", "solver.hessian=regularised"]
     done(["run", scene, "--out", "out", *few, *DIRECT], tmp_path)

@@ -1,4 +1,4 @@
-"""Runs that are stopped or killed go on where they were, also on another number of ranks."""
+"""Runs that are stopped or killed are resumed, also on another number of ranks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def final_state(folder: Path) -> tuple[float, NDArray[np.float64]]:
 
 
 def state_times(folder: Path) -> list[float]:
-    """Times [s] of all states, rounded; none is there twice."""
+    """Times [s] of all states, rounded; checks that none is repeated."""
     times = [round(state.time, 9) for state in stored_states(folder)]
     assert times == sorted(set(times))
     return times
@@ -63,7 +63,7 @@ def first_half(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def equal_runs(left: Path, whole: Path, end: float = 0.8) -> None:
-    """Same last state, and each step, probe and reaction once."""
+    """Check equal last states, and that each step, probe and reaction is there once."""
     (time_a, a), (time_b, b) = final_state(left), final_state(whole)
     assert time_a == time_b == pytest.approx(end, abs=1e-12)
     np.testing.assert_allclose(a, b, atol=1e-9)
@@ -84,7 +84,7 @@ def stopped_by(number: signal.Signals, folder: Path) -> Left:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_ends_a_step_and_the_run_goes_on(
+def test_a_run_stopped_by_a_signal_is_resumed(
     tmp_path: Path, uninterrupted: Path, number: signal.Signals, code: int
 ) -> None:
     left = stopped_by(number, tmp_path)
@@ -103,14 +103,14 @@ def test_a_signal_ends_a_step_and_the_run_goes_on(
     equal_runs(tmp_path / "out", uninterrupted)
 
 
-def test_a_killed_run_goes_on_from_its_newest_checkpoint(tmp_path: Path, uninterrupted: Path) -> None:
+def test_a_killed_run_is_resumed_from_its_newest_checkpoint(tmp_path: Path, uninterrupted: Path) -> None:
     assert stopped_by(signal.SIGKILL, tmp_path).code == -signal.SIGKILL
     done(["run", tmp_path / "scene.yaml", "--out", "out", "--resume", *DIRECT], tmp_path)
     equal_runs(tmp_path / "out", uninterrupted)
 
 
 @pytest.mark.parametrize(("before", "after"), [pytest.param(1, 2, marks=pytest.mark.quick), (3, 1)])
-def test_goes_on_with_another_number_of_ranks(
+def test_a_run_is_resumed_on_another_number_of_ranks(
     tmp_path: Path, first_half: Path, before: int, after: int
 ) -> None:
     scene = write_scene(tmp_path, LONG)
@@ -121,7 +121,7 @@ def test_goes_on_with_another_number_of_ranks(
     assert read_json(tmp_path / "out/summary.json")["ranks"] == after
 
 
-def test_resume_without_a_folder_takes_the_newest_run_of_the_scene(tmp_path: Path) -> None:
+def test_resume_without_a_folder_uses_the_newest_run_of_the_scene(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     done(["run", scene], tmp_path)
     again = done(["run", scene, "-ts_max_steps", "2"], tmp_path)

@@ -1,4 +1,4 @@
-"""``stress`` from the command line: table, folder, exit codes."""
+"""The command ``stress``: table, folder, exit codes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) -> None:
+def test_cases_pass_and_tables_and_a_page_with_pictures_are_written(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
     left = done(["stress", "--quick", *TWO], tmp_path)
@@ -66,7 +66,7 @@ def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: int) -> None:
+def test_a_given_scene_runs_the_cases_that_apply_to_it(tmp_path: Path, ranks: int) -> None:
     scene = write_scene(tmp_path)
     names = "bending-1e6,jump,slivers"
     words = ["stress", scene, "--quick", "--only", names, "--set", "gravity=[0, 0, -5]"]
@@ -78,7 +78,7 @@ def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: i
     assert list(content["left_out"]) == ["slivers"]
 
 
-def test_a_second_time_takes_another_folder(tmp_path: Path) -> None:
+def test_a_second_call_uses_another_folder(tmp_path: Path) -> None:
     (tmp_path / "stress" / "scene").mkdir(parents=True)
     (tmp_path / "stress" / "scene" / "stress.csv").write_text("")
     done(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path)
@@ -98,7 +98,7 @@ def test_a_failed_verdict_is_exit_code_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_a_base_that_does_not_run_is_exit_code_3(tmp_path: Path, ranks: int) -> None:
+def test_a_base_scene_that_fails_is_exit_code_3(tmp_path: Path, ranks: int) -> None:
     left = lyra(["stress", "--quick", "--out", "out", "-snes_max_it", "0"], tmp_path, ranks)
     assert left.code == 3, left.err + left.out
     [line] = left.ours
@@ -106,8 +106,8 @@ def test_a_base_that_does_not_run_is_exit_code_3(tmp_path: Path, ranks: int) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ranks_start_an_mpirun(tmp_path: Path) -> None:
-    """One for each case: see the tests of study."""
+def test_ranks_option_starts_mpirun(tmp_path: Path) -> None:
+    """One mpirun per case, as for ``study``."""
     scene = write_scene(tmp_path)
     words = ["stress", scene, "--quick", "--only", "membrane-1e-3", "--ranks", "2", "--out", "out"]
     left = lyra([*words, *REDUNDANT], tmp_path)
@@ -120,12 +120,12 @@ def test_ranks_start_an_mpirun(tmp_path: Path) -> None:
     assert [len(case["newton_iterations"]) for case in content["cases"]] == [20]
 
 
-def test_ranks_under_mpirun_are_refused(tmp_path: Path) -> None:
+def test_ranks_option_under_mpirun_is_refused(tmp_path: Path) -> None:
     refused(["stress", "--quick", "--ranks", "2"], tmp_path, "--ranks", ranks=2)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_interrupted_between_cases(tmp_path: Path) -> None:  # SIGINT: see the tests of verify
+def test_a_signal_ends_the_command_between_cases(tmp_path: Path) -> None:  # SIGINT: see the tests of verify
     process = start(["stress", "--only", "one-triangle,rigid-plate", "--out", "out"], tmp_path)
     wait_until((tmp_path / "out" / "stress.json").exists, process)
     process.send_signal(signal.SIGTERM)
@@ -138,7 +138,7 @@ def test_interrupted_between_cases(tmp_path: Path) -> None:  # SIGINT: see the t
     assert "one-triangle" in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_petsc_options_go_through_and_unused_ones_are_told(tmp_path: Path) -> None:
+def test_petsc_options_are_passed_on_and_unused_ones_reported(tmp_path: Path) -> None:
     left = lyra(
         ["stress", "--quick", "--only", "one-triangle", "-pc_type", "lu", "-snes_typo", "1", "--out", "out"],
         tmp_path,

@@ -1,4 +1,4 @@
-"""``study`` as a user starts it: what it leaves, how it stops, resumes and refuses."""
+"""The command ``study``: files, signals, resumption, refusals."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ output: {every: 0.05}
 
 
 def results(folder: Path) -> dict[str, float]:
-    """When each finished case was finished."""
+    """Times at which the finished cases were finished."""
     return {path.parent.name: path.stat().st_mtime for path in folder.glob("cases/*/result.json")}
 
 
-def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
+def test_a_study_writes_all_files(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     words = ["study", "scene.yaml", "--vary", "integrator=beuler,bdf2", "--vary", "dt=0.02,0.01,0.005",
              "--repeats", "2", "-ksp_rtol", "1e-3"]  # fmt: skip
@@ -101,7 +101,7 @@ def test_exact_answers_on_two_ranks(tmp_path: Path) -> None:
 
 
 def backward_euler_error(dt: float) -> float:
-    """Of the sheet that falls flat in still air, at 0.05 and 0.1 s, over its diagonal."""
+    """Error of a level sheet falling in still air, at 0.05 and 0.1 s, over its diagonal."""
     g, terminal = 9.81, math.sqrt(0.2 * 9.81 / 1.0)
     v = z = worst = 0.0
     for step in range(1, round(0.1 / dt) + 1):
@@ -114,7 +114,7 @@ def backward_euler_error(dt: float) -> float:
     return worst / math.hypot(0.6, 0.4)
 
 
-def test_a_failed_combination_is_a_row_and_the_study_goes_on(tmp_path: Path) -> None:
+def test_a_failed_combination_is_a_row_and_the_study_continues(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     words = ["study", "scene.yaml", "--vary", "max_iterations=1,50", "--vary", "pc_type=pbjacobi,bogus,lu"]
     left = done(
@@ -132,7 +132,7 @@ def test_a_failed_combination_is_a_row_and_the_study_goes_on(tmp_path: Path) -> 
     assert "What failed" in report
 
 
-def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
+def test_if_all_combinations_fail_the_exit_code_is_3(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING.replace("step: 0.01", "step: 0.04"))
     left = lyra(
         ["study", "scene.yaml", "--vary", "max_iterations=1", "--repeats", "1", "--out", "out"], tmp_path
@@ -150,7 +150,7 @@ LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.002", "--repeats", "1", "--o
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
-def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, code: int) -> None:
+def test_a_stopped_study_resumes_without_repeating(tmp_path: Path, number: int, code: int) -> None:
     write_scene(tmp_path, HANGING)
     process = start(LONG, tmp_path)
     wait_until((tmp_path / "out" / "cases" / "dt0.02" / "result.json").exists, process)
@@ -183,7 +183,7 @@ def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, 
 
 
 @pytest.mark.slow
-def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
+def test_ranks_option_starts_an_mpirun_for_each_case(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
     words = ["study", "scene.yaml", "--vary", "dt=0.025,0.0125", "--repeats", "1", "--ranks", "2"]
     done([*words, "--vary", "integrator=beuler", "--out", "two", "-ksp_rtol", "1e-4"], tmp_path)
@@ -196,7 +196,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ranks_stop_together(tmp_path: Path) -> None:
+def test_a_signal_stops_all_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
     wait_until((tmp_path / "out" / "cases" / "dt0.0001" / "history.csv").exists, process)
@@ -224,7 +224,7 @@ def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_as_reference(tmp_path: Path) -> None:
+def test_an_existing_run_as_reference(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     fine = ["run", "scene.yaml", "--set", "time.step=0.001", "--out", "fine"]
     done(fine, tmp_path)
@@ -253,17 +253,17 @@ def test_a_run_as_reference(tmp_path: Path) -> None:
         (["--resume", "--force"], "give one of them"),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, words: list[str], because: str) -> None:
+def test_bad_input_is_one_line_without_files(tmp_path: Path, words: list[str], because: str) -> None:
     write_scene(tmp_path, HANGING)
     refused(["study", "scene.yaml", *words], tmp_path, because)
 
 
-def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
+def test_bad_input_on_two_ranks_is_one_line(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     refused(["study", "scene.yaml", "--vary", "dt=0.01,0.01"], tmp_path, "twice", ranks=2)
 
 
-def test_a_run_imports_nothing_of_it(tmp_path: Path) -> None:
+def test_a_run_imports_no_module_of_studies(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     program = (
         "import sys; from lyra_petsc.cli.app import run_command_line; code = run_command_line(sys.argv); "
@@ -274,7 +274,7 @@ def test_a_run_imports_nothing_of_it(tmp_path: Path) -> None:
     assert left.out.splitlines()[-1] == "[]"
 
 
-def test_help_names_everything(tmp_path: Path) -> None:
+def test_help_names_all_options(tmp_path: Path) -> None:
     left = done(["study", "--help"], tmp_path)
     for word in ("--vary", "--reference", "--quantities", "--repeats", "--ranks", "--resume", "--force"):
         assert word in left.out

@@ -1,4 +1,4 @@
-"""PETSc's TS options choose the integrator and the kind of steps."""
+"""PETSc's TS options choose the integrator and fixed or adaptive steps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_command_line_chooses_the_integrator(tmp_path: Path, options: str, i
         ("-ts_adapt_type glee", "-ts_adapt_type"),
     ],
 )
-def test_what_there_is_not_is_refused(tmp_path: Path, options: str, key: str) -> None:
+def test_unavailable_integrators_are_refused(tmp_path: Path, options: str, key: str) -> None:
     write_scene(tmp_path, HANGING)
     refused(["run", "scene.yaml", "--out", "out", *options.split()], tmp_path, f"lyra-petsc: {key}: ")
     assert not (tmp_path / "out").exists()

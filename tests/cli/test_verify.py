@@ -1,4 +1,4 @@
-"""``verify`` from the command line: tables, folder, exit codes."""
+"""The command ``verify``: tables, folder, exit codes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_case_passes(tmp_path: Path) -> None:
     assert "verify free-fall patch-states --quick" in report
 
 
-def test_the_page_holds_its_plots_and_unused_petsc_options_are_told(tmp_path: Path) -> None:
+def test_the_page_has_plots_and_unused_petsc_options_are_reported(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
     left = done(["verify", "free-fall", "--quick", "--out", "out", "-snes_typo", "1"], tmp_path)
@@ -71,7 +71,7 @@ def test_a_wrong_answer_is_exit_code_1(tmp_path: Path) -> None:
     assert [case["passed"] for case in content["cases"]] == [False, True]
 
 
-def test_a_solver_that_gives_up_is_a_row_and_exit_code_1(tmp_path: Path) -> None:
+def test_a_failed_simulation_is_a_row_and_exit_code_1(tmp_path: Path) -> None:
     arguments = ["verify", "oscillator", "patch-states", "--quick", "-snes_max_it", "0"]
     left = lyra(arguments, tmp_path)
     assert left.code == 1, left.err
@@ -80,7 +80,7 @@ def test_a_solver_that_gives_up_is_a_row_and_exit_code_1(tmp_path: Path) -> None
     assert left.ours == []
 
 
-def test_interrupted_after_a_case(tmp_path: Path) -> None:
+def test_a_signal_ends_the_command_after_a_case(tmp_path: Path) -> None:
     process = start(["verify", "free-fall", "circular-membrane", "--out", "out"], tmp_path)
     wait_until((tmp_path / "out" / "verify.json").exists, process)
     process.send_signal(signal.SIGINT)

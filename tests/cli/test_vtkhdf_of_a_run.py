@@ -1,4 +1,4 @@
-"""``output: {vtkhdf: true}`` in a run: what VTK finds in it is what the states hold."""
+"""``output: {vtkhdf: true}``: VTK reads the same states as from the other files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_every_time_and_field(tmp_path: Path) -> None:
     assert len(StoredRun(tmp_path / "out")) > 3
 
 
-def test_a_scene_that_does_not_name_it_has_no_such_files(tmp_path: Path) -> None:
+def test_no_vtkhdf_files_by_default(tmp_path: Path) -> None:
     done(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
     names = {entry.name for entry in (tmp_path / "out").iterdir()}
     assert "states.xdmf" in names

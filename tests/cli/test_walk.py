@@ -1,4 +1,4 @@
-"""Each type that PETSc lists solves, or is refused in one line: no crash, no traceback, no hang."""
+"""Every type that PETSc lists either works or is refused in one line: no crash, traceback or hang."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ SOLVED = [
 
 
 class Walk:
-    """The process that forks the runs."""
+    """The process from which the runs are forked."""
 
     def __init__(self, folder: Path) -> None:
         write_scene(folder, SCENE.replace("end: 0.05", "end: 0.01"))
@@ -91,7 +91,7 @@ class Walk:
         )
 
     def ends(self, runs: list[list[str]]) -> list[tuple[int, list[str]]]:
-        """Of each run its exit code and the lines in which the program says why."""
+        """Exit code of each run, and the lines with which the program reports the reason."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(json.dumps(runs), file=self._process.stdin, flush=True)
@@ -115,7 +115,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
 
 
 def lists(folder: Path) -> dict[str, list[str]]:
-    """The types that ``-help`` names."""
+    """Types that ``-help`` lists."""
     text = done(["run", write_scene(folder), "--out", "out", "-help"], folder).out
     found = {}
     for option in LISTS:
@@ -126,7 +126,7 @@ def lists(folder: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.slow
-def test_each_type_solves_or_is_refused_in_one_line(tmp_path: Path, walk: Walk) -> None:
+def test_each_type_works_or_is_refused_in_one_line(tmp_path: Path, walk: Walk) -> None:
     from petsc4py import PETSc
 
     types = lists(tmp_path)
@@ -145,14 +145,14 @@ def test_each_type_solves_or_is_refused_in_one_line(tmp_path: Path, walk: Walk) 
     )
 
 
-def test_what_has_no_meaning_is_refused_before_the_run(walk: Walk) -> None:
+def test_types_without_meaning_are_refused_before_the_run(walk: Walk) -> None:
     for words, (code, lines) in zip(REFUSED, walk.ends(REFUSED), strict=True):
         assert (code, len(lines)) == (2, 1), (words, code, lines)
         option = next(word for word in reversed(words) if word.startswith("-"))
         assert option == "--set" or option in lines[0] or words[-1] == "nosuch", lines
 
 
-def test_what_petsc_solves_is_solved(walk: Walk) -> None:
+def test_types_that_petsc_supports_work(walk: Walk) -> None:
     for words, end in zip(SOLVED, walk.ends(SOLVED), strict=True):
         assert end == (0, []), (words, end)
 
@@ -174,8 +174,8 @@ NEEDS_A_DISPLAY = ("-ts_monitor_sp_swarm",)
 
 
 @pytest.mark.parametrize("words", AT_THE_START_OR_END, ids=" ".join)
-def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: list[str]) -> None:
-    """PETSc reads some options only as it starts; at its end it frees what calls Python."""
+def test_the_exit_code_fits_the_message(tmp_path: Path, words: list[str]) -> None:
+    """PETSc reads some options at its start only; at its end it frees objects that call Python."""
     left = lyra(["run", write_scene(tmp_path), "--out", "out", *words], tmp_path)
     assert left.code == 2, left.err
     lines = left.err.splitlines()
@@ -189,7 +189,7 @@ def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: li
 @pytest.mark.parametrize(
     "line", ["-fp_trap", "-python", "-history /nonexistent/log", "-options_file .petscrc"]
 )
-def test_files_of_options_are_looked_at_before_petsc_reads_them(tmp_path: Path, line: str) -> None:
+def test_options_files_are_checked_before_petsc_reads_them(tmp_path: Path, line: str) -> None:
     (tmp_path / ".petscrc").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
     left = lyra(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
     assert left.code == 2, left.err

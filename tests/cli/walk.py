@@ -1,8 +1,4 @@
-"""Many runs with other PETSc options, each forked from one process that has loaded everything.
-
-Arguments: a folder with ``scene.yaml``. Each line of the standard input is a list of command lines' PETSc
-options in JSON; the answer is a line with exit code, stdout and stderr of each run.
-"""
+"""Many runs with different PETSc options, forked from one process that has loaded everything."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ AT_A_TIME = 2
 
 
 def start(folder: Path, words: list[str], name: str) -> int:
-    """Fork a process for one run; its number."""
+    """Fork a process for one run; returns its process number."""
     pid = os.fork()
     if pid:
         return pid
@@ -41,7 +37,7 @@ def start(folder: Path, words: list[str], name: str) -> int:
 
 
 def simulate(scene: Path, words: list[str]) -> int:
-    """One step, as ``run`` would take it; the exit code."""
+    """Compute one step, as ``run`` does; returns the exit code."""
     from mpi4py import MPI
     from petsc4py import PETSc
 
@@ -69,12 +65,12 @@ def simulate(scene: Path, words: list[str]) -> int:
 
 
 def files(folder: Path, name: str) -> tuple[Path, Path]:
-    """Where stdout and stderr of a run go."""
+    """Files for stdout and stderr of a run."""
     return folder / f"{name}.out", folder / f"{name}.err"
 
 
 def run_all(folder: Path, runs: list[list[str]]) -> list[tuple[int, str, str]]:
-    """Exit code (-1: it hangs), stdout and stderr of each run; some at a time."""
+    """Exit code (−1 if it hangs), stdout and stderr of each run; several run at the same time."""
     waiting = list(enumerate(runs))
     going: dict[int, tuple[int, float]] = {}
     codes: dict[int, int] = {}

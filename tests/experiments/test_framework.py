@@ -1,4 +1,4 @@
-"""What all verbs of experiments share: outcomes, the registry, records, and the folder that is left."""
+"""The common framework of experiments: outcomes, the registry, records, and folders."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def outcome(name: str, *verdicts: Verdict, left_out: str = "") -> Outcome[Case]:
     return Outcome(Case(name, f"title of {name}"), named, 1.0, left_out)
 
 
-def test_what_has_passed() -> None:
+def test_passed_and_failed_outcomes() -> None:
     assert outcome("a", GOOD, GOOD).passed
     assert not outcome("a", GOOD, BAD).passed
     assert outcome("a", GOOD, BAD).failures == {"1": BAD}
@@ -70,7 +70,7 @@ class Whole:
     count: int | None = None
 
 
-def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_a_record_is_read_from_its_file(tmp_path: Path) -> None:
     whole = Whole("Δt", [Part(0.5), Part(math.inf)], ("a", "b"), 3)
     save_record(tmp_path / "whole.json", whole)
     assert load_record(tmp_path / "whole.json", Whole) == whole
@@ -111,7 +111,7 @@ class Silent:
     def end(self, outcome: Outcome[Case]) -> None: ...
 
 
-def test_what_had_been_done_is_in_the_folder_of_one_that_was_interrupted(tmp_path: Path) -> None:
+def test_an_interrupted_experiment_leaves_its_finished_cases(tmp_path: Path) -> None:
     def run(case: Case) -> Outcome[Case]:
         if case.name == "b":
             raise Interrupted("", 2)
@@ -130,7 +130,7 @@ def test_what_had_been_done_is_in_the_folder_of_one_that_was_interrupted(tmp_pat
     assert "try 'a b'" in page
 
 
-def test_a_folder_that_stands_there_is_refused_unless_forced(tmp_path: Path) -> None:
+def test_an_existing_folder_is_refused_unless_forced(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exists; choose another folder, or give --force"):
         Results(MPI.COMM_SELF, tmp_path, Told(), ranks=1, command=[])
     assert Results(MPI.COMM_SELF, tmp_path, Told(), ranks=1, command=[], force=True).outcomes == []

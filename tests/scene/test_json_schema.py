@@ -1,4 +1,4 @@
-"""The JSON Schema accepts each scene that the loader accepts, and refuses others where it can."""
+"""The JSON Schema accepts every scene that the loader accepts, and refuses others as far as it can."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def judgement(validator: Any, data: Any) -> str:
     return "accepted" if valid else f"too strict: {next(validator.iter_errors(data)).message}: {data}"
 
 
-def test_the_file_for_editors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_schema_file_for_editors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = schema_file()
     assert path.parent == tmp_path / "cache" / "lyra_petsc"
@@ -92,7 +92,7 @@ def test_every_key_is_described() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_shipped_scenes_fit(path: Path, validator: Any) -> None:
+def test_shipped_scenes_are_accepted(path: Path, validator: Any) -> None:
     data = parse_yaml(path.read_text(encoding="utf-8"), file=path)
     assert [error.message for error in validator.iter_errors(data)] == []
 
@@ -158,7 +158,7 @@ def test_further_mistakes_are_refused(part: str, validator: Any) -> None:
 
 
 @pytest.mark.slow
-def test_schema_and_loader_agree_on_drawn_scenes(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_schema_and_loader_agree_on_random_scenes(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     hypothesis = pytest.importorskip("hypothesis")
     with suppress(ImportError):
         # it also draws constants of all imported modules

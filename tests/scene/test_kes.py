@@ -1,4 +1,4 @@
-"""Internal friction and numbers of KES reports, from the scene to the constants of a shell."""
+"""Friction within the fabric, and numbers of KES reports, from the scene to the constants of a shell."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def shell_of(**keys: Any) -> ShellMaterial:
 
 
 @pytest.mark.parametrize("model", ["hinge", "midedge"])
-def test_a_report_in_its_own_units(model: str) -> None:
+def test_a_report_is_converted_from_its_own_units(model: str) -> None:
     kes = {name: value for name, value in REPORT.items() if name != "2HB" or model == "midedge"}
     shell = shell_of(**NUMBERS, bending_model=model, kes=kes)
     assert shell.bending == pytest.approx((9.80665e-6, 9.80665e-6, 9.80665e-6))
@@ -47,7 +47,7 @@ def test_warp_and_weft() -> None:
     assert midedge.friction_moment == pytest.approx((0.03 * 9.80665e-3, 0.01 * 9.80665e-3))
 
 
-def test_friction_is_scaled_as_bending_and_membrane() -> None:
+def test_friction_is_scaled_like_bending_and_membrane() -> None:
     shell = shell_of(
         **(NUMBERS | {"membrane": NUMBERS["membrane"] | {"c33": 1.0}}),  # type: ignore[operator]
         bending=1e-5,
@@ -63,7 +63,7 @@ def test_friction_is_scaled_as_bending_and_membrane() -> None:
 @pytest.mark.parametrize(
     ("moment", "model"), [(0, "hinge"), ([0, 0], "hinge"), (1e-4, "midedge"), ([0, 1], "midedge")]
 )
-def test_friction_in_bending_means_midedge(moment: Any, model: str) -> None:
+def test_friction_in_bending_selects_midedge(moment: Any, model: str) -> None:
     membrane = NUMBERS["membrane"] | {"c33": 1.0}  # type: ignore[operator]
     scene = scene_of(
         SCENE | {"material": NUMBERS | {"membrane": membrane, "bending": 1e-5, "friction_moment": moment}}

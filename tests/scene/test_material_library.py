@@ -1,4 +1,4 @@
-"""Conventions of the material library, compared with numbers computed by hand from the published tables."""
+"""Conventions of the material library, compared with values computed by hand from the published tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def shell(**keys: object) -> ShellMaterial:
     return resolve_material(Material.model_validate(keys))[0]
 
 
-def test_the_twelve_and_the_original_are_there() -> None:
+def test_the_library_has_all_cloths() -> None:
     assert set(material_names()) >= WANG_2011 | {"isotropic"}
     assert sum(isinstance(entry, ClothTable) for entry in library_entries().values()) == 13
     assert len(material_names()) == len(set(material_names()))
@@ -47,7 +47,7 @@ def test_every_material_can_be_simulated(name: str) -> None:
     assert bool(notes) == (name == "navy-sparkle-sweat")
 
 
-def test_measured_cloth_is_doubled_and_quartered() -> None:
+def test_factors_of_measured_cloths() -> None:
     cloth = shell(cloth="gray-interlock")
     assert cloth.density == 0.187
     assert cloth.c11 == pytest.approx(33.187664, rel=1e-12)  # 2 × 16.593832
@@ -57,19 +57,19 @@ def test_measured_cloth_is_doubled_and_quartered() -> None:
     assert cloth.bending == pytest.approx((5.7979245e-06, 6.187491e-06, 3.566906e-06), rel=1e-12)
 
 
-def test_paper_scene() -> None:
+def test_cloth_of_the_papers_scene() -> None:
     paper = shell(cloth="paper")
     assert (paper.density, paper.c11, paper.c12, paper.c22, paper.c33) == (0.1, 1e6, 0.0, 1e6, 5e5)
     assert paper.bending == pytest.approx((1e-4,) * 3, rel=1e-15)
 
 
-def test_isotropic_of_the_original() -> None:
+def test_isotropic_material_of_the_original_lyra() -> None:
     sheet = shell(cloth="isotropic")
     assert (sheet.density, sheet.c11, sheet.c12, sheet.c22, sheet.c33) == (0.1, 80.0, 0.0, 80.0, 40.0)
     assert sheet.bending == pytest.approx((5e-6,) * 3, rel=1e-15)
 
 
-def test_indefinite_cloth_is_projected() -> None:
+def test_indefinite_cloths_are_projected() -> None:
     material, (note,) = resolve_material(Material(cloth="navy-sparkle-sweat"))
     measured = 2 * np.array([[12.486332, -19.875324], [-19.875324, 3.272434]])
     values, vectors = np.linalg.eigh(measured)
@@ -90,7 +90,7 @@ def test_positive_definite_tables_are_not_projected() -> None:
     assert notes == []
 
 
-def test_isotropic_sheet_is_plane_stress() -> None:
+def test_isotropic_sheets_are_in_plane_stress() -> None:
     sheet = shell(young=1e6, poisson=0.25, thickness=0.01, density=0.5)
     # E h = 1e4 N/m; 1 − ν² = 15/16; E h³ = 1 N·m
     assert sheet.c11 == sheet.c22 == pytest.approx(1e4 * 16 / 15, rel=1e-14)
@@ -100,11 +100,11 @@ def test_isotropic_sheet_is_plane_stress() -> None:
     assert sheet.density == 0.5
 
 
-def test_engineering_density_is_areal() -> None:
+def test_density_of_engineering_materials_is_per_area() -> None:
     assert shell(cloth="steel-sheet-500um").density == pytest.approx(7850 * 0.5e-3, rel=1e-14)
 
 
-def test_explicit_numbers_are_unchanged() -> None:
+def test_given_constants_are_unchanged() -> None:
     membrane = {"c11": 120, "c22": 110, "c12": -40, "c33": 30}
     sheet = shell(density=0.2, membrane=membrane)
     assert (sheet.c11, sheet.c22, sheet.c12, sheet.c33) == (120.0, 110.0, -40.0, 30.0)
@@ -123,7 +123,7 @@ def test_explicit_numbers_are_unchanged() -> None:
     ],
     ids=lambda keys: next(iter(keys)),
 )
-def test_factors_apply_to_each_alternative(keys: dict[str, object]) -> None:
+def test_scale_factors_apply_to_each_kind_of_material(keys: dict[str, object]) -> None:
     plain = shell(**keys)
     scaled = shell(
         **keys, density_scale=3, stretching_scale=5, bending_scale=7, thicken=2,
@@ -142,7 +142,7 @@ def test_bending_can_be_switched_off() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
-def test_numbers_that_leave_the_range_are_refused(scale: float) -> None:
+def test_scaled_values_outside_the_range_are_refused(scale: float) -> None:
     with pytest.raises(InputError, match=r"too large|too small"):
         shell(cloth="paper", density_scale=scale, stretching_scale=scale, thicken=scale)
     assert math.isfinite(shell(cloth="paper", thicken=1e3).c11)

@@ -1,4 +1,4 @@
-"""The original program's conf.json, read as a scene."""
+"""The original Lyra's conf.json, read as a scene."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("changes", "key", "message"), BAD, ids=[case[1] for case in BAD])
-def test_mistakes(folder: Path, changes: dict[str, Any], key: str, message: str) -> None:
+def test_mistakes_are_refused(folder: Path, changes: dict[str, Any], key: str, message: str) -> None:
     path = write(folder, **changes)
     with pytest.raises(InputError) as caught:
         load_scene(path)
@@ -228,7 +228,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("text", "message"), BROKEN, ids=[case[0][:20] for case in BROKEN])
-def test_broken_json(tmp_path: Path, text: str, message: str) -> None:
+def test_broken_json_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "conf.json"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -247,7 +247,7 @@ BAD_TABLES = [
 
 
 @pytest.mark.parametrize(("table", "key", "message"), BAD_TABLES, ids=[str(case[1]) for case in BAD_TABLES])
-def test_bad_material_files(folder: Path, table: object, key: str | None, message: str) -> None:
+def test_bad_material_files_are_refused(folder: Path, table: object, key: str | None, message: str) -> None:
     (folder / "mine.json").write_text(json.dumps(table))
     cloth = {"mesh": "meshes/square.obj", "materials": [{"data": "mine.json"}]}
     with pytest.raises(InputError) as caught:

@@ -98,7 +98,7 @@ def test_values_and_defaults(full: Path, small: Path) -> None:
     assert plain.solver.max_iterations == 50
 
 
-def test_dump_is_the_same_scene(full: Path, small: Path, tmp_path: Path) -> None:
+def test_a_written_scene_loads_as_the_same_scene(full: Path, small: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "deep" / "er"
     elsewhere.mkdir(parents=True)
     for path in (full, small):
@@ -113,7 +113,7 @@ def test_dump_is_the_same_scene(full: Path, small: Path, tmp_path: Path) -> None
     assert load_scene(full) != load_scene(small)
 
 
-def test_dump_holds_defaults_and_no_internals(small: Path) -> None:
+def test_a_written_scene_has_defaults_and_no_internals(small: Path) -> None:
     text = dump_scene(load_scene(small))
     for line in (
         "integrator: beuler",
@@ -130,7 +130,7 @@ def test_dump_holds_defaults_and_no_internals(small: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["a: b", "- x", "2024-01-01", "yes", "1e5", "~", "'\"", "ß\n#", "\u2028x", " "]
 )
-def test_dump_quotes_text_that_is_no_plain_text_in_yaml(small: Path, tmp_path: Path, text: str) -> None:
+def test_a_written_scene_quotes_text_that_yaml_would_misread(small: Path, tmp_path: Path, text: str) -> None:
     scene = Scene.model_validate(
         {**load_scene(small).model_dump(by_alias=True, exclude_none=True), "title": text}
     )
@@ -178,7 +178,7 @@ def found(holds: Callable[[Scene], bool], scene: Scene) -> bool:
         return False
 
 
-def test_the_last_override_counts_and_anchors_are_independent(small: Path) -> None:
+def test_the_last_override_wins_and_anchors_are_independent(small: Path) -> None:
     assert load_scene(small, ["time.end=2", "time.end=3"]).time.end == 3.0
     small.write_text(SMALL.replace("[{group: left}, {group: right, from: 0.5}]", "[&h {group: left}, *h]"))
     scene = load_scene(small, ["handles[0].until=2"])
@@ -202,7 +202,7 @@ BAD_OVERRIDES = [
 
 
 @pytest.mark.parametrize(("text", "key", "message"), BAD_OVERRIDES, ids=[case[0] for case in BAD_OVERRIDES])
-def test_bad_overrides(small: Path, text: str, key: str, message: str) -> None:
+def test_bad_overrides_are_refused(small: Path, text: str, key: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         load_scene(small, [text])
     assert caught.value.key == key
@@ -225,7 +225,7 @@ def test_mesh_given_on_the_command_line(
         load_scene(small, ["mesh={file: nowhere.obj}"])
 
 
-def test_json_scene_of_ours_and_byte_order_mark(tmp_path: Path) -> None:
+def test_json_scenes_and_byte_order_marks(tmp_path: Path) -> None:
     path = tmp_path / "scene.json"
     path.write_text(
         '\ufeff{"mesh": {"grid": {"width": 1, "height": 1, "nx": 1, "ny": 1}}, // one\n'

@@ -259,13 +259,13 @@ def test_message_names_file_key_and_remedy(tmp_path: Path, part: str, key: str, 
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_base_of_the_table_is_right(tmp_path: Path) -> None:
+def test_the_valid_scene_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "good.yaml"
     path.write_text(scene_text("title: right"))
     assert load_scene(path).title == "right"
 
 
-def test_further_mistakes_are_counted(tmp_path: Path) -> None:
+def test_the_number_of_further_mistakes_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(
         "mesh: {grid: {width: 0, height: 0, nx: 1, ny: 1}}\nmaterial: {cloth: x}\ntime: {end: 1}\n"

@@ -1,4 +1,4 @@
-"""Exact motions against the program's own steps, and against scenes that they do not hold for."""
+"""Exact motions compared with simulated steps, and refused for scenes to which they do not apply."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def triangle(folder: Path, stretch: float = 1.2) -> dict[str, Any]:
 
 
 def content(name: str, folder: Path) -> dict[str, Any]:
-    """A scene that the exact solution of that name holds for."""
+    """A scene to which the exact solution ``name`` applies."""
     if name == "free-fall":
         return {"mesh": SHEET, "gravity": DOWN, "initial": {"velocity": [1.0, 0, 2.0]}}
     if name == "terminal-fall":
@@ -48,7 +48,7 @@ def content(name: str, folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", list(SOLUTIONS))
-def test_backward_euler_tends_to_it(name: str, shared_tmp: Path, comm: MPI.Comm) -> None:
+def test_backward_euler_converges_to_the_exact_motion(name: str, shared_tmp: Path, comm: MPI.Comm) -> None:
     if comm.size > 1 and (name == "breathing-triangle" or not PETSc.Sys.hasExternalPackage("mumps")):
         pytest.skip("one triangle is for one rank; the others need a parallel direct solver")
     end, coarse = (0.015, 150) if name == "breathing-triangle" else (0.2, 40)
@@ -88,7 +88,9 @@ def test_velocity_is_the_derivative_and_energy_starts_as_the_scene(name: str, tm
 
 
 @pytest.mark.parametrize("stretch", [1.2, 0.7])
-def test_breathing_conserves_energy_and_turns_where_it_should(stretch: float, tmp_path: Path) -> None:
+def test_the_breathing_triangle_conserves_energy_and_has_the_right_extremes(
+    stretch: float, tmp_path: Path
+) -> None:
     body = Body(scene_of({"mesh": triangle(tmp_path, stretch), "material": ROUND}))
     motion = exact_motion("breathing-triangle", body)
     start = body.mesh.positions
@@ -105,7 +107,7 @@ def test_breathing_conserves_energy_and_turns_where_it_should(stretch: float, tm
 
 
 @pytest.mark.parametrize("name", list(SOLUTIONS))
-def test_the_matching_one_is_found(name: str, tmp_path: Path) -> None:
+def test_the_exact_motion_of_a_scene_is_found(name: str, tmp_path: Path) -> None:
     found = matching(Body(scene_of(content(name, tmp_path))))
     assert found is not None
     assert found.name == name
@@ -139,7 +141,7 @@ def test_a_violated_assumption_is_named(
         exact_motion(name, body)
 
 
-def test_a_mixture_of_densities_does_not_fall_alike() -> None:
+def test_sheets_of_different_densities_are_refused() -> None:
     two = [SHEET | {"name": "a"}, SHEET | {"name": "b", "transform": {"translate": [0, 0, 1]}}]
     materials = [CLOTH, CLOTH | {"density": 0.4, "group": "b"}]
     body = Body(scene_of({"mesh": two, "material": materials, "gravity": DOWN, "wind": AIR}))
@@ -147,7 +149,7 @@ def test_a_mixture_of_densities_does_not_fall_alike() -> None:
         exact_motion("terminal-fall", body)
 
 
-def test_an_unknown_name_is_told_the_nearest() -> None:
+def test_an_unknown_name_is_refused_with_the_nearest() -> None:
     body = Body(scene_of({"mesh": SHEET}))
     with pytest.raises(InputError, match="did you mean 'free-fall'"):
         exact_motion("freefall", body)

@@ -1,4 +1,4 @@
-"""Textile tests: the numbers of materials that are known, shadows that are, and what is refused."""
+"""Textile tests: known constants of materials, shadows of known area, and refusals."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ FABRIC = Fabric(
 
 @pytest.fixture(autouse=True)
 def fewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cells and load steps that suffice to read the numbers of materials that are known."""
+    """Coarse meshes and few load steps, which suffice for known constants."""
     fewer = {"CELLS": 30, "PULLS": 12, "SHEARED": 6.0, "SHEARS": 12, "TURNS": 5}
     for name, value in fewer.items():
         monkeypatch.setattr(textile_tests, name, value)
 
 
 @pytest.mark.parallel
-def test_the_cantilever_gives_b_back(comm: MPI.Comm) -> None:
+def test_the_cantilever_reproduces_b(comm: MPI.Comm) -> None:
     bias = Fabric("fabric", FABRIC.block | {"warp_degrees": 30.0})  # where it lies in the scene
     with Bench(comm) as bench:
         record = textile_tests.cantilever(bench, bias, 90.0)
@@ -49,7 +49,7 @@ def test_the_cantilever_gives_b_back(comm: MPI.Comm) -> None:
     assert found["overhang"] == pytest.approx(2.0 * found["bending length c"])
 
 
-def test_bending_reads_b_and_the_loop() -> None:
+def test_bending_reproduces_b_and_2hb() -> None:
     rubbing = Fabric("fabric", FABRIC.block | {"friction_moment": [3e-4, 1e-4]})
     with Bench(MPI.COMM_SELF) as bench:
         record = textile_tests.bending(bench, rubbing, 0.0)
@@ -59,7 +59,7 @@ def test_bending_reads_b_and_the_loop() -> None:
     assert record.numbers[1].value == pytest.approx(6e-4 / 9.80665e-3, rel=0.01)
 
 
-def test_shear_and_tension() -> None:
+def test_shear_and_tension_reproduce_their_constants() -> None:
     rubbing = Fabric("fabric", FABRIC.block | {"friction_force": 0.7})
     with Bench(MPI.COMM_SELF) as bench:
         sheared, pulled = textile_tests.shear(bench, rubbing, 0.0), textile_tests.tensile(bench, FABRIC, 90.0)
@@ -72,8 +72,8 @@ def test_shear_and_tension() -> None:
     assert 800.0 * (1.0 + emt) * 0.5 * ((1.0 + emt) ** 2 - 1.0) == pytest.approx(490.3, rel=0.02)
 
 
-def test_tension_gives_a_curve_back() -> None:
-    """Also one that softens beyond what its slope at rest would let expect, and that of the weft alone."""
+def test_tension_reproduces_a_curve() -> None:
+    """Also one that softens below the slope at rest, and that of the weft only."""
     curve = [[e, 600.0 * (1.0 - np.exp(-e / 0.02))] for e in (0.001, 0.004, 0.01, 0.03, 0.08, 0.2, 0.5)]
     law = {"warp": [[0.1, 50.0]], "weft": curve, "shear": [[0.1, 5.0]]}
     soft = Fabric("soft", {"density": 0.2, "bending": 1e-5, "bending_model": "midedge", "law": law})
@@ -87,7 +87,7 @@ def test_tension_gives_a_curve_back() -> None:
 
 
 def test_shorter_steps_do_not_shift_the_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where steps fail and are taken again."""
+    """As if steps failed and were repeated."""
     with Bench(MPI.COMM_SELF) as bench:
         exact = textile_tests.tensile(bench, FABRIC, 0.0)
         steps, path = bench.steps, textile_tests._path
@@ -110,7 +110,7 @@ def test_a_stiff_membrane_does_not_lock(test: str) -> None:
     assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
 
 
-def test_a_loop_without_weight_and_one_that_hangs() -> None:
+def test_heart_loops_with_and_without_weight() -> None:
     assert textile_tests.loop_height(100.0, 1.0) == pytest.approx(0.13386, abs=1e-4)
     # Peirce's formula is an approximation
     assert textile_tests.loop_length(textile_tests.loop_height(1.0, 6.0), 6.0) == pytest.approx(1.0, rel=0.05)
@@ -121,7 +121,7 @@ def test_a_loop_without_weight_and_one_that_hangs() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 6])
-def test_folds_and_coefficient_of_a_shadow_that_is_known(count: int) -> None:
+def test_folds_and_drape_coefficient_of_a_known_shadow(count: int) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     rim = 0.12 * (1.0 + 0.08 * np.cos(count * angle))
     vertices, faces = disc_mesh(angle)
@@ -134,7 +134,7 @@ def test_folds_and_coefficient_of_a_shadow_that_is_known(count: int) -> None:
     assert count_folds(shadow(*disc_mesh(angle), 240)) == 0
 
 
-def test_a_record_outlives_its_process(tmp_path: Path) -> None:
+def test_a_record_is_read_from_its_file(tmp_path: Path) -> None:
     case = FabricCase("loop-warp", "title", "loop", 0.0)
     with Bench(MPI.COMM_SELF) as bench:
         outcome = outcome_of(case, textile_tests.tensile(bench, FABRIC, 0.0))
@@ -147,7 +147,7 @@ def test_a_record_outlives_its_process(tmp_path: Path) -> None:
     assert found.verdicts == outcome.verdicts
 
 
-def test_all_are_the_tests() -> None:
+def test_all_selects_every_test() -> None:
     assert {case.test for case in cases_of("all")} == set(TESTS)
 
 
@@ -159,7 +159,7 @@ def test_all_are_the_tests() -> None:
         ("gray-interlock", ("time.end=1",), "changes a scene"),
     ],
 )
-def test_what_is_no_material_is_refused(material: str, settings: Any, words: str) -> None:
+def test_invalid_materials_are_refused(material: str, settings: Any, words: str) -> None:
     with pytest.raises(InputError) as caught:
         fabric_of(material, settings)
     assert words in str(caught.value)

@@ -1,4 +1,4 @@
-"""Fits of small scenes: numbers and intervals, readings, resumption, ranks, what is refused."""
+"""Fits of small scenes: parameters and intervals, measured quantities, resumption, ranks, refusals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def strip(*measurements: dict[str, Any], parameters: Any = BENDING, **more: Any)
 
 
 def hanging() -> tuple[np.ndarray, float, np.ndarray]:
-    """Of the true strip: tip, angle, force of the clamp."""
+    """Tip, angle and force of the clamp of the true strip."""
     tip = lyra_petsc.gradient(STRIP, "tip", ["material.bending"])
     angle = lyra_petsc.gradient(STRIP, {"overhang": {"edge": "edge", "tip": "tip"}}, ["material.bending"])
     force = lyra_petsc.gradient(STRIP, {"force": 0}, ["material.bending", "material.density"])
@@ -61,7 +61,7 @@ def test_values_and_gradients() -> None:
 
 
 @pytest.mark.parametrize("kind", ["probe", "overhang", "points"])
-def test_finds_the_stiffness(kind: str, tmp_path: Path) -> None:
+def test_a_fit_finds_the_stiffness(kind: str, tmp_path: Path) -> None:
     tip, angle, _ = hanging()
     table = tmp_path / "points.csv"
     table.write_text(f"probe,x,z,uncertainty\ntip,{tip[0]!r},{tip[2]!r},1e-4\n".replace("np.float64", ""))
@@ -94,7 +94,7 @@ def test_drape_is_the_area_of_the_shadow() -> None:
 
 @pytest.mark.parametrize("kind", ["brgn", "blmvm"])
 def test_search_and_conclusion(kind: str) -> None:
-    """A linear problem: the answer, its deviations and its correlation are those of the normal equations."""
+    """A linear problem: solution, deviations and correlation are those of the normal equations."""
     from petsc4py import PETSc
 
     rng = np.random.default_rng(3)
@@ -112,8 +112,8 @@ def test_search_and_conclusion(kind: str) -> None:
     assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / deviation[0] / deviation[1])
 
 
-def test_a_search_ends_beside_a_jump() -> None:
-    """A sheet that buckles to the other side has no least cost where TAO looks for it."""
+def test_a_search_ends_at_a_jump() -> None:
+    """The cost jumps where a sheet buckles to the other side, and TAO finds no minimum."""
     rng = np.random.default_rng(5)
     matrix, right = rng.standard_normal((40, 2)), rng.standard_normal(40)
     best = np.linalg.lstsq(matrix, right, rcond=None)[0]
@@ -131,7 +131,7 @@ def test_a_search_ends_beside_a_jump() -> None:
     assert len(made) < 40
 
 
-def test_bound_and_what_is_not_told() -> None:
+def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
     matrix = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
     right = np.array([1.0, 2.0, 5.0, 10.0])
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
@@ -144,7 +144,7 @@ def test_bound_and_what_is_not_told() -> None:
     assert "c is at its bound 2" in told
 
 
-def test_goes_on_without_repeating(tmp_path: Path) -> None:
+def test_a_fit_resumes_without_repeating(tmp_path: Path) -> None:
     scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
 
     class Stops(Observer):
@@ -215,7 +215,7 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"table": "vertex,x,uncertainty\n" + 100_001 * "1,0,1\n"}, "at most 100000"),
     ],
 )
-def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_invalid_fits_are_refused(change: dict[str, Any], words: str, tmp_path: Path) -> None:
     good = {"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}
     content = strip(good)
     if "fit" in change:
@@ -254,13 +254,13 @@ def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
         (STRIP, "tip", [*BENDING_KEY, "material[0].bending"], "is the number material.bending"),
     ],
 )
-def test_gradient_refuses(scene: Any, quantity: Any, parameters: Any, words: str) -> None:
+def test_invalid_gradients_are_refused(scene: Any, quantity: Any, parameters: Any, words: str) -> None:
     with pytest.raises(InputError, match=re.escape(words)):
         lyra_petsc.gradient(scene, quantity, parameters)
 
 
 def test_gradient_of_a_table_of_points(tmp_path: Path) -> None:
-    """At all its times; a table without values measured has no uncertainty."""
+    """At all its times; tables without measured values have no uncertainty."""
     (tmp_path / "points.csv").write_text("time,probe,z\n0.5,tip,0\n1,tip,0\n")
     found = lyra_petsc.gradient(STRIP, {"points": str(tmp_path / "points.csv")}, BENDING_KEY)
     once = lyra_petsc.gradient(STRIP, {"probe": "tip", "axes": ["z"]}, BENDING_KEY)
@@ -278,7 +278,7 @@ def test_values_are_in_the_order_of_their_axes() -> None:
 
 
 def test_each_simulation_has_its_own_rows() -> None:
-    """Another partition may come at the address that the last one had."""
+    """A new partition may have the memory address of an earlier one."""
     rng = np.random.default_rng(1)
     tip = Positions("", "tip", 1.0, ("z", "x"), "m", wanted=[("tip", (2,)), (7, (0,))])
     for _ in range(20):
@@ -303,7 +303,7 @@ def test_any_number_of_ranks() -> None:
 
 @pytest.mark.slow
 def test_contact_by_differences() -> None:
-    """With contact derivatives are differences of whole runs."""
+    """With contact, derivatives are differences of whole runs."""
     content = STRIP | {
         "contact": {"gap": 2e-3, "self": False},
         "obstacles": {"floor": {"plane": {"point": [0, 0, -0.02], "normal": [0, 0, 1]}}},
@@ -333,8 +333,8 @@ def test_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth() -> None:
-    """As scripts/fit_coverage.py says of 100 seeds; of 6, two misses of a number would be one in 30."""
+def test_intervals_contain_the_true_values() -> None:
+    """As in scripts/fit_coverage.py, with 6 instead of 100 seeds: two misses have probability 1/30."""
     import importlib.util
 
     path = Path(__file__).resolve().parents[3] / "scripts" / "fit_coverage.py"

@@ -1,4 +1,4 @@
-"""The balances of real steps, and that a broken kernel or an unsolved step shows in them."""
+"""Balances of real steps, which show broken kernels and unsolved steps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CELLS = 8
 
 
 def run(comm: MPI.Comm, *, steps: int = 4, **changes: Any) -> StressOutcome:
-    """A small hanging sheet in a breeze, or what ``changes`` make of it."""
+    """A small hanging sheet in a breeze, with ``changes``."""
     content = set_wind(hanging_sheet(CELLS), 3.0) | changes
     case = StressCase("try", "a try", base_scene, steps=steps)
     return run_case(comm, case, Setting(content, False, Scope.QUICK))
@@ -71,7 +71,7 @@ def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
+def test_the_balance_agrees_with_the_ledger(comm: MPI.Comm) -> None:
     record = run(comm, **handled(0.02)).record
     found = np.cumsum([balance.change for balance in record.balances])
     np.testing.assert_allclose(found, np.subtract(record.energies, record.start_energy), rtol=1e-9)
@@ -86,7 +86,7 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
 
 
 def test_a_balance_does_not_miss_a_narrow_barrier(comm: MPI.Comm) -> None:
-    """Of steps thousands of gaps long."""
+    """In steps of thousands of gaps."""
     [case] = selected(["contact-gap-1e-5-10ms"], Scope.USUAL)
     outcome = run_case(comm, replace(case, steps=9), Setting(hanging_sheet(10), False, Scope.QUICK))
     assert any(balance.jumped for balance in outcome.record.balances)
@@ -112,7 +112,7 @@ def test_every_balance_holds_where_triangles_collapse(
 
 
 def broken(term: type, factor: float) -> Callable[[Any, Array, Any, Array], None]:
-    """A gradient that is not quite that of the energy."""
+    """A gradient that is not exactly that of the energy."""
     real = term.add_gradient
 
     def add_gradient(self: Any, x: Array, frozen: Any, out: Array) -> None:
@@ -124,7 +124,7 @@ def broken(term: type, factor: float) -> Callable[[Any, Array, Any, Array], None
 
 
 @pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])
-def test_forces_that_are_no_gradient_break_the_identity(
+def test_forces_that_are_not_a_gradient_violate_the_identity(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, term: type, factor: float
 ) -> None:
     monkeypatch.setattr(term, "add_gradient", broken(term, factor))
@@ -133,7 +133,7 @@ def test_forces_that_are_no_gradient_break_the_identity(
 
 
 def add_a_net_force(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the membrane's forces not add up to zero."""
+    """Make the sum of the membrane's forces nonzero."""
     real = Membrane.add_gradient
 
     def add_gradient(self: Membrane, x: Array, frozen: Any, out: Array) -> None:
@@ -143,14 +143,12 @@ def add_a_net_force(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
 
 
-def test_forces_that_do_not_add_up_break_the_momentum(
-    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_forces_that_do_not_balance_violate_momentum(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     add_a_net_force(monkeypatch)
     assert "momentum" in run(comm).failures
 
 
-def test_a_torque_from_within_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_torques_are_noticed(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     real = Membrane.add_gradient
 
     def add_gradient(self: Membrane, x: Array, frozen: Any, out: Array) -> None:
@@ -163,11 +161,11 @@ def test_a_torque_from_within_is_seen(comm: MPI.Comm, monkeypatch: pytest.Monkey
     assert "angular" in failures["momentum"].message
 
 
-def test_a_step_that_was_not_solved_is_seen(comm: MPI.Comm) -> None:
+def test_unsolved_steps_are_noticed(comm: MPI.Comm) -> None:
     assert "equations" in run(comm, petsc={"snes_rtol": 0.1}).failures
 
 
-def test_negative_damping_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_damping_is_noticed(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     real = Membrane.__init__
 
     def init(self: Membrane, elements: Any, *more: Any) -> None:
@@ -200,7 +198,7 @@ def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: st
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
 def test_stages_with_directors_are_balanced(comm: MPI.Comm, integrator: str) -> None:
-    """Clamped, damped and turning fast: forces are in balance in the frames of the step."""
+    """Clamped, damped and rotating fast, with the frames of the step."""
     turn = [{"time": 0.0}, {"time": 0.04, "rotate": {"axis": [1, 0, 0], "degrees": 120}}]
     handles = [{"group": "bottom", "clamp": True, "motion": "turn"}]
     content = use_directors(set_wind(hanging_sheet(CELLS), 3.0)) | {
@@ -213,26 +211,26 @@ def test_stages_with_directors_are_balanced(comm: MPI.Comm, integrator: str) -> 
 
 
 @pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])
-def test_a_broken_kernel_shows_in_other_integrators(
+def test_broken_kernels_are_noticed_with_other_integrators(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, term: type, factor: float
 ) -> None:
     monkeypatch.setattr(term, "add_gradient", broken(term, factor))
     assert "energy" in stepped_by(comm, "bdf2", initial={"noise": 0.01}).failures
 
 
-def test_an_unbalanced_force_shows_in_other_integrators(
+def test_unbalanced_forces_are_noticed_with_other_integrators(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add_a_net_force(monkeypatch)
     assert "momentum" in stepped_by(comm, "midpoint").failures
 
 
-def test_the_semi_implicit_method_promises_no_balance(comm: MPI.Comm) -> None:
+def test_semi_implicit_steps_have_no_balance(comm: MPI.Comm) -> None:
     outcome = stepped_by(comm, "semi-implicit")
     assert outcome.passed
     assert outcome.record.balances == []
     assert set(outcome.verdicts) == {"converged", "softening", "whole run"}
 
 
-def test_an_empty_record_is_no_success() -> None:
+def test_an_empty_record_fails() -> None:
     assert not StressOutcome(StressCase("a", "b", base_scene), record=RunRecord(1, 1.0, 1.0)).passed

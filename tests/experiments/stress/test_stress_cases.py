@@ -1,4 +1,4 @@
-"""The cases: what they make of a scene, and the answers they know."""
+"""Cases of ``stress``: the scenes that they make, and their known answers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def test_names_are_unique_and_speak_for_themselves() -> None:
+def test_names_are_unique_and_cases_have_titles() -> None:
     found = FAMILIES.all()
     assert [family.name for family in found] == list(FAMILIES.modules)
     names = [case.name for family in found for case in family.cases]
@@ -55,7 +55,7 @@ def test_names_are_unique_and_speak_for_themselves() -> None:
     assert all(family.title and all(case.title for case in family.cases) for family in found)
 
 
-def test_levels_include_each_other_and_every_family_is_in_the_usual_one() -> None:
+def test_levels_are_nested_and_the_usual_one_has_every_family() -> None:
     quick, usual, full = (
         [case.name for case in selected([], level)] for level in (Scope.QUICK, Scope.USUAL, Scope.FULL)
     )
@@ -101,7 +101,7 @@ def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None
     assert bool(left_out) is given
 
 
-def test_a_given_scene_keeps_what_it_is_made_of(scene: Path) -> None:
+def test_a_given_scene_keeps_its_materials_and_mesh(scene: Path) -> None:
     setting = setting_of(scene, ("gravity=[0, 0, -1]",), Scope.QUICK)
     assert setting.base["gravity"] == [0, 0, -1]
     assert setting.step == 0.005
@@ -126,7 +126,7 @@ def test_anisotropy_of_a_library_cloth(scene: Path) -> None:
     assert anisotropic(setting.content(), 1e4)["material"][1]["group"] == "sheet"
 
 
-def test_wind_has_its_speed_and_keeps_the_scenes_air() -> None:
+def test_wind_has_the_speed_of_the_case_and_the_air_of_the_scene() -> None:
     content = set_wind(
         hanging_sheet(4) | {"wind": {"velocity": [1, 0, 0], "density": 0.5, "drag": 0.1}}, 50.0
     )["wind"]
@@ -134,7 +134,7 @@ def test_wind_has_its_speed_and_keeps_the_scenes_air() -> None:
     assert (content["density"], content["drag"]) == (0.5, 0.1)
 
 
-def test_handles_move_for_ever_and_a_sheet_without_cannot() -> None:
+def test_handles_move_to_the_end_and_a_sheet_without_handles_is_refused() -> None:
     content = hanging_sheet(4)
     content["handles"][0] |= {"until": 1.0, "fade": 0.1}
     moved_handle = move_handles(content, [{"time": 0.0}])["handles"][0]
@@ -166,19 +166,19 @@ def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
     assert np.median(rows) == pytest.approx(0.025, rel=1e-3)
 
 
-def test_a_folded_sheet_lies_on_itself_with_its_crease_on_vertices() -> None:
+def test_a_folded_sheet_has_its_crease_on_vertices() -> None:
     y = sheets._folded(flat(), 0.025).reshape(41, 41, 3)
     np.testing.assert_allclose(y[:, 20, 0], 0.5)
     np.testing.assert_allclose(y[:, :20], y[:, :20:-1], atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(np.diff(y, axis=1), axis=2), 0.025)
 
 
-def test_a_fold_spares_an_odd_number_of_cells() -> None:
+def test_a_fold_with_an_odd_number_of_cells() -> None:
     y = sheets._folded(flat(15), 1 / 15).reshape(16, 16, 3)
     assert np.linalg.norm(np.diff(y, axis=1), axis=2).min() == pytest.approx(1 / 15)
 
 
-def test_noise_has_its_size_and_is_always_the_same() -> None:
+def test_noise_has_the_given_size_and_is_reproducible() -> None:
     x = flat()
     shift = sheets._noisy(x, 0.025) - x
     assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
@@ -193,11 +193,11 @@ def test_a_mirrored_shell_keeps_its_rim() -> None:
 # -- known answers -------------------------------------------------------------------------------------
 
 
-def test_the_rigid_plates_time() -> None:
+def test_time_of_the_rigid_plate() -> None:
     assert pytest.approx(0.4836, abs=5e-5) == limits.FALL_TIME
 
 
-def test_the_first_vertical_is_interpolated() -> None:
+def test_the_time_of_the_first_vertical_is_interpolated() -> None:
     angle = np.array([0.0, 0.4, 1.2, 1.7, 2.0])
     centres = [(math.cos(a), -math.sin(a)) for a in angle]
     found = limits.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], centres)
@@ -205,7 +205,7 @@ def test_the_first_vertical_is_interpolated() -> None:
     assert math.isnan(limits.first_vertical([0.0, 0.1, 0.2], centres[:3]))
 
 
-def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
+def test_a_step_of_the_chain_projects_free_motion_onto_rigid_links() -> None:
     angle = np.linspace(0.0, 0.9, 6)
     x = np.column_stack([np.cumsum(np.cos(angle)), np.cumsum(np.sin(angle))])
     v = np.zeros_like(x)
@@ -228,7 +228,7 @@ def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
     assert left.sum() < 1e-24
 
 
-def test_the_base_sheet_is_of_the_size_that_is_promised() -> None:
+def test_the_base_sheet_has_the_documented_size() -> None:
     grid = Scene.model_validate(setting_of(None, (), Scope.USUAL).base).mesh[0].grid
     assert grid is not None
     assert (grid.nx + 1) * (grid.ny + 1) == 1681

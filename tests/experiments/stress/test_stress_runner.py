@@ -1,4 +1,4 @@
-"""Cases run on any number of ranks, and end in a record whatever happens."""
+"""Cases run on any number of ranks, and always end with a record."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
 
 
 @pytest.mark.parallel(2)
-def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
+def test_the_start_shape_is_used(comm: MPI.Comm) -> None:
     case = StressCase(
         "a", "b", base_scene, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x
     )
@@ -70,7 +70,7 @@ def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
+def test_a_failed_simulation_is_a_verdict(comm: MPI.Comm) -> None:
     content = hanging_sheet(6) | {"petsc": {"snes_max_it": 0}}
     outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert not outcome.passed
@@ -82,7 +82,7 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
+def test_a_residual_as_large_as_the_weight_fails(comm: MPI.Comm) -> None:
     content = hanging_sheet(6) | {"petsc": {"snes_atol": 1e9}}
     outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
     assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].message
@@ -90,7 +90,7 @@ def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) 
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("scale", [1e9, 1e16])
-def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
+def test_a_sheet_that_round_off_keeps_from_falling_fails(comm: MPI.Comm, scale: float) -> None:
     content = hanging_sheet(6)
     content["material"]["stretching_scale"] = scale
     outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
@@ -99,7 +99,7 @@ def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
+def test_an_impossible_case_does_not_end_the_others(comm: MPI.Comm) -> None:
     content = hanging_sheet(6)
     content["handles"] = [{"group": "nowhere"}]
     outcome = run_case(comm, StressCase("a", "b", base_scene), Setting(content, False, Scope.QUICK))
@@ -107,7 +107,7 @@ def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None
 
 
 @pytest.mark.parallel(2)
-def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_ends_at_its_time_limit(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(stress_runner.TIME_LIMIT, Scope.QUICK, 0.0)
     outcome = run_case(comm, StressCase("a", "b", base_scene), SMALL)
     assert "has had its time" in outcome.failures["converged"].message
@@ -122,7 +122,7 @@ def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> Non
 
 
 @pytest.mark.parallel(2)
-def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
+def test_times_are_relative_to_the_base_scene(comm: MPI.Comm) -> None:
     clock = BaseClock(comm, SMALL)
     assert np.all(clock.latest > 0.0)
     assert clock.size == pytest.approx(np.sqrt(2.0))
@@ -132,7 +132,7 @@ def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
     assert 0.0 < outcome.cpu_ratio < 1e3
 
 
-def test_an_outcome_goes_through_files(comm: MPI.Comm, tmp_path: Path) -> None:
+def test_an_outcome_is_read_from_its_file(comm: MPI.Comm, tmp_path: Path) -> None:
     outcome = run(comm, "pressed")
     save_record(tmp_path / OUTCOME_FILE, outcome.saved())
     back = StressOutcome(outcome.case, **vars(load_record(tmp_path / OUTCOME_FILE, SavedOutcome)))

@@ -1,4 +1,4 @@
-"""The verdicts on fabricated records: good ones pass, and each kind of bad one fails for its own reason."""
+"""Verdicts on constructed records: good ones pass, each kind of bad one fails for its own reason."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOTE = "step 1: triangle 3 …; below 0.577 the St. Venant-Kirchhoff model softe
 
 
 def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: object) -> RunRecord:
-    """Three steps, the middle one as given."""
+    """Three steps, of which the middle one is given."""
     good = RunRecord(3, 0.01, 0.03, 1.0, [STEP, report, STEP], [GOOD, balance, GOOD])
     return replace(good, **more)  # type: ignore[arg-type]
 
@@ -63,7 +63,7 @@ def test_a_good_record_passes() -> None:
         ({"angular": math.nan}, "momentum"),
     ],
 )
-def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: str) -> None:
+def test_each_violated_balance_fails_its_verdict(change: dict[str, float], name: str) -> None:
     broken = failures(record(replace(GOOD, **change)))  # type: ignore[arg-type]
     assert name in broken
     assert set(broken) <= {name, "no gain", "resolved" if name == "equations" else name}
@@ -72,7 +72,7 @@ def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: s
 
 
 @pytest.mark.parametrize(("left", "good"), [(0.9e-4, True), (1.1e-4, False), (math.nan, False)])
-def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(left: float, good: bool) -> None:
+def test_large_residuals_at_round_off_are_allowed_if_they_move_nothing(left: float, good: bool) -> None:
     stiff = replace(GOOD, residual=1e-6, driving=1e-6, promised=1e-9, floor=2e-6)
     found = failures(record(stiff, replace(STEP, remaining=left)))
     assert ("resolved" in found) is not good
@@ -84,7 +84,7 @@ def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
     assert "buckling" in judge_physics(record(buckling))["no gain"].message
 
 
-def test_round_off_as_the_promise_is_said() -> None:
+def test_a_residual_at_round_off_is_reported_as_such() -> None:
     words = judge_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].message
     assert "floor of round-off" in words
 
@@ -94,14 +94,14 @@ def test_a_run_that_stopped_has_not_converged() -> None:
     assert "converged" in failures(RunRecord(3, 0.01, 0.03))
 
 
-def test_rejected_steps_are_told_and_allowed() -> None:
+def test_rejected_steps_are_allowed_and_reported() -> None:
     verdict = judge_physics(record(report=replace(STEP, rejected=2, dt=0.0025)))["converged"]
     assert verdict.passed
     assert "2 attempts rejected" in verdict.message
     assert "0.0025 s" in verdict.message
 
 
-def test_softening_must_be_told() -> None:
+def test_softening_must_be_noted() -> None:
     pressed = replace(STEP, smallest_stretch=0.57)
     assert "NOTHING" in failures(record(report=pressed))["softening"]
     assert failures(record(report=pressed, notes=[NOTE])) == {}
@@ -125,7 +125,7 @@ def test_speed_is_judged_by_iterations_and_time(
     assert judge_speed(record(reports=reports), wall_ratio, cpu_ratio).passed is good
 
 
-def test_what_stopped_is_not_fast() -> None:
+def test_a_stopped_run_has_no_speed() -> None:
     assert not judge_speed(record(stop_reason="at once"), 1.0, 1.0).passed
 
 

@@ -1,4 +1,4 @@
-"""Orders, Pareto front and advice on made-up rows: all computed from the data, nothing beyond them."""
+"""Orders, Pareto front and recommendations from constructed rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AXES = [
 
 
 def made_up(own_errors: float = 0.0) -> list[StudyRow]:
-    """Backward Euler errs by Δt, in 1 s/(100 Δt); BDF2 by 25 Δt², half as fast."""
+    """Rows: backward Euler with error Δt in 1 s/(100 Δt), BDF2 with 25 Δt² in twice the time."""
     rows = []
     for combination in make_combinations(AXES):
         integrator, dt = combination.values
@@ -58,7 +58,7 @@ def test_orders_between_neighbours_and_fitted() -> None:
     assert rows[5].orders["dt", "position_max"] == pytest.approx(2.0)
 
 
-def test_orders_are_those_of_the_steps_really_taken() -> None:
+def test_orders_use_the_mean_length_of_the_steps_taken() -> None:
     rows = made_up()
     for row in rows:  # as if all steps had been cut to half
         row.result.steps *= 2 if row.case.settings["dt"] == 0.04 else 1
@@ -73,14 +73,14 @@ def test_median_and_spread() -> None:
     assert row.total_time == pytest.approx(0.75)
 
 
-def test_the_front() -> None:
+def test_the_pareto_front() -> None:
     rows = made_up()
     mark_front(rows, "position_max")
     # beuler 0.04 in .25 s, 0.02 in .5, 0.01 in 1.; bdf2 0.04 in .5, 0.01 in 1., 0.0025 in 2.
     assert [row.on_front for row in rows] == [True, True, True, False, True, True]
 
 
-def test_advice_names_the_fastest_and_the_others() -> None:
+def test_the_recommendation_names_the_fastest_and_the_others() -> None:
     rows = made_up()
     advice = advise(rows, "position_max", AXES[1])
     assert [one.target for one in advice] == [0.1, 0.01, 0.001]
@@ -98,7 +98,7 @@ def test_advice_names_the_fastest_and_the_others() -> None:
     assert star.recommended
 
 
-def test_no_setting_is_starred_where_none_keeps_1_percent() -> None:
+def test_no_star_if_no_setting_reaches_1_percent() -> None:
     rows = made_up()
     for row in rows:
         row.errors["position_max"] *= 10.0
@@ -108,7 +108,7 @@ def test_no_setting_is_starred_where_none_keeps_1_percent() -> None:
     assert not any(row.recommended for row in rows)
 
 
-def test_advice_goes_as_far_as_the_errors_and_no_further() -> None:
+def test_no_recommendation_beyond_the_smallest_error() -> None:
     rows = made_up()
     for row in rows:
         row.errors["position_max"] *= 1e-3
@@ -116,7 +116,7 @@ def test_advice_goes_as_far_as_the_errors_and_no_further() -> None:
     assert targets == pytest.approx([1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
 
 
-def test_what_others_could_not_reach_is_said() -> None:
+def test_targets_that_integrators_did_not_reach_are_named() -> None:
     rows = made_up()
     words = advise(rows, "position_max")[1].text
     assert "did not reach it" not in words
@@ -126,7 +126,7 @@ def test_what_others_could_not_reach_is_said() -> None:
     assert "beuler did not reach it (Δt 10 ms: error 1.2 %, 1 s)" in words
 
 
-def test_an_error_below_the_references_own_is_no_number() -> None:
+def test_errors_below_that_of_the_reference_are_not_resolved() -> None:
     rows = made_up(own_errors=1.5e-3)
     assert rows[5].unresolved == {"position_max"}  # 0.0025 < 2 · 0.0015
     assert math.isnan(rows[5].resolved("position_max"))
@@ -141,14 +141,14 @@ def test_an_error_below_the_references_own_is_no_number() -> None:
     assert "choose bdf2, Δt 10 ms: 2 s (error below 0.45 %)" in words
 
 
-def test_the_references_own_error_counts_against_a_target() -> None:
+def test_the_error_of_the_reference_is_added_to_a_setting() -> None:
     rows = made_up(own_errors=2e-4)
     assert rows[4].errors["position_max"] == pytest.approx(0.01)
     winner = advise(rows, "position_max")[1].row
     assert winner is rows[5]  # 0.01 ± 0.0002 is not surely within 1 %
 
 
-def test_the_largest_error_is_told_beside_the_mean() -> None:
+def test_the_largest_error_is_reported_with_the_mean() -> None:
     rows = made_up()
     for row in rows:
         row.errors["position_l2"] = row.errors["position_max"] / 4.0
@@ -164,7 +164,7 @@ def test_the_largest_error_is_told_beside_the_mean() -> None:
     assert "at most 9 % anywhere" in advise(rows, "position_l2")[1].text
 
 
-def test_failed_rows_are_left_out() -> None:
+def test_failed_rows_are_omitted() -> None:
     rows = made_up()
     for row in rows[:3]:
         row.result.problem, row.result.timings, row.errors = "no", [], {}
@@ -183,7 +183,7 @@ def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None
     assert found.trusted
 
 
-def test_richardson_trusts_no_higher_order_than_expected_and_no_divergence() -> None:
+def test_richardson_limits_the_order_and_refuses_divergence() -> None:
     fast = richardson(1.0, 16.0, 2.0, 2)
     assert fast.error == pytest.approx(16.0 / 4.0 / 3.0)  # what the coarser pair says
     slow = richardson(1.0, 2.0, 2.0, 2)
@@ -202,8 +202,8 @@ def test_errors_in_time_and_space_add_up() -> None:
     assert two["a"].error == 0.2
 
 
-def test_a_largest_error_that_wanders_is_not_understated() -> None:
-    """Two places take turns: between the coarser pair one leads, between the finer the other."""
+def test_a_largest_error_that_changes_place_is_not_underestimated() -> None:
+    """One vertex has the largest difference of the coarser runs, another that of the finer runs."""
     first, second = np.array([0.75, 0.45]), np.array([6.0, 1.2])  # at two samples
     chain = Chain((), 2)
     found = estimate_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error

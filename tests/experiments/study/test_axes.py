@@ -1,4 +1,4 @@
-"""What ``--vary`` and ``--quantities`` mean, and what they refuse."""
+"""``--vary`` and ``--quantities``: meaning and refusals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lyra_petsc.experiments.study.plan import (
 MANY = ",".join(str(k + 1) for k in range(101))
 
 
-def test_short_names_options_and_paths() -> None:
+def test_short_names_options_and_paths_of_keys() -> None:
     axes = parse_axes(
         ["dt=0.02,1e-2", "integrator=beuler,bdf2", "ksp_rtol=1e-3", "solver.force_tolerance=1e-4", "mesh=0.1"]
     )
@@ -33,7 +33,7 @@ def test_short_names_options_and_paths() -> None:
     assert not any(axis.physical for axis in axes)
 
 
-def test_what_makes_another_scene_is_physical() -> None:
+def test_keys_that_change_the_physics() -> None:
     axes = parse_axes(["material.bending=1e-5,1e-4", "gravity=[0,0,-9.81],[0,0,-1.62]", "pc_type=lu,gamg"])
     assert [axis.physical for axis in axes] == [True, True, False]
     assert axes[1].values == ("[0,0,-9.81]", "[0,0,-1.62]")
@@ -63,19 +63,19 @@ def test_what_makes_another_scene_is_physical() -> None:
         (["dt=" + MANY, "mesh=" + MANY], "more than 10000 combinations"),
     ],
 )  # fmt: skip
-def test_refusals(texts: list[str], words: str) -> None:
+def test_invalid_axes_are_refused(texts: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_axes(texts)
 
 
-def test_all_combinations_with_the_last_axis_fastest() -> None:
+def test_combinations_vary_the_last_axis_fastest() -> None:
     found = make_combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
     assert [c.name for c in found] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
     assert found[3].title == "bdf2, Δt 10 ms"
     assert found[3].settings == {"integrator": "bdf2", "dt": 0.01}
 
 
-def test_names_are_file_names_and_never_the_same() -> None:
+def test_names_are_unique_file_names() -> None:
     texts = ["gravity=[0,0,-9.81],[0 0 -9.81]", "dt=0.0166666666,0.0166666667", "pc_type=lu,gamg"]
     names = [c.name for c in make_combinations(parse_axes(texts))]
     assert len(set(names)) == 8
@@ -83,7 +83,7 @@ def test_names_are_file_names_and_never_the_same() -> None:
     assert names[0].startswith("gravity-_0_0_-9.81_-dt0.0166666666-pc_type-lu")
 
 
-def test_settings_in_words() -> None:
+def test_settings_as_text() -> None:
     assert describe_setting("mesh", 0.05) == "h 0.05 m"
     assert describe_setting("ksp_rtol", 1e-4) == "ksp_rtol 1e-4"
     assert describe_setting("pc_type", "gamg") == "pc_type gamg"
@@ -108,11 +108,11 @@ def test_quantities() -> None:
         ("tpi", "did you mean 'tip'"),
     ],
 )
-def test_unknown_quantities(text: str, words: str) -> None:
+def test_unknown_quantities_are_refused(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_quantities(text, ["tip"])
 
 
-def test_probes_of_a_scene_without() -> None:
+def test_probes_of_a_scene_without_probes_are_refused() -> None:
     with pytest.raises(InputError, match="the scene has no probes"):
         parse_quantities("probes", [])

@@ -1,4 +1,4 @@
-"""Runs compared slab by slab, on one mesh and across meshes, on any number of ranks."""
+"""Comparison of runs on one mesh and across meshes, in slabs, on any number of ranks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def mesh_of(*sources: object) -> Mesh:
 def write_run(
     folder: Path, mesh: Mesh, states: list[Array], energies: list[list[float]], tip: list[Array]
 ) -> None:
-    """The files of a run as far as a comparison reads them."""
+    """Write the files of a run that a comparison reads."""
     folder.mkdir()
     with h5py.File(folder / "mesh.h5", "w") as file:
         file["mesh/rest"], file["mesh/triangles"] = mesh.rest, mesh.triangles
@@ -66,7 +66,7 @@ TIP = [np.zeros(3), np.array([0.0, 0.0, -0.1]), np.array([0.0, 0.0, -0.2])]
 
 @pytest.fixture
 def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
-    """Two runs on one mesh: the second is off by 0.05 m in one corner at 0.1 s, and in energy and probe."""
+    """Two runs on one mesh; the second differs at 0.1 s by 0.05 m at one corner, and in energy and probe."""
     one, two = shared_tmp / "one", shared_tmp / "two"
     if comm.rank == 0:
         mesh = mesh_of(SHEET)
@@ -115,7 +115,7 @@ def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm)
 
 
 def linear(rest: Array, t: float) -> Array:
-    """A field that linear interpolation gives exactly."""
+    """A field that linear interpolation reproduces exactly."""
     return np.asarray(rest @ np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, 0.5], [0.0, 0.0, 1.0]]) + [t, 0.0, -t])
 
 
@@ -148,7 +148,7 @@ def surface(mesh: Mesh) -> RestSurface:
 
 
 @pytest.mark.parallel(2)
-def test_sheets_that_lie_on_each_other_are_kept_apart(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_coincident_sheets_are_distinguished(comm: MPI.Comm, shared_tmp: Path) -> None:
     two = [grid(1.0, 1.0, 2, 2), grid(1.0, 1.0, 2, 2)]
     finer = [grid(1.0, 1.0, 4, 4), grid(1.0, 1.0, 4, 4)]
     coarse, fine = mesh_of(*two), mesh_of(*finer)
@@ -175,14 +175,14 @@ def test_curved_surfaces_are_projected() -> None:
     assert np.allclose(transfer.weight.sum(axis=1), 1.0)
 
 
-def test_weights_of_the_nearest_place() -> None:
+def test_weights_of_the_nearest_point() -> None:
     corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 4)
     points = np.array([[0.25, 0.25, 0.3], [0.5, -1.0, 0.0], [2.0, 2.0, 0.0], [-1.0, -1.0, 0.5]])
     expected = [[0.5, 0.25, 0.25], [0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]
     assert np.allclose(barycentric(points, corners), expected)
 
 
-def test_other_meshes_are_told_apart(tmp_path: Path) -> None:
+def test_different_meshes_are_recognised(tmp_path: Path) -> None:
     one, two = surface(mesh_of(SHEET)), surface(mesh_of(grid(0.3, 0.4, 3, 4, "alternating")))
     assert one.same_as(one)
     assert not one.same_as(two)

@@ -1,4 +1,4 @@
-"""What a study is going to do: combinations, sample times, references; decided before anything runs."""
+"""Plan of a study, made before anything runs: combinations, sample times, references."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_sample_times(tmp_path: Path) -> None:
     assert any("every 20 ms instead" in note for note in plan.notes)
 
 
-def test_steps_that_do_not_land_on_samples_are_told(tmp_path: Path) -> None:
+def test_steps_that_do_not_divide_the_sample_interval_are_noted(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "dt=0.04,0.015,0.01")
     assert any("Δt 40 ms, 15 ms does not divide" in note for note in plan.notes)
 
@@ -88,7 +88,7 @@ def test_scenes_of_combinations(tmp_path: Path) -> None:
     assert plan.scene(plan.combinations[0]).time.step == "auto"
 
 
-def test_vertices_by_number_are_told_of_when_meshes_vary(tmp_path: Path) -> None:
+def test_vertices_by_number_are_noted_when_meshes_vary(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, SCENE + MOVING + "handles: [{nodes: [0]}]\n", "mesh=0.25,0.125")
     assert any("handles[0]: vertices picked by number" in note for note in plan.notes)
 
@@ -106,19 +106,19 @@ def test_vertices_by_number_are_told_of_when_meshes_vary(tmp_path: Path) -> None
         ("handles[3].until=1", "handles"),
     ],
 )
-def test_values_that_cannot_be_are_refused(tmp_path: Path, vary: str, words: str) -> None:
+def test_invalid_values_are_refused(tmp_path: Path, vary: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         plan_of(tmp_path, HELD + MOVING, vary)
 
 
-def test_a_mesh_file_keeps_its_elements(tmp_path: Path) -> None:
+def test_element_sizes_of_mesh_files_cannot_vary(tmp_path: Path) -> None:
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     text = HELD.replace("{grid: {width: 1.0, height: 0.5, nx: 4, ny: 2}}", "{file: one.obj}")
     with pytest.raises(InputError, match=r"one\.obj comes with its elements"):
         plan_of(tmp_path, text.replace("handles: [{group: left}]\n", "") + MOVING, "mesh=0.1")
 
 
-def test_the_reference_is_exact_where_that_holds(tmp_path: Path) -> None:
+def test_the_reference_is_exact_if_an_exact_motion_applies(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, SCENE + MOVING, "dt=0.01")
     (chosen,) = choose_references(plan).values()
     assert chosen.kind == "exact"
@@ -144,12 +144,12 @@ def test_every_physical_scene_has_a_reference_of_its_own(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("reference", ["exact", "exact:", "run:", "best", "auto:x", ""])
-def test_references_that_are_none(tmp_path: Path, reference: str) -> None:
+def test_invalid_references_are_refused(tmp_path: Path, reference: str) -> None:
     with pytest.raises(InputError, match="must be auto, exact:NAME or run:DIR"):
         choose_references(plan_of(tmp_path, HELD + MOVING, "dt=0.01", reference=reference))
 
 
-def test_the_finer_run_is_finer_in_what_varies(tmp_path: Path) -> None:
+def test_the_finer_run_is_finer_in_the_varied_keys(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "dt=0.02,0.01")
     assert refines_time(plan)
     chains = make_chains(plan, [], 0.01, "bdf2")
@@ -175,7 +175,7 @@ def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> No
     ]  # fmt: skip
 
 
-def test_one_integrator_beside_meshes_is_the_references_too(tmp_path: Path) -> None:
+def test_with_one_integrator_and_varied_meshes_the_reference_uses_it(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "integrator=alpha2", "dt=0.005")
     assert not refines_time(plan)
     chains = make_chains(plan, [], None, "")
@@ -190,7 +190,7 @@ def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
     assert "petsc.ksp_rtol=1e-06" in chains[0].levels[0].overrides
 
 
-def test_requests_survive_their_file(tmp_path: Path) -> None:
+def test_requests_are_read_from_their_file(tmp_path: Path) -> None:
     from lyra_petsc.experiments.study.plan import read_request
 
     request = Request("a.yaml", ("time.end=1",), ("dt=0.1,0.2",), "auto", "position", 2, 4)
@@ -201,7 +201,7 @@ def test_requests_survive_their_file(tmp_path: Path) -> None:
         read_request(tmp_path)
 
 
-def test_a_busy_machine_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_machine_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     from lyra_petsc.experiments.study import study_report as conduct
 
     monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)

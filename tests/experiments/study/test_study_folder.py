@@ -1,4 +1,4 @@
-"""Which folder a study takes, and which it refuses; decided without touching the disk."""
+"""Choice of a study's folder, decided without touching the disk."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_newest_is_resumed(here: Path) -> None:
         ("there", {"resume": True, "force": True}, "give one of them"),
     ],
 )
-def test_folders_that_cannot_be(here: Path, out: str, flags: dict[str, bool], words: str) -> None:
+def test_invalid_folders_are_refused(here: Path, out: str, flags: dict[str, bool], words: str) -> None:
     (here / "file").write_text("")
     (here / "there").mkdir()
     with pytest.raises(InputError, match=words):

@@ -1,4 +1,4 @@
-"""What the bending cases compare with, and the tools by which they look at a flat sheet's stiffness."""
+"""References of the bending cases, and tools for the stiffness of flat sheets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PUBLISHED = reference("cantilevers")
 
 
 @pytest.mark.parametrize("row", PUBLISHED["tip_load"]["rows"], ids=lambda row: f"{row[0]:g}")
-def test_the_loaded_elastica_is_the_published_one(row: list[float]) -> None:
+def test_the_loaded_elastica_agrees_with_the_published_one(row: list[float]) -> None:
     load, angle, shortening, drop = row
     tip = cantilever(0.0, tip_load=load)
     found = (tip.angle, 1.0 - tip.reach, tip.drop)
@@ -39,7 +39,7 @@ def test_the_loaded_elastica_is_the_published_one(row: list[float]) -> None:
 
 
 @pytest.mark.parametrize("row", PUBLISHED["own_weight"]["rows"], ids=lambda row: f"{row[0]:g}")
-def test_the_heavy_elastica_is_the_published_one(row: list[float]) -> None:
+def test_the_heavy_elastica_agrees_with_the_published_one(row: list[float]) -> None:
     weight, drop, reach, angle, curvature = row
     tip = cantilever(weight)
     tolerance = PUBLISHED["own_weight"]["tolerance"]
@@ -48,19 +48,19 @@ def test_the_heavy_elastica_is_the_published_one(row: list[float]) -> None:
 
 
 @pytest.mark.parametrize("row", PUBLISHED["stretching"]["rows"], ids=lambda row: f"{row[0]:g} {row[1]:g}")
-def test_the_stretching_elastica_is_the_published_one(row: list[float]) -> None:
+def test_the_stretching_elastica_agrees_with_the_published_one(row: list[float]) -> None:
     weight, thickness, drop, reach, angle = row
     tip = cantilever(weight, stretch=thickness**2 / 12.0)
     tolerance = PUBLISHED["stretching"]["tolerance"]
     assert (tip.drop, tip.reach, tip.angle) == pytest.approx((drop, reach, angle), abs=tolerance)
 
 
-def test_overhangs_are_the_published_ones() -> None:
+def test_overhangs_agree_with_published_ones() -> None:
     for degrees, weight in PUBLISHED["overhang"]["rows"]:
         assert overhang_weight(degrees) == pytest.approx(weight, rel=PUBLISHED["overhang"]["tolerance"])
 
 
-def test_a_light_coupled_strip_bends_with_four_fifths_and_goes_sideways_by_the_square() -> None:
+def test_a_light_strip_of_hinges_bends_with_four_fifths_of_b() -> None:
     weight = 1e-3
     _, sideways, drop = heavy_coupled_strip(0.8 * weight)
     assert drop == pytest.approx(weight / 8.0, rel=1e-5)
@@ -68,14 +68,14 @@ def test_a_light_coupled_strip_bends_with_four_fifths_and_goes_sideways_by_the_s
     assert sideways == pytest.approx(weight**2 / 60.0 * (1.0 / 4.0 - 1.0 / 7.0), rel=1e-4)
 
 
-def test_far_bent_the_coupled_strip_is_stiffer_than_four_fifths() -> None:
+def test_a_strongly_bent_strip_of_hinges_is_stiffer_than_four_fifths_of_b() -> None:
     _, sideways, drop = heavy_coupled_strip(8.0)
     assert sideways > 0.05
     assert drop < cantilever(10.0).drop - 0.005
 
 
 def test_buckled_columns() -> None:
-    """Just above the critical load P/P_c = 1 + a²/16, height 2 a/π, a the angle at the ends."""
+    """Slightly above the critical load: P/P_c = 1 + a²/16, height 2 a/π, with the angle a at the ends."""
     load, height = column_shape(shortening=1e-4)
     angle = 2.0 * math.sqrt(1e-4)  # a²/4 for a sine
     assert load / math.pi**2 - 1.0 == pytest.approx(angle**2 / 8.0, rel=1e-3)
@@ -92,7 +92,7 @@ def test_a_tall_cantilever_tips_at_the_published_load() -> None:
 
 
 @pytest.mark.parallel(2)
-def test_displacements_balance_their_forces(comm: MPI.Comm) -> None:
+def test_displacements_are_in_balance_with_their_forces(comm: MPI.Comm) -> None:
     with Bench(comm).simulation(hinges.square_plate("CFFF", "criss-cross", 6)) as trial:
         motions, force = small_motions(trial), trial.mass[:, None] * [0.0, 0.0, 1.0]
         held = trial.start[:, 0] < 1e-9
@@ -106,7 +106,7 @@ def test_displacements_balance_their_forces(comm: MPI.Comm) -> None:
 
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("pattern", hinges.PATTERNS)
-def test_bending_divided_by_what_the_mesh_makes_of_it_gives_b(comm: MPI.Comm, pattern: str) -> None:
+def test_bending_over_the_factor_of_the_mesh_gives_b(comm: MPI.Comm, pattern: str) -> None:
     scene: dict[str, Any] = strip(
         pattern, 8, material={"bending": 1.0, "bending_scale": 1.0 / expected(pattern)}
     )
@@ -117,7 +117,7 @@ def test_bending_divided_by_what_the_mesh_makes_of_it_gives_b(comm: MPI.Comm, pa
 
 
 @pytest.mark.parallel(2)
-def test_another_stiffness_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stiffness_other_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hinges, "expected", lambda pattern, ratio=1.0: 1.0)
     outcome = run_case(comm, hinges.hinge_strip, quick=True, warm=False)
     verdicts = {quantity: verdict.passed for quantity, verdict in outcome.verdicts.items()}

@@ -1,4 +1,4 @@
-"""Every case of ``verify`` holds, on one rank and on several."""
+"""All cases of ``verify`` pass, on one rank and on several."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TOGETHER = (
 
 
 @pytest.mark.parametrize("name", CASES.modules)
-def test_describes_itself(name: str) -> None:
+def test_a_case_has_a_description(name: str) -> None:
     case = CASES.load(name)
     assert case.name == name
     assert case.title
@@ -70,7 +70,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 
 @pytest.mark.parametrize("name", CASES.modules)
-def test_is_in_the_docs(name: str) -> None:
+def test_a_case_is_in_the_docs(name: str) -> None:
     assert any(f"`{name}`" in page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
 
 
@@ -80,7 +80,7 @@ def marks(name: str) -> list[pytest.MarkDecorator]:
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in CASES.modules])
-def test_passes(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_passes(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES.load(name)
     for constant, fewer in FEWER.get(name, {}).items():
         monkeypatch.setattr(sys.modules[case.measure.__module__], constant, fewer)

@@ -1,4 +1,4 @@
-"""The exact answers that cases work out by themselves, and the meshes they make."""
+"""Closed forms used by cases, and their meshes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from lyra_petsc.experiments.verification.flat_plates import arc
 from lyra_petsc.experiments.verification.verification_case import load_data
 
 
-def test_the_level_fall_is_the_tabulated_one() -> None:
+def test_the_level_fall_agrees_with_the_table() -> None:
     for steps, speed, z in reference("backward_euler")["terminal_velocity"]["rows"]:
         assert level_fall(100.0, 0.01 * steps) == pytest.approx((speed, -z), rel=1e-12)
 
 
-def test_the_level_fall_tends_to_the_continuous_one() -> None:
+def test_the_level_fall_converges_to_the_continuous_one() -> None:
     assert level_fall(1e5, 0.5) == pytest.approx((1.3981709474047688, 0.5619092595485882), rel=1e-3)
 
 
-def test_strips_and_chains_hang_as_tabulated() -> None:
+def test_hanging_strips_and_chains_agree_with_the_table() -> None:
     tables = reference("hanging")
     for e, exact in tables["strip"]["rows"]:
         assert of_strip(e) == pytest.approx(exact, rel=1e-9)
@@ -36,7 +36,7 @@ def test_strips_and_chains_hang_as_tabulated() -> None:
         assert of_chain(e, bars) == pytest.approx(exact, rel=1e-9)
 
 
-def test_stress_and_energy_are_the_tabulated_ones() -> None:
+def test_stress_and_energy_agree_with_the_table() -> None:
     tables = reference("stvk_patch")
     for material, _, gradient, _, stress, _, energy in tables["rows"]:
         c = dict(zip(("c11", "c12", "c22", "c33"), tables["materials"][material], strict=True))
@@ -46,7 +46,7 @@ def test_stress_and_energy_are_the_tabulated_ones() -> None:
 
 
 @pytest.mark.parametrize("row", load_data("catenary")["unequal_heights"]["rows"])
-def test_the_middle_of_a_catenary_halves_its_length(row: list[float]) -> None:
+def test_the_midpoint_of_a_catenary_halves_its_length(row: list[float]) -> None:
     dx, dz, a, lowest = row[:4]
     x, z = middle(a, lowest)
 
@@ -92,7 +92,7 @@ def test_rectangles_are_covered_once(
     assert parts.sum() == pytest.approx(0.7, rel=1e-14)
 
 
-def test_an_irregular_rectangle_is_irregular_and_always_the_same() -> None:
+def test_an_irregular_rectangle_is_reproducible() -> None:
     vertices, triangles = irregular_rectangle(6, 6, 1.0, 0.7)
     assert areas(vertices, triangles).std() > 0.1 * areas(vertices, triangles).mean()
     again = irregular_rectangle(6, 6, 1.0, 0.7)

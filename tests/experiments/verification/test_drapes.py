@@ -1,4 +1,4 @@
-"""What the agreement of drapes is judged by: their starts, their meshes, and the statistics."""
+"""Agreement of drapes: starts, meshes and statistics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lyra_petsc.stepping.simulation import StepReport
 
 
 def edges(faces: Ints) -> tuple[Ints, Ints]:
-    """Edges (n, 2) of triangles, and of how many each is."""
+    """Edges (n, 2) of triangles, and the number of triangles of each."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
 
@@ -44,7 +44,7 @@ def test_rings_fill_a_polygon(n: int) -> None:
 
 @pytest.fixture
 def starts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Ints, Array]]:
-    """Positions, triangles and material coordinates with which all drapes of the finest meshes begin."""
+    """Initial positions, triangles and material coordinates of all drapes on the finest meshes."""
     seen: list[tuple[Array, Ints, Array]] = []
 
     def begins(bench: Bench, start: Array, faces: Ints, rest: Array, *_: object, **more: float) -> Array:
@@ -59,7 +59,9 @@ def starts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array,
     return seen
 
 
-def test_drapes_begin_apart_and_gently(starts: list[tuple[Array, Ints, Array]]) -> None:
+def test_starts_of_drapes_have_independent_waves_and_small_strains(
+    starts: list[tuple[Array, Ints, Array]],
+) -> None:
     at, waves = np.radians(np.arange(0.0, 360.0, 5.0)), []
     for start, faces, rest in starts:
         pairs = edges(faces)[0]
@@ -73,17 +75,19 @@ def test_drapes_begin_apart_and_gently(starts: list[tuple[Array, Ints, Array]]) 
     assert abs(alike.mean()) < 0.1
 
 
-def test_mesh_directions_are_at_random(starts: list[tuple[Array, Ints, Array]]) -> None:
+def test_mesh_directions_are_random(starts: list[tuple[Array, Ints, Array]]) -> None:
     turned = np.array([math.atan2(*(rest[0] - rest.mean(axis=0))[::-1]) for _, _, rest in starts[:STARTS]])
     assert abs(np.exp(1j * turned).mean()) < 0.9
     assert np.ptp(turned) > 1.0
 
 
 @pytest.mark.parallel(2)
-def test_friction_throws_no_vertex_off(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stretched cloth presses on the disc's edge a thousand times its weight, and less when it has slid.
+def test_friction_at_the_disc_does_not_throw_vertices_off(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stretched cloth presses on the disc's edge with a thousand times its weight, and less after sliding.
 
-    Friction that is given back for that made 0.5 J of nothing.
+    Taking back the friction of the higher force once created 0.5 J.
     """
     step, rises = Trial.step, []
 
@@ -108,20 +112,20 @@ def drawn(mean: float, scatter: float = 0.01) -> list[float]:
     return FOLDS.normal(mean, scatter, STARTS).tolist()
 
 
-def test_a_biased_kind_fails() -> None:
+def test_a_biased_kind_of_mesh_fails() -> None:
     found = [contacts.differences([*(drawn(0.80) for _ in range(3)), drawn(0.84)]) for _ in range(200)]
     failed = np.array(found) > 1.0
     assert failed[:, 3].mean() > 0.9
 
 
-def test_kinds_that_differ_by_chance_pass() -> None:
+def test_kinds_of_mesh_that_differ_by_chance_pass() -> None:
     found = [contacts.differences([drawn(0.80, s) for s in (0.003, 0.01, 0.01, 0.02)]) for _ in range(500)]
     wrong = (np.array(found) > 1.0).mean(axis=0)
     assert wrong.max() < 0.15
     assert wrong.min() > 0.02
 
 
-def test_differences_are_those_of_the_formula() -> None:
+def test_differences_follow_the_formula() -> None:
     assert contacts.differences([[0.0, 2.0], [2.0, 4.0]]) == pytest.approx([1.0 / math.sqrt(2.0)] * 2)
     one, *_ = contacts.differences([[0.0, 2.0], [3.0, 3.0], [6.0, 6.0]])
     assert one == pytest.approx(3.5 / 2.0)

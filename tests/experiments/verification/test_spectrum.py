@@ -26,7 +26,7 @@ SHEET: dict[str, Any] = {
 
 
 def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Every ω² of a simulation on one rank, from element Hessians summed here."""
+    """All ω² of a simulation on one rank, from element Hessians summed here."""
     problem = trial.simulation.problem
     n = problem.points.n_owned
     stiffness = np.zeros((n, 3, n, 3))
@@ -41,7 +41,7 @@ def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 @pytest.mark.parametrize("count", [1, 5, 30])
-def test_as_from_a_dense_solver(comm: MPI.Comm, count: int) -> None:
+def test_frequencies_agree_with_a_dense_solver(comm: MPI.Comm, count: int) -> None:
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(SHEET) as trial:
         exact = np.sqrt(dense(trial)[:count])
     with Bench(comm) as bench, bench.simulation(SHEET) as trial:
@@ -61,8 +61,8 @@ def test_an_unstable_state_is_refused(comm: MPI.Comm) -> None:
             lowest_modes(trial, 3)
 
 
-def test_edges_without_mass_balance_by_themselves(comm: MPI.Comm) -> None:
-    """As from a dense solver that has condensed them; a free sheet, whose rigid motions need a shift."""
+def test_massless_edges_are_condensed(comm: MPI.Comm) -> None:
+    """Compared with a dense solver; a free sheet, whose rigid motions need a shift."""
     material = SHEET["material"] | {"bending_model": "midedge"}
     content = SHEET | {"material": material, "handles": [{"group": "sheet", "axes": ["x", "y"]}]}
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
@@ -86,7 +86,7 @@ def test_edges_without_mass_balance_by_themselves(comm: MPI.Comm) -> None:
     assert np.abs(shapes[:, :, :2]).max() == 0.0
 
 
-def test_below_zero_beyond_the_critical_load(comm: MPI.Comm) -> None:
+def test_squared_frequencies_are_negative_beyond_the_critical_load(comm: MPI.Comm) -> None:
     with Bench(comm) as bench, bench.simulation(SHEET) as trial:
         trial.set_state(x=trial.start * [0.95, 1.0, 1.0])
         squares, _ = lowest_squares(trial, 1, shift=1e4)

@@ -1,4 +1,4 @@
-"""Verdicts: what is right passes, what is wrong fails, what cannot run says so."""
+"""Verdicts of ``verify``: right results pass, wrong ones fail, cases that cannot run are reported."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def finest(rows: list[ErrorRow]) -> float:
     return rows[-1].h
 
 
-def test_orders_are_those_of_the_errors() -> None:
+def test_orders_follow_from_errors() -> None:
     rows = table(1e-2, 2.5e-3, 1.25e-3)
     assert math.isnan(rows[0].order)
     assert [r.order for r in rows[1:]] == pytest.approx([2.0, 1.0])
@@ -74,7 +74,7 @@ def test_claims(claim: Claim, errors: tuple[float, ...], good: bool) -> None:
     assert verdict.message
 
 
-def test_the_bound_of_a_quick_run_grows_with_its_h() -> None:
+def test_the_bound_of_a_quick_run_grows_with_h() -> None:
     rows = table(6e-2, 1.5e-2)
     assert Converges(2.0, 1e-3).judge(rows, finest(rows) / 4.0).passed  # 16e-3
     assert not Converges(2.0, 1e-3).judge(rows, finest(rows) / 2.0).passed  # 4e-3
@@ -107,7 +107,7 @@ def test_rows_and_verdicts_of_a_case(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
+def test_a_case_that_cannot_run_is_reported_and_the_others_continue(comm: MPI.Comm) -> None:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         if n == 8:
             raise SolverError("the step\ndid not converge", collective=True)
@@ -128,12 +128,12 @@ def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(2)
-def test_nothing_measured_is_no_success(comm: MPI.Comm) -> None:
+def test_a_case_without_measurements_fails(comm: MPI.Comm) -> None:
     assert not run_case(comm, made(measure=lambda bench, n: [])).passed
 
 
 @pytest.mark.parallel(2)
-def test_a_request_to_stop_ends_the_case(comm: MPI.Comm) -> None:
+def test_a_stop_request_ends_the_case(comm: MPI.Comm) -> None:
     def stop() -> None:
         raise Interrupted("", 2)
 
@@ -142,7 +142,7 @@ def test_a_request_to_stop_ends_the_case(comm: MPI.Comm) -> None:
 
 
 def wrong_by(case: VerificationCase, fraction: float) -> VerificationCase:
-    """The case with every exact answer off by a fraction of its scale."""
+    """The case with every exact answer changed by a fraction of its scale."""
 
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         for one in case.measure(bench, n):
@@ -173,7 +173,7 @@ def test_a_limit_wrong_by_a_few_percent_fails(comm: MPI.Comm, name: str) -> None
     assert not any(verdict.passed for verdict in outcome.verdicts.values())
 
 
-def test_a_package_that_is_missing_is_named() -> None:
+def test_a_missing_package_is_named() -> None:
     def measure(bench: Bench, n: float) -> list[Measured]:
         raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
 
