@@ -1,4 +1,4 @@
-"""The order of the packages: imports point one way, and only the command line prints."""
+"""Structure of the package: imports go in one direction, and only the command line prints."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def module_name(path: Path) -> str:
 
 
 def room(module: str) -> str:
-    """The room of a module of the package; empty for the package itself."""
+    """The subpackage of a module; empty for the package itself."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else ""
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and name of every module of ours that is imported, wherever it stands."""
+    """Line and name of every imported module of the package, anywhere in the file."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -68,7 +68,7 @@ def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def upward(tree: ast.AST, name: str) -> list[str]:
-    """The imports of a module that point up the house."""
+    """Imports of a module that violate the order of the packages."""
     wrong = []
     mine = room(name)
     for line, other in imported(tree):
@@ -80,7 +80,7 @@ def upward(tree: ast.AST, name: str) -> list[str]:
     return wrong
 
 
-def test_imports_point_one_way() -> None:
+def test_imports_go_in_one_direction() -> None:
     for path in MODULES:
         name = module_name(path)
         assert room(name) in RANK or name == PACKAGE.name, f"give the package of {name} its place in LEVELS"
@@ -112,7 +112,7 @@ def test_only_the_command_line_prints() -> None:
         assert lines == [], path
 
 
-def test_terms_have_never_heard_of_petsc_mpi_or_files() -> None:
+def test_terms_do_not_use_petsc_mpi_or_files() -> None:
     for path in (PACKAGE / "terms").glob("*.py"):
         names = set()
         for node in ast.walk(parsed(path)):
@@ -150,7 +150,7 @@ def linear_algebra(kernel: ast.AST) -> list[int]:
 
 
 def test_kernels_need_no_scipy() -> None:
-    """It is in an extra; a kernel that was compiled with it ends a process without it."""
+    """SciPy is in an extra; a kernel compiled with it would crash a process without it."""
     count = 0
     for path in MODULES:
         for kernel in kernels(parsed(path)):

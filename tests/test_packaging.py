@@ -1,4 +1,4 @@
-"""The wheel holds every room, the scenes and the meshes."""
+"""The wheel has every package, the scenes and the meshes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ tomllib = pytest.importorskip("tomllib")  # Python 3.11
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def test_every_room_is_packaged() -> None:
+def test_every_package_is_in_the_wheel() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     rooms = {
         ".".join(init.parent.relative_to(ROOT).parts) for init in (ROOT / "lyra_petsc").rglob("__init__.py")

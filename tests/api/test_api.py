@@ -1,4 +1,4 @@
-"""The package as a program or a notebook uses it; the same on any number of ranks."""
+"""The Python interface, on any number of ranks."""
 
 import gc
 import os
@@ -27,7 +27,7 @@ SCENE = {
 
 
 @pytest.mark.parallel(2)
-def test_run_then_read(shared_tmp, comm):
+def test_a_run_is_read_after_it(shared_tmp, comm):
     taken = []
     run = lyra_petsc.run(SCENE, shared_tmp / "out", on_step=lambda report: taken.append(report.time))
 
@@ -45,7 +45,7 @@ def test_run_then_read(shared_tmp, comm):
 
 
 @pytest.mark.parallel(2)
-def test_a_loop_over_the_steps_gives_what_a_run_writes(shared_tmp, comm):
+def test_a_loop_over_the_steps_agrees_with_a_run(shared_tmp, comm):
     run = lyra_petsc.run(SCENE, shared_tmp / "out")
     steps = []
     with lyra_petsc.Simulation(SCENE) as simulation:
@@ -150,7 +150,7 @@ def test_many_simulations_in_one_process(tmp_path):
     assert options() == before
 
 
-def test_a_step_that_fails_is_an_exception(tmp_path):
+def test_a_failed_step_is_an_exception(tmp_path):
     scene = lyra_petsc.load(SCENE, {"solver.max_iterations": 1, "petsc.ts_adapt_dt_min": 0.01})
     with pytest.raises(lyra_petsc.SolverError) as caught, lyra_petsc.Simulation(scene) as simulation:
         list(simulation)
@@ -161,7 +161,7 @@ def test_a_step_that_fails_is_an_exception(tmp_path):
     lyra_petsc.run(SCENE, tmp_path / "next")  # the next is not touched by it
 
 
-def test_a_mesh_script_is_trusted_where_it_is_asked_for(tmp_path):
+def test_mesh_scripts_are_trusted_on_request(tmp_path):
     corners = "Point(1) = {0,0,0,0.5}; Point(2) = {1,0,0,0.5}; Point(3) = {0,1,0,0.5};"
     sides = "Line(1) = {1,2}; Line(2) = {2,3}; Line(3) = {3,1};"
     surface = "Curve Loop(1) = {1,2,3}; Plane Surface(1) = {1};"
@@ -172,7 +172,7 @@ def test_a_mesh_script_is_trusted_where_it_is_asked_for(tmp_path):
     assert len(lyra_petsc.run(scene, tmp_path / "out", trust_mesh=True)) > 1
 
 
-def test_an_interrupt_ends_the_step_and_leaves_a_checkpoint(tmp_path):
+def test_an_interrupt_finishes_the_step_and_writes_a_checkpoint(tmp_path):
     def interrupt(report):
         if report.step == 2:
             os.kill(os.getpid(), signal.SIGINT)
@@ -185,7 +185,7 @@ def test_an_interrupt_ends_the_step_and_leaves_a_checkpoint(tmp_path):
     assert list(run.history["step"]) == [0, 1, 2, 3, 4, 5]
 
 
-def test_the_import_is_cheap():
+def test_the_import_loads_no_large_packages():
     program = """
 import sys, lyra_petsc
 assert lyra_petsc.__version__

@@ -1,4 +1,4 @@
-"""What a launcher inherits from the process that starts it."""
+"""Environment that a launcher inherits from the process that starts it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEFT_BY_MPI_INIT = {
 """Of Open MPI 4, in a process that no launcher has started."""
 
 
-def test_a_launcher_starts_below_a_process_that_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_launcher_can_be_started_after_mpi_init(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in LEFT_BY_MPI_INIT.items():
         monkeypatch.setenv(name, value)
     code = "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"
@@ -29,6 +29,6 @@ def test_a_launcher_starts_below_a_process_that_has_none(monkeypatch: pytest.Mon
     assert (done.returncode, sorted(done.stdout.replace("\n", ""))) == (0, ["2", "2"]), done.stderr
 
 
-def test_what_a_user_sets_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variables_of_the_user_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMPI_MCA_btl", "self,tcp")
     assert environment()["OMPI_MCA_btl"] == "self,tcp"

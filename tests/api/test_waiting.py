@@ -1,4 +1,4 @@
-"""Notes on ranks that wait for processors, and on the number of ranks for which there are enough."""
+"""Notes on ranks that wait for processors, and on a better number of ranks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def shares(*got: float, processors: int = 2, machine: str = "a") -> list[Share]:
         (shares(0.5, 0.5, 0.5, 0.5) + shares(1.0, 1.0, machine="b"), "(there are 4)"),
     ],
 )
-def test_words(everyone: list[Share], words: str) -> None:
+def test_content_of_the_note(everyone: list[Share], words: str) -> None:
     note = note_on(everyone)
     assert words in note
     assert bool(note) == bool(words)

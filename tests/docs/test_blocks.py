@@ -1,4 +1,4 @@
-"""Every command, scene and program that the documentation shows is run, or its syntax is checked."""
+"""Commands, scenes and programs of the documentation are run, or their syntax is checked."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
 @pytest.mark.parametrize(
     "page", [page for page, blocks in ALL.items() if any(b.runs for b in blocks)], ids=shown
 )
-def test_commands(page: Path, checkout: tuple[Path, dict[str, str]]) -> None:
-    """The files of a page are written and its commands run, in their order."""
+def test_commands_run(page: Path, checkout: tuple[Path, dict[str, str]]) -> None:
+    """The files of a page are written, and its commands are run in order."""
     folder, variables = checkout
     for block in ALL[page]:
         if block.title:
@@ -129,7 +129,7 @@ EVERY = [block for blocks in ALL.values() for block in blocks]
 
 
 @pytest.mark.parametrize("block", EVERY, ids=[block.place for block in EVERY])
-def test_what_is_shown_is_well_formed(block: Block) -> None:
+def test_code_blocks_are_well_formed(block: Block) -> None:
     assert block.language in LANGUAGES
     if block.said.startswith("by="):
         assert (ROOT / block.said.removeprefix("by=")).exists(), f"{block.place}: {block.said}"
@@ -146,8 +146,8 @@ def test_what_is_shown_is_well_formed(block: Block) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=shown)
-def test_verbs_and_options_that_are_named_exist(page: Path) -> None:
-    """Also those in the text, and of commands that are not run."""
+def test_named_verbs_and_options_exist(page: Path) -> None:
+    """Also in the text, and in commands that are not run."""
     for command, words in commands_of(page):
         ours, _ = split(words)
         verb = ours[0] if ours else "VERB"
@@ -169,15 +169,15 @@ NAMED = re.compile(
 )
 
 
-def test_files_that_are_named_exist() -> None:
-    """Paths from the checkout, or below the package."""
+def test_named_files_exist() -> None:
+    """Paths in the checkout, or below the package."""
     for page in PAGES:
         for name in NAMED.findall(page.read_text(encoding="utf-8")):
             places = ROOT / name, ROOT / "lyra_petsc" / name
             assert any(place.exists() for place in places), f"{shown(page)}: {name}"
 
 
-def test_the_blocks_are_found() -> None:
+def test_code_blocks_are_found() -> None:
     assert sum(len(commands_of(page)) for page in PAGES) > 80
 
     assert len(PAGES) > 15

@@ -1,4 +1,4 @@
-"""The pages made from the program are up to date and whole, and the site builds without warnings."""
+"""Generated pages are up to date and complete, and the site builds without warnings."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def test_the_pages_are_up_to_date(name: str, reference: ModuleType) -> None:
     assert text == reference.PAGES[name](), "run: python scripts/docs/reference.py"
 
 
-def test_no_option_that_the_program_reads_is_left_out(reference: ModuleType) -> None:
+def test_every_option_that_the_program_reads_is_listed(reference: ModuleType) -> None:
     read = reference.options_read()
     assert {"ts_dt", "pc_type", "mat_partitioning_type", "ts_theta_endpoint"} <= read
     assert read <= set(reference.OPTIONS)
 
 
-def test_every_verb_and_linear_solver_is_there(reference: ModuleType) -> None:
+def test_every_verb_and_linear_solver_is_listed(reference: ModuleType) -> None:
     commands = reference.commands_page()
     assert all(f"## `{name}`" in commands for name in verbs.commands)
     petsc = reference.petsc_page()
@@ -47,7 +47,7 @@ def test_readme_names_every_verb() -> None:
     assert [name for name in verbs.commands if f"`{name}`" not in readme] == []
 
 
-def test_links_of_the_readme_lead_somewhere() -> None:
+def test_links_of_the_readme_exist() -> None:
     links = LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
     inside = [link for link in links if "://" not in link]
     assert len(inside) > 10

@@ -1,4 +1,4 @@
-"""Compiled functions are found in the cache; stale, damaged or differently typed entries are not used."""
+"""The cache of compiled functions; stale, damaged or differently typed entries are not used."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def files(place: Path, ending: str) -> list[Path]:
     return sorted(place.rglob(f"*.{ending}"))
 
 
-def test_what_was_compiled_is_found_again(place: Path) -> None:
+def test_compiled_functions_are_found_again(place: Path) -> None:
     assert compiled(2.5) == (5.0, 0)
     assert compiled(2.5) == (5.0, 1)
     assert len(files(place, "nbi")) == len(files(place, "nbc")) == 1
 
 
-def test_a_change_of_any_module_of_the_package_counts(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_of_any_module_invalidates_the_cache(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled(2.5)
     monkeypatch.setattr(kernel_cache, "digest", lambda room: "changed")
     assert compiled(2.5) == (5.0, 0)
@@ -55,7 +55,7 @@ def test_a_change_of_any_module_of_the_package_counts(place: Path, monkeypatch: 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("left", [0, 5, 40])
-def test_half_a_file_is_compiled_again_and_mended(place: Path, ending: str, left: int) -> None:
+def test_truncated_files_are_compiled_again_and_replaced(place: Path, ending: str, left: int) -> None:
     compiled(2.5)
     (file,) = files(place, ending)
     file.write_bytes(file.read_bytes()[:left])
@@ -63,14 +63,14 @@ def test_half_a_file_is_compiled_again_and_mended(place: Path, ending: str, left
     assert compiled(2.5) == (5.0, 1)
 
 
-def test_an_entry_that_was_announced_but_not_written_is_compiled(place: Path) -> None:
+def test_entries_in_the_index_without_a_file_are_compiled(place: Path) -> None:
     compiled(2.5)
     files(place, "nbc")[0].unlink()
     assert compiled(2.5) == (5.0, 0)
 
 
-def test_two_ranks_that_chose_one_name_for_two_types(place: Path) -> None:
-    """Both saw an empty index: the file holds what the one compiled, the index what the other announced."""
+def test_two_ranks_that_use_one_file_name_for_two_types(place: Path) -> None:
+    """Both read an empty index: the file has one rank's function, the index the other's."""
     compiled(2)
     (integer,) = files(place, "nbc")
     of_integers = integer.read_bytes()
@@ -83,7 +83,7 @@ def test_two_ranks_that_chose_one_name_for_two_types(place: Path) -> None:
     assert compiled(2.5) == (5.0, 1)
 
 
-def test_a_disk_that_takes_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -94,7 +94,7 @@ def test_a_disk_that_takes_nothing(place: Path, monkeypatch: pytest.MonkeyPatch)
     assert compiled(2.5) == (5.0, 1)
 
 
-def test_no_place_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_writable_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CacheImpl, "_locator_classes", [])
     with pytest.raises(RuntimeError):
         KernelCache(twice)
@@ -102,7 +102,7 @@ def test_no_place_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_processes_that_begin_at_once_with_an_empty_cache(place: Path) -> None:
+def test_processes_that_start_together_with_an_empty_cache(place: Path) -> None:
     code = (
         "import numpy as np; from lyra_petsc.terms import wind; out = np.ones((1, 3)); x = np.eye(3)\n"
         "wind.normals(x, np.array([[0, 1, 2]], dtype=np.int{}), out); assert np.allclose(out, 3 ** -0.5), out"
@@ -116,7 +116,7 @@ def test_processes_that_begin_at_once_with_an_empty_cache(place: Path) -> None:
     assert not files(place, "tmp.*")
 
 
-def test_terms_that_the_scene_does_not_name_are_not_loaded() -> None:
+def test_terms_without_a_key_in_the_scene_are_not_loaded() -> None:
     code = """
 import sys
 from mpi4py import MPI

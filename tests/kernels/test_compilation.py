@@ -1,4 +1,4 @@
-"""Compilation is reported and timed, and only if numba really compiles."""
+"""Reporting and timing of compilation, only if numba really compiles."""
 
 import os
 import subprocess
@@ -43,6 +43,6 @@ def compiled(folder: Path, place: Path) -> list[str]:
     return done.stdout.split()
 
 
-def test_it_is_told_once_and_not_where_kernels_are_loaded(tmp_path: Path) -> None:
+def test_compilation_is_reported_once_and_loading_is_not(tmp_path: Path) -> None:
     assert compiled(tmp_path, tmp_path / "kept") == ["begins", "first", "ends", "True", "True"]
     assert compiled(tmp_path, tmp_path / "kept") == ["True", "False"]

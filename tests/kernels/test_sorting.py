@@ -1,4 +1,4 @@
-"""The order of rows against numpy's."""
+"""Sorting of rows, compared with numpy."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def test_rows_are_in_the_order_of_both_tables() -> None:
     assert set(found) == set(which)
 
 
-def test_time_for_many_rows_with_the_same_first_number_grows_little_faster_than_they() -> None:
-    """As for sheets that pass through each other completely on the displacements of a search."""
+def test_sorting_time_of_equal_first_numbers_grows_nearly_linearly() -> None:
+    """As in searches of sheets that pass through each other completely."""
     rng, spent = np.random.default_rng(0), []
     for rows in (2_000, 2_000, 16_000):  # the first compiles
         first, then = rng.permutation(rows)[:, None] * np.array([0, 1]), np.zeros((rows, 1))

@@ -1,4 +1,4 @@
-"""The SIMD operations on 3×3 blocks give the numbers of their twins in plain numba."""
+"""SIMD operations on 3×3 blocks agree with those in plain numba."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def calls(module: Any) -> Any:
 
 
 @pytest.mark.parametrize(("kind", "index"), [(np.float32, np.int32), (np.float64, np.int64)])
-def test_products_are_those_of_plain_numba(kind: type, index: type) -> None:
+def test_products_agree_with_plain_numba(kind: type, index: type) -> None:
     random = np.random.default_rng(3)
     blocks = np.append(random.normal(size=(3 * N, 9)), np.zeros((1, 9)), axis=0).astype(kind)
     x = random.normal(size=(N + 1, 3)).astype(kind)
@@ -64,7 +64,7 @@ def test_products_are_those_of_plain_numba(kind: type, index: type) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_products_with_edges_are_those_of_plain_numba(kind: type) -> None:
+def test_products_with_edges_agree_with_plain_numba(kind: type) -> None:
     random = np.random.default_rng(5)
     blocks = random.normal(size=(3 * N, 12)).astype(kind)
     x, indices = random.normal(size=(N, 3)).astype(kind), random.integers(0, 3 * N, (3 * N, 4))
@@ -91,7 +91,7 @@ def test_products_with_edges_are_those_of_plain_numba(kind: type) -> None:
 
 
 @pytest.mark.parametrize("index", [np.int32, np.int64])
-def test_sums_are_those_of_plain_numba(index: type) -> None:
+def test_sums_agree_with_plain_numba(index: type) -> None:
     random = np.random.default_rng(4)
     offsets = random.integers(0, 2 * N, (N, 6)).astype(index)
     some = offsets[::2]  # of these elements, the row of the first point is another rank's

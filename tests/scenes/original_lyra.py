@@ -25,7 +25,7 @@ def scatter(corners: Array, local: Array, blocks: Array, n: int) -> tuple[Array,
 
 
 def outer(a: Array, b: Array) -> Array:
-    """Of each row."""
+    """Outer products of the rows."""
     return a[:, :, None] * b[:, None, :]
 
 

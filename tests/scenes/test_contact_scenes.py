@@ -1,4 +1,4 @@
-"""The shipped scenes that live by contact, reduced: a number each, and no crossings in any state."""
+"""Shipped scenes with contact, reduced: a physical number each, and no crossings in any state."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def run_of(comm: MPI.Comm, folder: Path, name: str, *settings: str) -> StoredRun | None:
-    """A shipped scene with settings after its run, on rank 0, which has found no crossings; collective."""
+    """Run a shipped scene with settings; returns the run, without crossings, on rank 0; collective."""
     scene = load_scene(CONFIGS / f"{name}.yaml", settings)
     simulate(comm, scene, FolderChoice(folder / "run"), ProgressCallbacks(), lambda: 0)
     if comm.rank > 0:
@@ -39,7 +39,7 @@ def run_of(comm: MPI.Comm, folder: Path, name: str, *settings: str) -> StoredRun
 
 
 def linking_number(one: Array, other: Array) -> float:
-    """How often closed polygons (n, 3), (m, 3) go around each other: Gauss's integral, exact for segments.
+    """Linking number of closed polygons (n, 3), (m, 3), by Gauss's integral, exact for segments.
 
     Klenin & Langowski, Computation of writhe in modeling of supercoiled DNA, Biopolymers 54 (2000) 307-317,
     method 1a.
@@ -69,7 +69,9 @@ def test_a_flag_moves_as_without_contact_until_it_meets_itself(comm: MPI.Comm, s
 
 
 @pytest.mark.parallel(3, alone=False)
-def test_a_tablecloth_lies_with_its_weight_and_is_pulled_off(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_table_carries_the_weight_of_its_cloth_which_is_pulled_off(
+    comm: MPI.Comm, shared_tmp: Path
+) -> None:
     settings = ("mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.02")
     if (run := run_of(comm, shared_tmp, "tablecloth", *settings)) is None:
         return
@@ -80,7 +82,7 @@ def test_a_tablecloth_lies_with_its_weight_and_is_pulled_off(comm: MPI.Comm, sha
 
 
 @pytest.mark.parallel(1)
-def test_a_stack_weighs_on_its_box(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_stack_loads_its_box_with_its_weight(comm: MPI.Comm, shared_tmp: Path) -> None:
     coarse = [f"mesh[{sheet}].grid.{n}=2" for sheet in range(20) for n in ("nx", "ny")]
     if (run := run_of(comm, shared_tmp, "stack", *coarse, "time.step=0.02", "time.end=2")) is None:
         return

@@ -1,4 +1,4 @@
-"""A scene of the original program runs as it is and follows it."""
+"""A scene of the original Lyra runs unchanged and agrees with it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def square() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("material", ["materials/isotropic.json", "isotropic"])
-def test_hanging_square_follows_the_original(
+def test_hanging_square_agrees_with_the_original(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, material: str
 ) -> None:
     uv, triangles = square()

@@ -31,7 +31,7 @@ def end_of(integrator: str, step: float) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_bdf2_moves_as_the_ensemble_does() -> None:
+def test_bdf2_agrees_with_the_ensemble() -> None:
     energy, apart = end_of("bdf2", 0.005)
     assert abs(energy) < 0.07
     assert apart < 0.01
@@ -43,7 +43,7 @@ def test_semi_implicit_steps_lock() -> None:
     assert apart > 0.2
 
 
-def test_reference_comes_from_its_script(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reference_is_reproduced_by_its_script(monkeypatch: pytest.MonkeyPatch) -> None:
     script = module_of(ROOT / "scripts" / "references" / "paper.py")
     monkeypatch.setattr(script, "TIMES", tuple(ANSWERS["times"][:3]))
     rows = script.motion(1e-9, seed=1)

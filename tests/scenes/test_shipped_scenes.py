@@ -1,4 +1,4 @@
-"""Each scene in configs/, reduced, pins one physical number."""
+"""Shipped scenes, reduced: a physical number each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
     return simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
 
 
-def test_a_turning_ball_takes_its_cloth_along() -> None:
+def test_a_turning_ball_rotates_its_cloth() -> None:
     with simulated("ball", "mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.01") as simulation:
         x, surface = simulation.problem.system.x, simulation.problem.surface
         columns = simulation.energy_balance.columns()
@@ -51,14 +51,14 @@ def test_every_shipped_scene_is_tested() -> None:
     assert sorted(path.stem for path in CONFIGS.glob("*.yaml")) == sorted(SHIPPED + OF_CONTACT)
 
 
-def test_flag_tip_is_where_finer_steps_put_it() -> None:
+def test_the_tip_of_the_flag_agrees_with_finer_steps() -> None:
     # the same mesh with Δt = 0.00078125 s gave (1.4778, 0.2017, 0.7594); first order, so a few mm are left
     with simulated("flag", "mesh.size=0.1", "time.end=0.25", "time.step=0.003125") as simulation:
         tip = mean_of(simulation, "tip")
     np.testing.assert_allclose(tip, [1.4778, 0.2017, 0.7594], atol=2e-3)
 
 
-def test_draped_square_hangs_with_its_whole_weight() -> None:
+def test_the_draped_square_hangs_with_its_whole_weight() -> None:
     with simulated(
         "drape", "mesh.size=0.1", "time.step=0.25", "time.end=20", "output.every=20"
     ) as simulation:
@@ -68,7 +68,7 @@ def test_draped_square_hangs_with_its_whole_weight() -> None:
     assert lowest < -0.9
 
 
-def test_spun_corners_stand_opposite_after_half_a_turn() -> None:
+def test_turned_corners_are_opposite_after_half_a_turn() -> None:
     # half-way between the keyframes at 144° and 216°, by symmetry
     with simulated(
         "spin", "mesh.size=0.12", "time.end=3.5", "time.step=0.05", "output.every=3.5"
@@ -80,7 +80,7 @@ def test_spun_corners_stand_opposite_after_half_a_turn() -> None:
     np.testing.assert_allclose([corner[1:] for corner in corners.values()], 0.0, atol=1e-9)
 
 
-def test_sail_passes_wind_and_weight_on_to_its_handles() -> None:
+def test_handles_of_the_sail_carry_wind_and_weight() -> None:
     with simulated("sail", "mesh.size=0.2", "time.step=0.1", "time.end=20", "output.every=20") as simulation:
         system, scene = simulation.problem.system, simulation.scene
         pull = sum(simulation.energy_balance.handle_forces(2))
@@ -98,7 +98,7 @@ def test_sail_passes_wind_and_weight_on_to_its_handles() -> None:
     np.testing.assert_allclose(pull + weight + push.sum(axis=0), 0.0, atol=0.01 * np.linalg.norm(pull))
 
 
-def test_plate_bends_like_a_beam_under_a_small_weight() -> None:
+def test_the_plate_bends_like_a_beam_under_a_small_weight() -> None:
     # w L⁴ / 8 D for a hundredth of its weight; a beam has (1 − ν²) D, but at the clamp it cannot curve
     # across: 1.0816 on elements of 0.0125 m
     settings = (
@@ -115,7 +115,7 @@ def test_plate_bends_like_a_beam_under_a_small_weight() -> None:
     assert sag / beam == pytest.approx(1.0816, abs=0.005)
 
 
-def test_swings_free_edge_falls_freely_and_swings_in() -> None:
+def test_the_free_edge_of_the_swing_falls_freely_and_swings_in() -> None:
     # of a strip of 20 cells; 0.4738, -0.7848 by a converged calculation in one dimension
     small = ("mesh.grid.nx=20", "mesh.grid.ny=2", "mesh.grid.height=0.1", "mesh.grid.pattern=alternating")
     with simulated("swing", *small) as simulation:
@@ -124,7 +124,7 @@ def test_swings_free_edge_falls_freely_and_swings_in() -> None:
     assert edge[0] == pytest.approx(0.4738, abs=5e-3)
 
 
-def test_paper_falls_with_the_energy_it_must_have() -> None:
+def test_paper_falls_like_the_ensemble() -> None:
     # known from an ensemble: at 0.2 s, before the wrinkles matter, 0.1623 J moving
     with simulated("paper", "time.end=0.2") as simulation:
         system = simulation.problem.system
@@ -134,7 +134,7 @@ def test_paper_falls_with_the_energy_it_must_have() -> None:
     assert height == pytest.approx(-0.1657, abs=5e-4)
 
 
-def test_shell_opens_as_far_as_on_a_finer_mesh() -> None:
+def test_the_shell_opens_as_far_as_on_a_finer_mesh() -> None:
     # mesh.size=0.3 gives 3.4046 and 5.8314 m
     with simulated("shell", "mesh.size=1.2") as simulation:
         pulled, pushed = (mean_of(simulation, name) for name in ("pulled", "pushed"))
@@ -142,7 +142,7 @@ def test_shell_opens_as_far_as_on_a_finer_mesh() -> None:
     np.testing.assert_allclose([pulled[1], pushed[0]], 0.0, atol=1e-9)
 
 
-def test_buckled_strip_hangs_between_its_clamps() -> None:
+def test_the_buckled_strip_hangs_between_its_clamps() -> None:
     settings = ("mesh.grid.nx=40", "time.step=0.02", "output.every=2")
     with simulated("buckle", *settings) as simulation:
         middle, (left, right) = mean_of(simulation, "middle"), simulation.energy_balance.handle_forces(2)
@@ -152,7 +152,7 @@ def test_buckled_strip_hangs_between_its_clamps() -> None:
     np.testing.assert_allclose((left + right)[2], 3.925 * 0.1 * 9.81, rtol=0.02)
 
 
-def test_twisted_strip_has_turned_by_half_in_the_middle() -> None:
+def test_the_twisted_strip_has_turned_by_half_in_the_middle() -> None:
     settings = ("mesh.grid.nx=50", "mesh.grid.ny=6", "time.step=0.02", "output.every=2")
     with simulated("twist", *settings) as simulation:
         problem, forces = simulation.problem, simulation.energy_balance.handle_forces(2)

@@ -1,7 +1,4 @@
-"""A sheet released flat with one edge held, against a converged calculation in one dimension.
-
-References: ``tests/reference/swing.json``, made by ``scripts/references/swing.py``.
-"""
+"""A sheet released flat with one edge held, compared with a converged one-dimensional calculation."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ ANSWERS = reference("swing")
 
 
 def answer(c11: float, time: float, cells: int | None = None) -> Array:
-    """Position (x, z) [m] of the free edge: of so many cells, or of the continuum."""
+    """Position (x, z) [m] of the free edge, for a number of cells or for the continuum."""
     block = ANSWERS["stiffness"][f"{c11:g}"]
     rows = block["continuum"] if cells is None else block["cells"][str(cells)]
     [place] = [row[1:] for row in rows if row[0] == time]
@@ -65,7 +62,7 @@ def distance(a: Array, b: Array) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("c11", [STIFFNESSES[0], STIFFNESSES[-1]])
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
-def test_second_order_integrators_follow_the_free_edge(integrator: str, c11: float) -> None:
+def test_second_order_integrators_agree_at_the_free_edge(integrator: str, c11: float) -> None:
     edges = [edge_after(MPI.COMM_SELF, integrator, c11, frequency, 0.4, 20)[0] for frequency in (60, 120)]
     errors = [distance(edge, answer(c11, 0.4)) for edge in edges]
     assert errors[0] <= 0.013
@@ -77,16 +74,14 @@ def test_second_order_integrators_follow_the_free_edge(integrator: str, c11: flo
 
 
 @pytest.mark.parametrize("c11", [pytest.param(1e3, marks=pytest.mark.parallel(2)), 1e5])
-def test_backward_euler_falls_below_the_free_edge_by_its_first_order_error(
-    c11: float, comm: MPI.Comm
-) -> None:
+def test_backward_euler_has_its_first_order_error_at_the_free_edge(c11: float, comm: MPI.Comm) -> None:
     # before tension reaches the edge it falls freely, in z = -½ g t (t + Δt)
     edge, _ = edge_after(comm, "beuler", c11, 60, 0.3)
     assert edge[1] - answer(c11, 0.3)[1] == pytest.approx(-GRAVITY * 0.3 / 120.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("c11", STIFFNESSES[:2])
-def test_backward_euler_does_nothing_worse(c11: float) -> None:
+def test_backward_euler_has_no_other_errors(c11: float) -> None:
     # at 0.4 s the scheme's diffused tension already lifts the edge a little: g t Δt / 2 is the bound in z,
     # and within 2 % of the whole distance; the sheet is stretched no more than its weight can
     first_order = GRAVITY * 0.4 / 120.0
@@ -99,7 +94,7 @@ def test_backward_euler_does_nothing_worse(c11: float) -> None:
 
 @pytest.mark.parametrize("c11", STIFFNESSES)
 @pytest.mark.parametrize("integrator", ["beuler", "bdf2", "alpha2"])
-def test_newton_takes_as_few_iterations_for_stiff_sheets(integrator: str, c11: float) -> None:
+def test_stiff_sheets_take_as_few_newton_iterations(integrator: str, c11: float) -> None:
     strip = scene(integrator, c11) | {"mesh": grid(1.0, 1.0 / CELLS, CELLS, 1)}
     with Simulation(strip, MPI.COMM_SELF) as simulation:
         iterations = [simulation.step(1.0 / 60.0).newton_iterations for _ in range(24)]
@@ -118,7 +113,7 @@ def test_reference_is_consistent() -> None:
     np.testing.assert_allclose(answer(1e5, 0.4), [0.467, -0.7848], atol=5e-4)
 
 
-def test_reference_comes_from_its_script() -> None:
+def test_reference_is_reproduced_by_its_script() -> None:
     script = module_of(Path(__file__).resolve().parents[2] / "scripts" / "references" / "swing.py")
     found = script.swing(20, 1e3)
     expected = [answer(1e3, t, 20) for t in script.TIMES]

@@ -1,4 +1,4 @@
-"""``scripts/bench``: whole files that say what was measured, peers beside, one line for each failure."""
+"""``scripts/bench``: its files, comparisons with other programs, one line for each failure."""
 
 import json
 import math
@@ -95,7 +95,7 @@ def measured(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_json_holds_every_measurement(measured):
+def test_json_has_every_measurement(measured):
     done, folder = measured
     results = json.loads((folder / "bench.json").read_text())
     ours = [row for row in results["rows"] if "command" not in row]
@@ -144,7 +144,7 @@ def test_json_holds_every_measurement(measured):
 
 
 @pytest.mark.slow
-def test_markdown_shows_them(measured):
+def test_markdown_has_every_measurement(measured):
     done, folder = measured
     text = (folder / "bench.md").read_text()
     assert done.stdout.strip() == text.strip()
@@ -171,7 +171,7 @@ def test_markdown_shows_them(measured):
 
 
 @pytest.mark.slow
-def test_peers_stand_beside_and_one_that_fails_is_one_line(measured):
+def test_other_programs_are_compared_and_a_failing_one_is_one_line(measured):
     done, folder = measured
     results = json.loads((folder / "bench.json").read_text())
     slow, idle = (row for row in results["rows"] if "command" in row)
@@ -206,7 +206,7 @@ def test_mistakes_are_one_line(tmp_path, words, says):
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-def test_files_for_peers_are_the_scene(tmp_path):
+def test_files_for_other_programs_describe_the_scene(tmp_path):
     write_files(tmp_path, 100)
     theirs = load_scene(write_scene(tmp_path, 100, 7), [])
     ours = Scene.model_validate(hanging_square(100))
@@ -224,7 +224,7 @@ def test_files_for_peers_are_the_scene(tmp_path):
     assert list(theirs.handles[0].nodes) == corners(100)
 
 
-def test_corners_and_small_sheet():
+def test_held_corners_and_the_small_sheet():
     for scene in (hanging_square(400), small_sheet()):
         checked = Scene.model_validate(scene)
         mesh = build_mesh(checked.mesh)
@@ -258,7 +258,7 @@ def test_the_worst_mesh_is_named():
     assert lines[-1] == "Worst: gmsh, 110 vertices, 1.20 times the time a vertex of diagonal."
 
 
-def test_directors_are_shown_beside_hinges():
+def test_directors_are_compared_with_hinges():
     def found(vertices: int, cpu: float, cg: int, peak: int) -> dict:
         steps = [{"cpu": cpu, "seconds": 2.0 * cpu, "cg": cg, "newton": 1}] * 3
         return {"vertices": vertices, "preset": "multigrid", "peak_bytes": peak, "steps": steps}
@@ -281,7 +281,7 @@ def test_directors_are_shown_beside_hinges():
     assert "1.00" in first
 
 
-def test_two_checkouts_are_compared_pair_by_pair():
+def test_two_checkouts_are_compared_in_pairs():
     def runs(*cpu: float) -> list[dict]:
         return [
             {"vertices": 36, "peak_bytes": 50, "set_up_seconds": 1.0, "steps": [{"cpu": c, "cg": 7}] * 3}
@@ -298,7 +298,7 @@ def test_two_checkouts_are_compared_pair_by_pair():
     assert most == "Median of the rows 1.50, largest 2.00."
 
 
-def test_a_checkout_beside_itself(tmp_path, monkeypatch):
+def test_a_checkout_is_compared_with_itself(tmp_path, monkeypatch):
     monkeypatch.setattr(measures, "PAIRS", 2)
     limits = Limits(steps=2, seconds=0.1, process=120.0)
     found = measures.against("gmsh", 36, "beuler", 1, [], tmp_path, limits, SCRIPTS.parent)
@@ -327,7 +327,7 @@ def test_exponents_of_growth():
     assert math.isnan(exponent(rows[:1], lambda each: 1.0))
 
 
-def test_a_file_without_any_row_is_still_whole():
+def test_a_file_without_rows_is_complete():
     results = {
         "started": "now",
         "machine": {"processor": "p", "cores": 1, "load": 0.0},
@@ -351,7 +351,7 @@ def test_spread_is_median_and_extremes():
     assert spread([3.0, 1.0, 2.0], 10.0) == "20.0 (10.0-30.0)"
 
 
-def test_cpu_time_counts_what_a_process_has_started():
+def test_cpu_time_includes_child_processes():
     program = "import time\nwhile time.process_time() < 0.3: pass"
     spent = run(f"{sys.executable} -c '{program}'; true", 60.0)
     assert spent.cpu >= 0.3
@@ -377,6 +377,6 @@ def test_a_process_that_takes_too_long_is_ended_with_its_children(tmp_path):
         ("kill -9 $$", "ended by SIGKILL"),
     ],
 )
-def test_why_a_process_failed(command, says):
+def test_causes_of_failed_processes(command, says):
     with pytest.raises(Failed, match=says):
         run(command, 10.0)

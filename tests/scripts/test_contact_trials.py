@@ -1,4 +1,4 @@
-"""The other method of the note on contact, which lives in a script: it holds and slides as Coulomb has it."""
+"""The augmented Lagrangian method of the note on contact: sticking and sliding by Coulomb's law."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def trials() -> ModuleType:
 
 
 @pytest.mark.parametrize("part", [0.9, 1.01])
-def test_a_sheet_on_a_slope_by_multipliers(trials: ModuleType, part: float) -> None:
+def test_a_sheet_on_a_slope_with_multipliers(trials: ModuleType, part: float) -> None:
     known = list(registry.REGISTRY)
     with trials.in_use(10.0):
         found = trials.measure(trials.scene_of("slope", part))

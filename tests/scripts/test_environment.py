@@ -1,4 +1,4 @@
-"""The set-up scripts against made-up environments: what is used, what is refused, what stays untouched."""
+"""The set-up scripts in simulated environments: what is used, refused and left unchanged."""
 
 import os
 import re
@@ -26,7 +26,7 @@ def listing(folder: Path) -> list[tuple[str, float]]:
     return sorted((str(path), path.lstat().st_mtime) for path in folder.rglob("*"))
 
 
-def test_an_environment_that_has_everything_is_used_and_left_as_it_was(environment, tmp_path):
+def test_a_complete_environment_is_used_unchanged(environment, tmp_path):
     before = listing(environment)
     done = call("run.sh", "my scene.yaml", "-ts_monitor", cwd=tmp_path, **activated(environment))
     python = environment / "bin" / "python3"
@@ -44,8 +44,8 @@ def test_python_variable_ranks_and_exit_code(environment, tmp_path):
     assert done.returncode == 3
 
 
-def test_waiting_ranks_give_cores_away_only_where_there_are_more_of_them(environment, tmp_path):
-    """Beside busy programs a run of as many ranks as cores would hardly get on otherwise."""
+def test_waiting_ranks_yield_only_if_they_exceed_the_cores(environment, tmp_path):
+    """Otherwise a run would get little time next to busy programs."""
     (environment / "bin" / "mpirun").write_text(f'#!/bin/sh\necho "${YIELD}"\n')
     cores = len(os.sched_getaffinity(0))
     for script, words in (("run.sh", []), ("lyra.sh", ["run"])):
@@ -57,7 +57,7 @@ def test_waiting_ranks_give_cores_away_only_where_there_are_more_of_them(environ
     assert kept.stdout.strip() == "1"
 
 
-def test_python_variable_without_the_stack_is_refused(tmp_path):
+def test_a_python_without_petsc_is_refused(tmp_path):
     venv.create(tmp_path / "empty", symlinks=True)
     done = call("run.sh", cwd=tmp_path, PYTHON=str(tmp_path / "empty" / "bin" / "python"))
     assert done.returncode == 1
@@ -82,7 +82,7 @@ def test_an_old_petsc4py_is_refused_in_one_line(environment, tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_folder_that_is_not_ours_is_left_alone(environment, tmp_path):
+def test_other_folders_are_not_changed(environment, tmp_path):
     (site_packages(environment) / "rich" / "__init__.py").unlink()
     (site_packages(environment) / "rich").rmdir()
     mine = tmp_path / "laid over" / "pyvenv.cfg"
@@ -100,7 +100,7 @@ def test_missing_launcher_is_named(environment, tmp_path):
     assert "no-such-mpirun not found" in done.stderr
 
 
-def test_missing_lists_what_is_old_absent_or_cut_short(environment):
+def test_old_missing_and_incomplete_packages_are_listed(environment):
     site = site_packages(environment)
     (site / "click-8.1.7.dist-info" / "METADATA").write_text("Name: click\nVersion: 7.9\n")
     (site / "rich-13.9.dist-info" / "METADATA").unlink()
@@ -115,7 +115,7 @@ def test_missing_lists_what_is_old_absent_or_cut_short(environment):
     assert {line.split(">=")[0] for line in done.stdout.splitlines()} == {"click", "rich", "numba"}
 
 
-def test_a_layer_shows_the_packages_below_and_pins_them(environment, tmp_path):
+def test_a_layered_environment_uses_and_pins_the_packages_below(environment, tmp_path):
     over = tmp_path / "über"
     venv.create(over, symlinks=True)
     python = str(over / "bin" / "python")
@@ -140,7 +140,7 @@ def test_shell_syntax(script):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_bench_is_started_with_its_arguments_and_the_launcher(environment, tmp_path):
+def test_the_bench_gets_its_arguments_and_the_launcher(environment, tmp_path):
     # the first module from outside the standard library speaks and ends the program
     spy = "import os, sys\nprint(sys.argv, os.environ['MPIRUN'], os.getcwd())\nsys.exit(5)\n"
     (site_packages(environment) / "numpy" / "__init__.py").write_text(spy)
@@ -151,7 +151,7 @@ def test_the_bench_is_started_with_its_arguments_and_the_launcher(environment, t
     assert done.returncode == 5
 
 
-def test_any_verb_runs_by_one_script(environment: Path, tmp_path: Path) -> None:
+def test_one_script_runs_every_verb(environment: Path, tmp_path: Path) -> None:
     variables = {**activated(environment), "RANKS": "3"}
     done = call("lyra.sh", "check", "a scene.yaml", "-ksp_view", cwd=tmp_path, **variables)
     assert done.returncode == 0, done.stderr

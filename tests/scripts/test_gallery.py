@@ -1,4 +1,4 @@
-"""The gallery: every shipped scene is in it, it is small, and its script makes it."""
+"""The gallery has every shipped scene, is small, and is made by its script."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The list of changes that tests must notice is of the present code."""
+"""The list of mutations fits the present code and tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def mutate() -> ModuleType:
     return module_of(SCRIPT)
 
 
-def test_every_change_is_of_the_present_code(
+def test_every_mutation_fits_the_present_code(
     mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["mutate.py", "--list"])
@@ -25,7 +25,7 @@ def test_every_change_is_of_the_present_code(
     assert len(capsys.readouterr().out.splitlines()) == len(mutate.CHANGES) >= 40
 
 
-def test_every_test_that_is_named_exists(mutate: ModuleType) -> None:
+def test_every_named_test_exists(mutate: ModuleType) -> None:
     for test in {test for change in mutate.CHANGES for test in change.tests}:
         file, _, name = test.rpartition("@")[2].partition("::")
         text = (mutate.ROOT / file).read_text(encoding="utf-8")
@@ -45,7 +45,7 @@ def test_text_that_is_not_found_is_an_error(
 @pytest.mark.parametrize(
     ("old", "new", "code"), [("value = 1", "value = 2", 0), ("unused = 3", "unused = 4", 1)]
 )
-def test_what_is_noticed(
+def test_mutations_that_are_noticed(
     old: str, new: str, code: int, mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "code.py").write_text("value = 1\nunused = 3\n")

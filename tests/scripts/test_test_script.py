@@ -1,4 +1,4 @@
-"""``scripts/test.sh``: which tests it runs in how many processes, its exit code, its last line."""
+"""``scripts/test.sh``: selected tests, numbers of processes, exit code, last line."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_all_tests_on_one_rank_and_the_parallel_ones_on_two_and_three(tests: Tes
     assert done.stdout.splitlines()[-1] == "=== 7 passed in 3.75s ==="
 
 
-def test_quick_reads_only_the_files_that_have_quick_tests(tests: Tests) -> None:
+def test_quick_collects_only_files_with_quick_tests(tests: Tests) -> None:
     done = tests("--quick", "-m", "not slow")
     assert "'-m', 'quick and (not slow)'" in first_part(done)
     assert "quick and parallel and (not slow)" in parallel_part(done, 2)
@@ -127,7 +127,7 @@ def test_a_failure_on_some_ranks_is_a_failure(tests: Tests) -> None:
         ((), {"CORES": "64"}, 4),
         (("-s",), {}, 0),
         (("tests/docs",), {}, 4),
-        (("tests/test_house.py::test_imports_point_one_way",), {}, 0),
+        (("tests/test_house.py::test_imports_go_in_one_direction",), {}, 0),
     ],
 )
 def test_number_of_processes(

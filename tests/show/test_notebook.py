@@ -1,4 +1,4 @@
-"""Runs in a notebook: progress, pictures, films and the page inline, errors in Python's words."""
+"""Runs in a notebook: progress, inline pictures, films and reports, errors with Python's names."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_run_shows_its_progress_in_a_notebook(monkeypatch, tmp_path) -> None:
     assert shown[-1].endswith("stopped")
 
 
-def test_elsewhere_it_is_silent(tmp_path, capfd) -> None:
+def test_there_is_no_output_outside_notebooks(tmp_path, capfd) -> None:
     lyra_petsc.run(SCENE, tmp_path / "run")
     assert capfd.readouterr() == ("", "")
 
@@ -74,7 +74,7 @@ def test_a_picture_a_film_and_the_page_are_inline(run, tmp_path) -> None:
     assert {path.name for path in Path(run.folder).iterdir()}.isdisjoint({"film.mp4", "report.html"})
 
 
-def test_errors_are_short_and_in_pythons_words(run, tmp_path) -> None:
+def test_errors_are_short_and_use_names_of_python(run, tmp_path) -> None:
     with pytest.raises(InputError) as caught:
         lyra_petsc.run(SCENE, run.folder)
     said = "".join(caught.value._render_traceback_())
@@ -89,7 +89,7 @@ def test_errors_are_short_and_in_pythons_words(run, tmp_path) -> None:
         run.render(field="speed", range=(2, 1))
 
 
-def test_details_are_said_in_pythons_words_too() -> None:
+def test_details_use_names_of_python() -> None:
     with pytest.raises(SolverError) as caught, python_argument_names():
         raise SolverError("stopped", details=("--resume goes on", "take --set"))
     assert caught.value._render_traceback_() == [

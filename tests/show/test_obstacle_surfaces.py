@@ -1,4 +1,4 @@
-"""What is shown of obstacles has their shape and place."""
+"""Surfaces that represent obstacles in pictures and exports."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def shown(folder: Path, obstacle: dict[str, Any], middle: list[float], size: flo
     return surface
 
 
-def test_a_plane_is_a_square_nearest_to_the_sheets_at_all_times(tmp_path: Path) -> None:
-    """Also where it moves far along itself, and when it has turned."""
+def test_a_plane_is_a_square_near_the_sheets_at_all_times(tmp_path: Path) -> None:
+    """Also if it moves far within itself, or rotates."""
     frames = [
         {"time": 0},
         {"time": 1, "translate": [90, 0, 1]},
@@ -71,7 +71,7 @@ def test_a_plane_is_a_square_nearest_to_the_sheets_at_all_times(tmp_path: Path) 
         assert out[normal] == pytest.approx(9.0)
 
 
-def test_only_containers_and_planes_are_seen_through(tmp_path: Path) -> None:
+def test_only_containers_and_planes_are_transparent(tmp_path: Path) -> None:
     shape = {"sphere": {"center": [0, 0, 0], "radius": 2}}
     ball = shown(tmp_path / "out", shape, [0, 0, 0], 1.0)
     hull = shown(tmp_path / "in", shape | {"inside": True}, [0, 0, 0], 1.0)

@@ -1,4 +1,4 @@
-"""These tests start the program as those of the command line do."""
+"""Helpers of tests/cli for these tests, which start the program."""
 
 import sys
 from pathlib import Path

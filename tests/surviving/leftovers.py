@@ -1,4 +1,4 @@
-"""What a run that ended early left behind."""
+"""Files and processes that are left by a run which ended early."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENDLESS = SHEET % 1000
 
 
 def announced(out: Path) -> list[float]:
-    """Times of the states in ``states.xdmf``, each read through it and found whole."""
+    """Times of the states in ``states.xdmf``, each read and found complete."""
     times = []
     for grid in ElementTree.parse(out / "states.xdmf").findall(".//Grid[@GridType='Uniform']"):
         times.append(float(grid.find("Time").attrib["Value"]))
@@ -50,7 +50,7 @@ def steps(out: Path, name: str = "history.csv") -> list[int]:
 
 
 def ranks_in(folder: Path) -> list[int]:
-    """Processes of ours that still work in a folder; mpirun itself is none of them."""
+    """Processes of the program, without mpirun, that still run in a folder."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
@@ -67,5 +67,5 @@ def ranks_in(folder: Path) -> list[int]:
 
 
 def wait_for_states(out: Path, number: int, patience: float = 60.0) -> None:
-    """Until that many states are on disk."""
+    """Wait until a number of states are on disk."""
     wait_until(lambda: out.is_dir() and len(stored_states(out)) >= number, patience=patience)

@@ -1,4 +1,4 @@
-"""Resuming with another scene: another mesh is refused, other parameters are told."""
+"""Resuming with a changed scene: another mesh is refused, changed parameters are reported."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def content(folder: Path) -> dict[str, bytes]:
         ("output:", "probes: {a: {nodes: [1]}}\noutput:", None),
     ],
 )
-def test_what_cannot_go_on_is_refused_and_left_alone(
+def test_runs_that_cannot_be_continued_are_refused_without_changes(
     run: Path, old: str, new: str, words: str | None
 ) -> None:
     before = content(run)
@@ -59,7 +59,7 @@ def test_what_cannot_go_on_is_refused_and_left_alone(
     assert content(run) == before
 
 
-def test_other_columns_are_refused_and_nothing_is_cut(run: Path) -> None:
+def test_other_columns_are_refused_without_changes(run: Path) -> None:
     done(["run", "--out", "out", "--resume", "--set", "probes.a.nodes=[1]", "-ts_max_steps", "6"], run.parent)
     before = content(run)
     left = lyra(["run", "--out", "out", "--resume", "--set", "probes.b.nodes=[2]"], run.parent)
@@ -68,7 +68,7 @@ def test_other_columns_are_refused_and_nothing_is_cut(run: Path) -> None:
     assert content(run) == before
 
 
-def test_changed_parameters_are_told(run: Path) -> None:
+def test_changed_parameters_are_reported(run: Path) -> None:
     settings = ["wind={velocity: [0, 3, 0], density: 1.2}", "gravity=[0, 0, -5]", "time.end=0.05"]
     words = [word for setting in settings for word in ("--set", setting)]
     left = done(["run", "--out", "out", "--resume", *words, *DIRECT], run.parent)
@@ -92,39 +92,39 @@ def test_changed_parameters_are_told(run: Path) -> None:
     assert announced(run) == pytest.approx([0, 0.02, 0.025, 0.04, 0.05, 0.06])
 
 
-def test_an_unchanged_scene_is_not_commented_on(run: Path) -> None:
+def test_an_unchanged_scene_gives_no_note(run: Path) -> None:
     left = done(["run", write_scene(run.parent, SCENE), "--out", "out", "--resume"], run.parent)
     assert "note: " not in left.err
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2", "midpoint", "semi-implicit"])
-def test_another_integrator_begins_without_memory(run: Path, integrator: str) -> None:
+def test_another_integrator_starts_without_past_states(run: Path, integrator: str) -> None:
     left = done(["run", "--out", "out", "--resume", "--set", f"time.integrator={integrator}"], run.parent)
     assert f"time.integrator: beuler → {integrator} (begins without memory of earlier steps)" in left.err
     assert steps(run) == list(range(9))
 
 
 @pytest.mark.parametrize("step", ["auto", "0.0025", "0.01"])
-def test_another_step_length(run: Path, step: str) -> None:
+def test_another_step_length_is_used(run: Path, step: str) -> None:
     done(["run", "--out", "out", "--resume", "--set", f"time.step={step}"], run.parent)
     assert steps(run) == list(range(len(steps(run))))
     assert announced(run) == pytest.approx([0, 0.02, 0.025, 0.04])
 
 
-def test_a_handle_that_would_have_begun_before(run: Path) -> None:
+def test_a_new_handle_with_an_earlier_start_is_reported(run: Path) -> None:
     handles = "handles=[{nodes: [0, 4]}, {nodes: [24], from: 0.01}]"
     left = done(["run", "--out", "out", "--resume", "--set", handles], run.parent)
     assert "handles[1]: absent → " in left.err
 
 
-def test_a_scene_that_is_missing_from_the_folder(run: Path) -> None:
+def test_a_missing_scene_yaml_is_no_obstacle(run: Path) -> None:
     (run / "scene.yaml").unlink()
     left = done(["run", write_scene(run.parent, SCENE), "--out", "out", "--resume"], run.parent)
     assert "scene.yaml: no such file; what has changed since the run was begun is not known" in left.err
     assert (run / "scene.yaml").exists()
 
 
-def test_lost_rows_are_said(run: Path) -> None:
+def test_lost_rows_are_reported(run: Path) -> None:
     table = run / "history.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:4]))
     left = done(["run", "--out", "out", "--resume"], run.parent)
@@ -156,7 +156,7 @@ $EndElements
 """
 
 
-def test_another_member_of_a_group(tmp_path: Path) -> None:
+def test_another_member_of_a_group_is_refused(tmp_path: Path) -> None:
     scene = SCENE.replace("grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}", "file: mesh.msh")
     scene = write_scene(tmp_path, scene.replace("nodes: [0, 4]", "group: pole"))
     (tmp_path / "mesh.msh").write_text(GROUPS.format(held=1))
@@ -169,7 +169,7 @@ def test_another_member_of_a_group(tmp_path: Path) -> None:
     done(["run", scene, "--out", "out", "--resume"], tmp_path, 2)
 
 
-def test_a_run_from_before_there_were_bending_models_goes_on_with_hinges(tmp_path: Path) -> None:
+def test_runs_of_versions_without_bending_models_resume_with_hinges(tmp_path: Path) -> None:
     shell = "material: {young: 1.0e6, poisson: 0.3, thickness: 1.0e-3, density: 0.2}"
     (old,) = [line for line in SCENE.splitlines() if line.startswith("material:")]
     scene = write_scene(tmp_path, SCENE.replace(old, shell))

@@ -1,4 +1,4 @@
-"""Full disks, limits, folders that vanish: clear words, exit code 3, and what was announced stands."""
+"""Full disks, limits, removed folders: one clear line, exit code 3, and listed states stay readable."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ sys.exit(run_command_line(sys.argv))
 
 
 def refused(left: Left, words: str) -> None:
-    """Exit code 3, one line of ours with these words, no traceback."""
+    """Check exit code 3, one line of the program with these words, and no traceback."""
     assert left.code == 3, left.err
     (line,) = left.ours
     assert words in line
@@ -46,7 +46,7 @@ def refused(left: Left, words: str) -> None:
 
 
 def goes_on(scene: Path, out: Path, folder: Path, ranks: int = 1) -> None:
-    """The run resumes behind its last whole state, without a gap or a double."""
+    """Check that the run resumes after its last complete state, without gap or duplicate."""
     before = announced(out)
     end = before[-1] + 0.1
     done(["run", scene, "--out", out, "--resume", "--set", f"time.end={end:.3f}"], folder, ranks)
@@ -80,7 +80,7 @@ def test_a_disk_full_from_the_start(tmp_path: Path, small_disk: Path) -> None:
 
 @pytest.mark.parametrize("in_a_row", [False, True])
 def test_a_limit_on_the_size_of_files(tmp_path: Path, in_a_row: bool) -> None:
-    """It meets a state, or the history in the middle of a row."""
+    """It is reached in a state, or within a row of the history."""
     program = tmp_path / "limited.py"
     program.write_text(LIMITED.format(in_a_row=in_a_row))
     scene = write_scene(tmp_path, ENDLESS)
@@ -99,7 +99,7 @@ def test_a_limit_on_the_size_of_files(tmp_path: Path, in_a_row: bool) -> None:
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_the_folder_vanishes(tmp_path: Path, ranks: int) -> None:
+def test_the_folder_is_removed(tmp_path: Path, ranks: int) -> None:
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, ranks)
     wait_for_states(tmp_path / "out", 4)
     (tmp_path / "out").rename(tmp_path / "elsewhere")

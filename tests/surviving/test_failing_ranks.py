@@ -1,4 +1,4 @@
-"""One rank that fails ends the job within 20 s, wherever it is, and no process stays behind."""
+"""A failing rank ends the job within 20 s, and no process remains."""
 
 from __future__ import annotations
 
@@ -85,14 +85,14 @@ def job(folder: Path, place: str, what: str, rank: int, ranks: int) -> Left:
         ("a row of the history", 1, 2),
     ],
 )
-def test_an_exception(tmp_path: Path, place: str, rank: int, ranks: int) -> None:
+def test_an_exception_on_one_rank(tmp_path: Path, place: str, rank: int, ranks: int) -> None:
     left = job(tmp_path, place, "raise ZeroDivisionError('here')", rank, ranks)
     assert left.code not in (0, 2, 3)
     assert f"internal error on rank {rank}: ZeroDivisionError: here" in left.err
 
 
 @pytest.mark.parametrize(("place", "rank"), [("distributing", 1), ("residual", 0)])
-def test_no_memory_left(tmp_path: Path, place: str, rank: int) -> None:
+def test_no_memory_left_on_one_rank(tmp_path: Path, place: str, rank: int) -> None:
     left = job(tmp_path, place, "out_of_memory()", rank, 2)
     assert left.code == 3, left.err
     (line,) = left.ours
@@ -100,15 +100,15 @@ def test_no_memory_left(tmp_path: Path, place: str, rank: int) -> None:
     assert line.endswith("take more memory, more machines or a coarser mesh")
 
 
-def test_an_error_of_ours_on_one_rank_only(tmp_path: Path) -> None:
-    """Which should never be; the others are not waited for."""
+def test_an_error_of_the_program_on_one_rank_only(tmp_path: Path) -> None:
+    """The job ends without waiting for the other ranks."""
     what = "from lyra_petsc.errors import OutputError; raise OutputError('nowhere: cannot be written')"
     left = job(tmp_path, "a row of the history", what, 1, 2)
     assert left.code != 0
 
 
-def test_petsc_stops_on_one_rank_only(tmp_path: Path) -> None:
-    """No state can be written then, and none is promised."""
+def test_a_petsc_error_on_one_rank_only(tmp_path: Path) -> None:
+    """No state can be written, and the message does not promise one."""
     left = job(tmp_path, "residual", "from petsc4py import PETSc; raise PETSc.Error(56)", 1, 2)
     assert left.code == 3, left.err
     (line,) = left.ours
@@ -119,7 +119,7 @@ def test_petsc_stops_on_one_rank_only(tmp_path: Path) -> None:
     assert announced(tmp_path / "out")[: len(before)] == before
 
 
-def test_killed_during_the_set_up(tmp_path: Path) -> None:
+def test_a_rank_is_killed_during_the_set_up(tmp_path: Path) -> None:
     left = job(tmp_path, "assembly", "import os; os.kill(os.getpid(), 9)", 1, 2)
     assert left.code != 0
     # only the lock's file may stand, and it is no obstacle
@@ -128,7 +128,7 @@ def test_killed_during_the_set_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 2])
-def test_killed_during_the_steps(tmp_path: Path, rank: int) -> None:
+def test_a_rank_is_killed_during_the_steps(tmp_path: Path, rank: int) -> None:
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 3)
     wait_for_states(tmp_path / "out", 3)
     began = time.monotonic()
@@ -144,7 +144,7 @@ def test_killed_during_the_steps(tmp_path: Path, rank: int) -> None:
     assert announced(tmp_path / "out")[: len(before)] == before
 
 
-def test_the_launcher_killed(tmp_path: Path) -> None:
+def test_the_launcher_is_killed(tmp_path: Path) -> None:
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 2)
     wait_for_states(tmp_path / "out", 3)
     began = time.monotonic()

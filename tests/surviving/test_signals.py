@@ -1,4 +1,4 @@
-"""Signals: at any moment no traceback, the right exit code, and a checkpoint once there are steps."""
+"""Signals at any moment: no traceback, the right exit code, and a checkpoint once there are steps."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ CODES = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGUSR1, 143), (si
     ("seconds", "number", "code"),
     [(seconds, *CODES[0]) for seconds in (0.1, 0.3, 0.6, 0.9)] + [(0.3, *each) for each in CODES[1:]],
 )
-def test_at_the_start(tmp_path: Path, seconds: float, number: signal.Signals, code: int) -> None:
-    """Imports, MPI, set-up, first steps, wherever the moment falls on this machine."""
+def test_signals_during_the_start(tmp_path: Path, seconds: float, number: signal.Signals, code: int) -> None:
+    """During imports, MPI, set-up or first steps, depending on the machine."""
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path)
     time.sleep(seconds)
     deadline = time.monotonic() + 20
@@ -65,7 +65,7 @@ def test_at_the_start(tmp_path: Path, seconds: float, number: signal.Signals, co
 
 
 def maps(pid: int) -> list[str]:
-    """Signs that our handlers stand: the process catches SIGUSR1."""
+    """Check that the program's handlers are installed: the process catches SIGUSR1."""
     with open(f"/proc/{pid}/status", encoding="utf-8") as file:
         caught = next(int(line.split()[1], 16) for line in file if line.startswith("SigCgt"))
     return ["lyra_petsc"] if caught >> (signal.SIGUSR1 - 1) & 1 else []
@@ -91,7 +91,9 @@ def test_one_rank_that_gets_a_signal_has_all_finish_the_step(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_mpirun_leaves_a_second_and_nothing_announced_is_lost(tmp_path: Path, number: signal.Signals) -> None:
+def test_mpirun_kills_after_a_second_and_no_listed_state_is_lost(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     scene = write_scene(tmp_path, ENDLESS)
     process = start(["run", scene, "--out", "out"], tmp_path, 2)
     wait_for_states(tmp_path / "out", 5)
@@ -107,7 +109,7 @@ def test_mpirun_leaves_a_second_and_nothing_announced_is_lost(tmp_path: Path, nu
     assert after == pytest.approx([0.02 * k for k in range(len(after))])
 
 
-def test_usr1_through_mpirun_reaches_the_ranks(tmp_path: Path) -> None:
+def test_mpirun_forwards_usr1_to_the_ranks(tmp_path: Path) -> None:
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 2)
     wait_for_states(tmp_path / "out", 3)
     process.send_signal(signal.SIGUSR1)
@@ -117,7 +119,7 @@ def test_usr1_through_mpirun_reaches_the_ranks(tmp_path: Path) -> None:
 
 
 def test_a_long_step_under_mpirun_has_its_start_in_the_checkpoint(tmp_path: Path) -> None:
-    """Long before a state or a minute is due, the checkpoint holds the last accepted step."""
+    """The checkpoint has the last accepted step long before the next state or minute."""
     program = tmp_path / "slow.py"
     program.write_text(SLOW_STEPS.format(seconds=60))
     scene = write_scene(
@@ -135,7 +137,7 @@ def test_a_long_step_under_mpirun_has_its_start_in_the_checkpoint(tmp_path: Path
     assert summary["resumed"][-1]["step"] == 6
 
 
-def test_a_long_step_is_finished_and_kept(tmp_path: Path) -> None:
+def test_a_long_step_is_finished_and_written(tmp_path: Path) -> None:
     program = tmp_path / "slow.py"
     program.write_text(SLOW_STEPS.format(seconds=3))
     process = start(
@@ -148,7 +150,7 @@ def test_a_long_step_is_finished_and_kept(tmp_path: Path) -> None:
     assert "stopped by SIGUSR1 after step 7 " in left.ours[0]
 
 
-def test_output_that_nobody_reads_ends_no_run(tmp_path: Path) -> None:
+def test_a_closed_stdout_does_not_end_the_run(tmp_path: Path) -> None:
     words = command(["run", write_scene(tmp_path, ENDLESS), "--out", "out", "--set", "time.end=0.1"])
     process = subprocess.Popen(
         words,
@@ -164,7 +166,7 @@ def test_output_that_nobody_reads_ends_no_run(tmp_path: Path) -> None:
     assert announced(tmp_path / "out")[-1] == pytest.approx(0.1)
 
 
-def test_nohup_stays_in_force(tmp_path: Path) -> None:
+def test_nohup_is_respected(tmp_path: Path) -> None:
     words = command(["run", write_scene(tmp_path, ENDLESS), "--out", "out", "--set", "time.end=0.5"])
     ignore = "signal.signal(signal.SIGHUP, signal.SIG_IGN); os.execv(sys.argv[1], sys.argv[1:])"
     process = subprocess.Popen(

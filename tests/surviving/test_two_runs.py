@@ -1,4 +1,4 @@
-"""Two runs into one folder: the second is refused, whatever the first is at."""
+"""Two runs in one folder: the second is always refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choice of states, folders, disks, and the command."""
+"""The command ``export``: choice of states, folders, full disks."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from lyra_petsc.show.export import FORMATS, ExportFormat, export_run
 
 
 def states(folder):
-    """Which states the files of an OBJ sequence hold, by their positions."""
+    """Numbers of the states in the files of an OBJ sequence, by their positions."""
     found = []
     for file in sorted(folder.glob("*.obj")):
         lines = file.read_text().splitlines()
@@ -38,7 +38,7 @@ def test_choice_of_states(tmp_path, chosen, expected):
     assert done.states == len(expected)
 
 
-def test_times_of_a_sequence_are_beside_it(tmp_path):
+def test_times_of_a_sequence_are_in_a_table(tmp_path):
     done = export_run(written(tmp_path / "run", states=4), "obj", times="0.1,0.3")
     expected = "file,state,time\n0,1,0.1\n1,3,0.30000000000000004\n"
     assert (done.folder / "times.csv").read_text() == expected
@@ -55,7 +55,7 @@ def test_times_of_a_sequence_are_beside_it(tmp_path):
         ({"every": 1, "times": "0"}, r"--every: choose states either by"),
     ],
 )
-def test_mistakes_write_nothing(tmp_path, asked, words):
+def test_mistakes_leave_no_files(tmp_path, asked, words):
     folder = written(tmp_path / "run")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match=words):
@@ -69,7 +69,7 @@ def test_a_missing_extra_is_one_line(tmp_path, monkeypatch):
         export_run(written(tmp_path / "run"), "usd")
 
 
-def test_an_existing_folder_is_replaced_by_force_alone(tmp_path):
+def test_an_existing_folder_is_replaced_with_force_only(tmp_path):
     run, out = written(tmp_path / "run", states=5), tmp_path / "a" / "b"
     export_run(run, "obj", out)
     with pytest.raises(InputError, match=r"b: --out: exists; name another folder, or give --force"):
@@ -88,7 +88,7 @@ def test_an_existing_folder_is_replaced_by_force_alone(tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a", "file", "run"]
 
 
-def test_a_failure_leaves_what_stood_there(tmp_path, monkeypatch):
+def test_a_failure_keeps_the_existing_folder(tmp_path, monkeypatch):
     run, out = written(tmp_path / "run"), tmp_path / "out"
     export_run(run, "obj", out)
 
@@ -116,8 +116,8 @@ def test_a_full_disk(tmp_path, small_disk, to):
     assert list(small_disk.iterdir()) == []
 
 
-def test_what_has_no_obstacles_does_not_import_them(tmp_path):
-    """Neither to set a scene up nor to export its run; with some they are."""
+def test_obstacles_are_imported_for_scenes_with_obstacles_only(tmp_path):
+    """For setting up a scene and for exporting its run."""
     code = """
 import sys
 from lyra_petsc.mesh.build import build_scene_mesh

@@ -1,4 +1,4 @@
-"""What is read back from each format equals the states, to the format's precision."""
+"""Exported files of each format, read back, equal the states within the format's precision."""
 
 import json
 import shutil
@@ -64,7 +64,7 @@ def test_ply(tmp_path):
 
 
 @pytest.mark.parametrize("to", ["npz", "vtkhdf", "ply", "usd"])
-def test_displacement_is_added_where_it_is_asked_for(tmp_path, to):
+def test_displacement_is_added_on_request(tmp_path, to):
     """From the run's first state, whichever states are chosen."""
     run = written(tmp_path / "run", states=4)
     moved = position(3) - position(0)
@@ -102,7 +102,7 @@ def test_formats_of_positions_alone_refuse_displacement(tmp_path, to):
 
 
 def read_glb(path):
-    """The document, and a function that reads an accessor by the format's rules."""
+    """The JSON document, and a function that reads an accessor by the rules of the format."""
     pygltflib = pytest.importorskip("pygltflib")
     gltf = pygltflib.GLTF2().load(str(path))
     blob = gltf.binary_blob()
@@ -156,7 +156,7 @@ def test_gltf(tmp_path, vt):
 
 
 @pytest.mark.parametrize("vt", ["none", "each vertex"])
-def test_gltf_as_another_program_animates_it(tmp_path, vt):
+def test_gltf_animated_by_the_rules_of_the_format(tmp_path, vt):
     geometry = pytest.importorskip("vtkmodules.vtkIOGeometry")
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -177,7 +177,7 @@ def test_gltf_as_another_program_animates_it(tmp_path, vt):
 
 
 def usd_errors(stage):
-    """What the library's own validators have against a stage."""
+    """Complaints of the library's own validators about a stage."""
     validation = pytest.importorskip("pxr.UsdValidation")
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
@@ -253,7 +253,7 @@ def test_vtkhdf(tmp_path):
 
 
 @pytest.mark.parametrize("to", ["obj", "ply", "gltf", "usd", "npz", "vtkhdf"])
-def test_a_single_state_of_a_run_with_a_name_of_its_own(tmp_path, to):
+def test_a_single_state_of_a_named_run(tmp_path, to):
     folder = tmp_path / "Fähnchen 旗 (1)"
     done = export_run(written(folder, states=1, fields=False), to)
     assert done.states == 1
@@ -275,7 +275,7 @@ def test_a_single_state_of_a_run_with_a_name_of_its_own(tmp_path, to):
 
 
 @pytest.mark.parametrize(("gravity", "axis"), [([0, -9.81, 0], "Y"), ([9.81, 0, 0], "Z"), (None, "Z")])
-def test_up_is_against_gravity(tmp_path, gravity, axis):
+def test_the_vertical_axis_is_against_gravity(tmp_path, gravity, axis):
     pytest.importorskip("pxr")
     from pxr import Gf, Usd, UsdGeom
 
@@ -291,7 +291,7 @@ def test_up_is_against_gravity(tmp_path, gravity, axis):
 
 @pytest.mark.parametrize("target", [0, 1, 2])
 @pytest.mark.parametrize("up", [(axis, sign) for axis in range(3) for sign in (-1, 1)])
-def test_the_turn_that_makes_an_axis_the_upper_one(up, target):
+def test_rotations_that_make_an_axis_vertical(up, target):
     x, y, z, w = rotation_to_up(up, target)
     assert x * x + y * y + z * z + w * w == pytest.approx(1.0)
     vector, q = np.zeros(3), np.array([x, y, z])
@@ -310,7 +310,7 @@ def test_json_of_a_glb_holds_no_empty_values(tmp_path):
 
 
 def read_objects(to, folder):
-    """Of each obstacle in an export of two states: its points (2, n, 3) and its triangles (m, 3)."""
+    """Points (2, n, 3) and triangles (m, 3) of each obstacle in an export of two states."""
     if to == "obj":
         found = {}
         for file in sorted(folder.glob("*.obj")):
@@ -366,8 +366,8 @@ def read_objects(to, folder):
 
 
 @pytest.mark.parametrize("to", ["obj", "ply", "npz", "vtkhdf", "gltf", "usd"])
-def test_obstacles_are_objects_of_their_own(tmp_path, to):
-    """A ball that moves 1.5 m along x and a triangle that stands still; the cloth is as without them."""
+def test_obstacles_are_separate_objects(tmp_path, to):
+    """A ball that moves by 1.5 m along x and a triangle at rest; the cloth is as without them."""
     export_run(met(tmp_path / "run"), to, tmp_path / "out", times="0,0.5")
     found = read_objects(to, tmp_path / "out")
     assert set(found) == {"ball", "post"}
@@ -382,7 +382,7 @@ def test_obstacles_are_objects_of_their_own(tmp_path, to):
     np.testing.assert_array_equal(faces, POST.triangles)
 
 
-def test_names_of_obstacles_in_files_are_different(tmp_path):
+def test_names_of_obstacles_in_files_are_unique(tmp_path):
     ball = {"sphere": {"center": [0, 0, 0], "radius": 1}}
     names = ["cloth", "a b", "a_b", "2/1", "ü"]
     done = export_run(met(tmp_path / "run", dict.fromkeys(names, ball)), "obj", every=99)

@@ -1,4 +1,4 @@
-"""The camera: everything in the picture and no nearer than it must be; the side that shows most."""
+"""The camera: everything is in the picture, as large as possible, from the most informative side."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def with_camera(camera: dict | None, gravity: tuple | None = None) -> Scene:
 
 
 def in_picture(view: PerspectiveCamera, points: np.ndarray, aspect: float) -> np.ndarray:
-    """(n, 2) places of points in the picture, -1 to 1 from edge to edge, raised by the window centre."""
+    """Coordinates (n, 2) of points in the picture, −1 to 1 between its edges, after ``window_center``."""
     sight = view.position - view.target
     sight = sight / np.linalg.norm(sight)
     right = np.cross(view.up, sight)
@@ -56,7 +56,7 @@ def test_all_points_are_seen_and_one_touches_the_margin(sight, bar, aspect):
     assert places[:, full].min() == pytest.approx(-places[:, full].max())
 
 
-def test_zoom_comes_nearer():
+def test_zoom_enlarges_the_sheet():
     points = np.eye(3)
     distances = []
     for zoom in (1.0, 2.0):
@@ -67,7 +67,7 @@ def test_zoom_comes_nearer():
     assert distances[0] == pytest.approx(2.0 * distances[1])
 
 
-def test_a_camera_given_by_its_place_stands_there():
+def test_a_camera_with_a_position_is_there():
     chosen = with_camera({"position": [1, 2, 3], "target": [0, 0, 1], "up": [0, 1, 0], "angle": 50})
     up = up_direction(chosen)
     view = CameraFit(chosen, line_of_sight(chosen, up, [], np.empty((0, 3), int)), up, 1.5).view(np.zeros(6))
@@ -111,7 +111,7 @@ def test_a_lying_sheet_is_seen_from_the_front_and_above():
     assert sight[2] > 0.5
 
 
-def test_a_sheet_that_lies_at_first_and_hangs_later_is_not_seen_from_its_edge():
+def test_a_sheet_that_lies_and_later_hangs_is_not_seen_edge_on():
     lying = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     hanging = np.array([[0.0, 1, -1], [1, 1, -1], [1, 1, 0], [0, 1, 0]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
@@ -121,7 +121,7 @@ def test_a_sheet_that_lies_at_first_and_hangs_later_is_not_seen_from_its_edge():
 
 
 @pytest.mark.parametrize(("frame", "reach"), [(None, 1.0), (100.0, 50.0), (50.0, 1.0)])
-def test_a_short_excursion_does_not_set_the_frame(frame, reach):
+def test_a_short_excursion_does_not_determine_the_frame(frame, reach):
     chosen = with_camera({"direction": [0, -1, 0]} | ({"frame": frame} if frame else {}))
     fit = CameraFit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
     supports = np.ones((50, 6))

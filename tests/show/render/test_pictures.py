@@ -1,4 +1,4 @@
-"""What is drawn, looked at pixel by pixel; films as their readers see them."""
+"""Pictures, checked pixel by pixel, and films."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pixel(x: float, y: float) -> tuple[int, int]:
     return round(60 - (y - 1.5) / half * 60), round(80 + (x - 1.5) / half * 60)
 
 
-def test_the_sheet_is_where_it_is(ring, tmp_path):
+def test_the_sheet_is_at_its_place_in_the_picture(ring, tmp_path):
     image = picture(ring, tmp_path)
     assert image.shape == (120, 160, 3)
     red = (image[:, :, 0] > 1.5 * image[:, :, 1]) & (image[:, :, 0] > 1.5 * image[:, :, 2])
@@ -61,22 +61,22 @@ def test_the_sheet_is_where_it_is(ring, tmp_path):
     assert red.sum() * (2 * 9.0 * np.tan(np.radians(15.0)) / 120) ** 2 == pytest.approx(8.0, rel=0.05)
 
 
-def test_the_back_has_its_own_tone(ring, tmp_path):
+def test_the_back_has_its_own_colour(ring, tmp_path):
     below = ("render.camera.position=[1.5,1.5,-9]", *LEVEL[1:])
     image = picture(ring, tmp_path, settings=below)
     blue = image[pixel(0.5, 1.5)]
     assert blue[2] > 1.5 * blue[0]
 
 
-def test_light_is_seen_on_the_slope(ring, tmp_path):
+def test_a_tilted_sheet_is_shaded(ring, tmp_path):
     flat = picture(ring, tmp_path, at="0")[pixel(0.5, 1.5)]
     tilted = picture(ring, tmp_path, at="0.5")
     red = tilted[:, :, 0] > 1.5 * tilted[:, :, 1]
     assert abs(np.median(tilted[red][:, 0]) - flat[0]) > 5.0
 
 
-def test_the_ground_takes_the_shadow(ring, tmp_path):
-    """Under a scene with gravity; there is none without."""
+def test_the_ground_has_a_shadow(ring, tmp_path):
+    """With gravity; otherwise there is no ground."""
     scene = (ring / "scene.yaml").read_text(encoding="utf-8")
     run = written(tmp_path / "run", states=6)
     (run / "scene.yaml").write_text(scene + "gravity: [0, 0, -9.81]\n", encoding="utf-8")
@@ -90,7 +90,7 @@ def test_the_ground_takes_the_shadow(ring, tmp_path):
     np.testing.assert_array_equal(images[1], without)
 
 
-def test_a_texture_lies_on_its_coordinates(ring, tmp_path):
+def test_a_texture_is_placed_by_its_coordinates(ring, tmp_path):
     """Left half green, upper right quarter blue, lower right red; the picture's first row is v = 1."""
     colors = np.zeros((64, 64, 3), dtype=np.uint8)
     colors[:, :32, 1] = colors[:32, 32:, 2] = colors[32:, 32:, 0] = 200
@@ -121,7 +121,7 @@ def test_vertices_on_a_seam_are_drawn_twice():
     assert np.isfinite(vertex_normals(np.zeros((4, 3)), triangles)).all()
 
 
-def test_colours_tell_values_apart_and_come_with_a_bar(ring, tmp_path):
+def test_colours_distinguish_values_and_have_a_bar(ring, tmp_path):
     """Stress grows with the number of the triangle: the first is darkest (viridis), the last brightest."""
     image = picture(ring, tmp_path, field="stress", range="0,7", cells=True)
     first, last = image[pixel(1.2, 0.5)], image[pixel(2.2, 2.5)]
@@ -206,7 +206,7 @@ def test_a_film_that_cannot_be_finished_leaves_the_old_one(tmp_path):
             film(tmp_path / "nowhere" / "a.mp4", frames, stop=False)
 
 
-def test_states_that_are_no_numbers_are_refused(tmp_path, monkeypatch):
+def test_states_with_nan_are_refused(tmp_path, monkeypatch):
     import h5py
 
     run = written(tmp_path / "run")
@@ -218,7 +218,7 @@ def test_states_that_are_no_numbers_are_refused(tmp_path, monkeypatch):
     assert not (tmp_path / "a.mp4").exists()
 
 
-def test_no_opengl_is_one_line(ring, monkeypatch):
+def test_missing_opengl_is_one_line(ring, monkeypatch):
     class Window:
         def SetOffScreenRendering(self, on: bool) -> None: ...
 
@@ -279,8 +279,8 @@ def grey(image: np.ndarray, x: float, y: float) -> bool:
     return bool(max(red, green, blue) < 1.35 * min(red, green, blue) and max(red, green, blue) < 200)
 
 
-def test_obstacles_are_where_they_are_at_each_time(tmp_path):
-    """A ball that moves 1.5 m to the right in 0.5 s, and a mesh, which is in the run's own folder."""
+def test_obstacles_are_drawn_at_their_place_at_each_time(tmp_path):
+    """A ball that moves by 1.5 m in 0.5 s, and a mesh from the run's folder."""
     run = met(tmp_path / "run")
     start, end = (picture(run, tmp_path, at=at) for at in ("0", "0.5"))
     for image, here, there in ((start, 0.0, 1.5), (end, 1.5, 0.0)):
@@ -291,7 +291,7 @@ def test_obstacles_are_where_they_are_at_each_time(tmp_path):
         assert not grey(image, 3.9, 0.9)
 
 
-def test_planes_and_containers_hide_no_sheet(tmp_path):
+def test_planes_and_containers_do_not_hide_sheets(tmp_path):
     plane = {"plane": {"point": [0, 0, 2], "normal": [0, 0, -1]}}
     hull = {"box": {"min": [-9, -9, -9], "max": [9, 9, 4]}, "inside": True}
     plain = picture(met(tmp_path / "plain", obstacles={}), tmp_path)
@@ -305,7 +305,7 @@ def test_planes_and_containers_hide_no_sheet(tmp_path):
 
 
 def test_obstacles_are_in_the_picture(tmp_path):
-    """A ball beside the sheet is seen whole without a camera of the scene's; a far one takes little room."""
+    """A ball near the sheet is completely visible without a camera; a distant one takes little space."""
     images = []
     for number, x in enumerate((4.0, 400.0, None)):
         ball = {"ball": {"sphere": {"center": [x, 1.5, 0], "radius": 0.5}}} if x is not None else {}
@@ -321,7 +321,7 @@ def test_obstacles_are_in_the_picture(tmp_path):
     assert (np.ptp(edge, axis=1) < 30).all()
 
 
-def test_a_run_without_the_mesh_of_an_obstacle_is_damaged(tmp_path):
+def test_a_run_without_the_mesh_of_an_obstacle_is_refused(tmp_path):
     run = met(tmp_path / "run")
     write_mesh(run, ring_mesh(), MPI.COMM_SELF)
     with pytest.raises(InputError, match="does not hold the mesh of obstacle 'post'"):

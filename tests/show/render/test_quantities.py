@@ -1,4 +1,4 @@
-"""What a sheet is coloured by, against numbers worked out by hand."""
+"""Quantities shown as colours, compared with values computed by hand."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_written_fields(run):
     assert quantity(run, "velocity").label == "velocity [m/s]"
 
 
-def test_what_is_not_there_is_said(run, tmp_path):
+def test_missing_fields_are_reported(run, tmp_path):
     with pytest.raises(InputError, match="no field 'spede', did you mean 'speed'"):
         quantity(run, "spede")
     bare = StoredRun(written(tmp_path / "bare", fields=False))
@@ -67,7 +67,7 @@ def test_what_is_not_there_is_said(run, tmp_path):
         quantity(bare, "speed")
 
 
-def test_the_extent_is_that_of_each_state(run):
+def test_extents_and_percentiles_are_measured_for_each_state(run):
     normals = np.random.default_rng(0).normal(size=(5, 3))
     shown = quantity(run, "speed")
     supports, values = measure_states(run, [0, 2], normals, shown)
@@ -85,7 +85,7 @@ def ranges(values: list[np.ndarray], asked: str | None = None, signed: bool = Fa
     return made.limits(found, ColourRange.parse(asked) if asked else None)
 
 
-def test_a_violent_start_does_not_set_the_colours():
+def test_a_violent_start_does_not_determine_the_colours():
     """A tenth of the states are a hundred times faster; the range is that of the others."""
     calm = np.linspace(0.0, 1.0, 1001)
     low, high = ranges([100.0 * calm] * 2 + [calm] * 18)
@@ -101,12 +101,12 @@ def test_a_violent_start_does_not_set_the_colours():
 @pytest.mark.parametrize(
     "text", ["", "1", "2,1", "1%,2", "-1%,50%", "0%,101%", "nan,1", "0,inf", "a,b", "1,2,3"]
 )
-def test_a_range_that_is_none_is_refused(text):
+def test_invalid_ranges_are_refused(text):
     with pytest.raises(InputError, match="--range: must be"):
         ColourRange.parse(text)
 
 
-def test_checkers_disappear_in_the_means_of_vertices(run):
+def test_vertex_values_are_means_weighted_by_area(run):
     raw = quantity(run, "stress")
     smooth = raw.on_vertices(run)
     assert not smooth.on_triangles

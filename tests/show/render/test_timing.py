@@ -1,4 +1,4 @@
-"""Which states pictures and films show."""
+"""States shown by pictures and films."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_film_lasts_as_long_as_the_motion(every, fps):
     assert timing.states[-1] >= len(times) - 1 - round(1.0 / (fps * every))
 
 
-def test_each_state_is_a_frame_where_their_interval_makes_a_film():
+def test_each_state_is_a_frame_if_their_interval_suits_a_film():
     times = np.cumsum([0.0] + [0.025] * 80)
     assert film_timing(times).states == tuple(range(81))
 
@@ -46,7 +46,7 @@ def test_slow_motion_has_all_states():
     assert timing.states == tuple(range(41))
 
 
-def test_asked_for_frames_a_second():
+def test_a_given_number_of_frames_per_second():
     timing = film_timing(0.04 * np.arange(26), fps=50.0)
     assert timing.fps == 50.0
     # at 0.02 s two states are as near: the earlier
@@ -54,13 +54,13 @@ def test_asked_for_frames_a_second():
     assert len(timing.states) == 51
 
 
-def test_uneven_states_are_shown_at_their_time():
+def test_irregular_states_are_shown_at_their_times():
     times = np.array([0.0, 0.1, 0.11, 0.12, 1.0])
     timing = film_timing(times, fps=10.0)
     assert timing.states == (0, 1, 3, 3, 3, 3, 4, 4, 4, 4, 4)
 
 
-def test_gif_has_delays_of_whole_hundredths():
+def test_gifs_have_delays_of_whole_hundredths():
     assert film_timing(0.025 * np.arange(81), gif=True).fps == 20.0
     assert film_timing(0.04 * np.arange(81), gif=True).fps == 25.0
     assert film_timing(0.04 * np.arange(81), gif=True, fps=200.0).fps == 50.0
@@ -76,7 +76,7 @@ def test_a_single_state_is_a_film_of_one_frame():
     assert film_timing(np.array([0.0])).states == (0,)
 
 
-def test_films_without_end_are_refused():
+def test_films_that_are_too_long_are_refused():
     with pytest.raises(InputError, match=r"--film: .* would have 1e.06 frames"):
         film_timing(np.linspace(0.0, 1e5, 1001))
 
@@ -101,7 +101,7 @@ def test_times_outside_the_run_are_refused(time):
         pick_state(run_of(np.linspace(0.0, 1.0, 26)), time, "--at")
 
 
-def test_pictures_of_a_sheet_are_spread():
+def test_states_of_a_contact_sheet_are_evenly_spaced():
     assert spread_states(0.1 * np.arange(11), 6) == (0, 2, 4, 6, 8, 10)
     assert spread_states(0.1 * np.arange(2), 6) == (0, 1)
     assert spread_states(np.array([0.0]), 6) == (0,)
@@ -110,7 +110,7 @@ def test_pictures_of_a_sheet_are_spread():
 @pytest.mark.parametrize(
     ("interval", "expected"), [(0.04, 2), (0.025, 3), (0.1, 1), (1.0, 0), (30.0, 0), (0.001, 3), (1 / 60, 3)]
 )
-def test_the_time_in_the_corner_tells_states_apart(interval, expected):
+def test_the_time_in_the_corner_distinguishes_states(interval, expected):
     times = np.cumsum(np.r_[0.0, np.full(9, interval)])
     assert decimals(times) == expected
     assert len({f"{time:.{expected}f}" for time in times}) == 10

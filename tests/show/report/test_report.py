@@ -1,4 +1,4 @@
-"""Reports: what stands in them, that they need no other file, and what their figures say."""
+"""Reports: content, self-contained files, figures."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def small_report() -> Report:
     return report
 
 
-def test_the_html_is_whole_and_fetches_nothing(tmp_path: Path) -> None:
+def test_the_html_is_complete_and_fetches_nothing(tmp_path: Path) -> None:
     written = small_report().write(tmp_path)
     assert {path.name for path in written} == {
         "report.html", "report.md", "steps.png", "steps.svg", "work.png", "work.svg"
@@ -60,13 +60,13 @@ def test_the_html_is_whole_and_fetches_nothing(tmp_path: Path) -> None:
     assert "my scene.yaml" in page
 
 
-def test_a_page_with_line_drawings_draws_no_pixels() -> None:
+def test_pages_with_line_drawings_have_no_bitmaps() -> None:
     report = small_report()
     report.html()
     assert not any("png" in vars(drawing) for drawing in report.drawings)
 
 
-def test_the_markdown_says_the_same(tmp_path: Path) -> None:
+def test_the_markdown_has_the_same_content(tmp_path: Path) -> None:
     small_report().write(tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "| **x\\|y** | **0.0123** |" in text
@@ -90,7 +90,7 @@ def test_the_same_data_give_the_same_figures() -> None:
     assert [drawing.svg for drawing in one] == [drawing.svg for drawing in two]
 
 
-def test_slopes() -> None:
+def test_slopes_of_fits() -> None:
     assert fitted_slope(STEPS, [3.0 * step**2 for step in STEPS]) == pytest.approx(2.0)
     assert math.isnan(fitted_slope([0.1], [1.0]))
     assert math.isnan(fitted_slope([0.1, 0.1], [1.0, 2.0]))
@@ -108,11 +108,11 @@ def test_slopes() -> None:
         (1.0, "1 s"),
     ],
 )
-def test_times_in_words(value: float, text: str) -> None:
+def test_times_as_text(value: float, text: str) -> None:
     assert seconds(value) == text
 
 
-def test_numbers_in_words() -> None:
+def test_numbers_as_text() -> None:
     assert [short(v) for v in (0.0, 100.0, 0.0123456, 1.5e-5, 2e6, math.nan)] == [
         "0", "100", "0.0123", "1.5e-5", "2e6", "–"
     ]  # fmt: skip
@@ -128,7 +128,7 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         extras.require_packages("study")
 
 
-def test_plain_numbers_and_tables_need_no_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_and_tables_need_no_extra_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def refuse(name: str, *rest: object, **more: object) -> object:

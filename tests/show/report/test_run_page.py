@@ -1,4 +1,4 @@
-"""The page about a run: finished, failed, stopped, killed, or going on."""
+"""The report of a run that is finished, failed, stopped, killed, or unfinished."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FAILING = SCENE.replace("c11: 800, c22: 800", "c11: 8.0e+9, c22: 8.0e+9") + "sol
 
 
 def page_of(folder: Path) -> str:
-    """The text of the page, tags and pictures taken out."""
+    """Text of the page without tags and pictures."""
     write_page(folder, None)
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"https?://|<script|<link|url\(", page)
@@ -70,7 +70,7 @@ def test_a_finished_run_has_all_sections(finished: Path) -> None:
     assert "PETSc options that nothing used: -ksp_rtoll" in text
 
 
-def test_the_page_does_without_what_draws_films(
+def test_the_page_needs_no_packages_for_films(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = copied(finished, tmp_path)
@@ -93,7 +93,7 @@ def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> No
     assert f"taken away by the time scheme {facts.scheme_loss[-1]:.3g}"[:38] in page_of(finished)
 
 
-def test_a_run_that_failed_says_why_and_what_to_try(tmp_path: Path) -> None:
+def test_a_failed_run_has_its_cause_and_advice(tmp_path: Path) -> None:
     write_scene(tmp_path, FAILING)
     left = lyra(["run", "scene.yaml", "--out", "bad", "-ts_adapt_dt_min", "0.005"], tmp_path)
     assert left.code == 3, left.err
@@ -103,7 +103,7 @@ def test_a_run_that_failed_says_why_and_what_to_try(tmp_path: Path) -> None:
     assert "The last attempt, Newton iteration by iteration" in text  # failure.txt
 
 
-def test_a_killed_run_is_told_from_one_that_goes_on(finished: Path, tmp_path: Path) -> None:
+def test_a_killed_run_is_distinguished_from_an_unfinished_one(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path)
     summary = read_json(run / "summary.json")
     (run / "summary.json").write_text(json.dumps({**summary, "outcome": "running"}), encoding="utf-8")
@@ -119,7 +119,7 @@ def test_a_killed_run_is_told_from_one_that_goes_on(finished: Path, tmp_path: Pa
     assert "How the run ended is not known" in page_of(run)
 
 
-def test_a_stopped_run_says_how_to_go_on(tmp_path: Path) -> None:
+def test_a_stopped_run_says_how_to_continue(tmp_path: Path) -> None:
     write_scene(tmp_path, SCENE.replace("end: 0.05, step: 0.01", "end: 1000, step: 0.01"))
     process = start(["run", "scene.yaml", "--out", "long"], tmp_path)
     wait_until((tmp_path / "long" / "states.xdmf").exists)
@@ -140,7 +140,9 @@ def test_a_static_run_has_load_factors(tmp_path: Path) -> None:
     assert "increment of the load factor" in text
 
 
-def test_the_page_can_go_elsewhere_and_mistakes_are_one_line(finished: Path, tmp_path: Path) -> None:
+def test_the_page_is_written_to_a_given_file_and_mistakes_are_one_line(
+    finished: Path, tmp_path: Path
+) -> None:
     done(["report", finished, "--out", "page.html"], tmp_path, ranks=2)
     assert (tmp_path / "page.html").is_file()
     for arguments, words in (
@@ -166,7 +168,7 @@ def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
 
 
 def told(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
-    """The advice for the finished run with another summary or other columns of its history."""
+    """Advice for the finished run with a changed summary or history."""
     from lyra_petsc.output.read_run import StoredRun
 
     run = StoredRun(finished)
@@ -197,7 +199,7 @@ WALL = {"mesh": 0.1, "solve": 8.0, "output": 0.5, "other": 0.1}
         ({"summary": {"ranks": 4}}, "4 ranks share 25 vertices"),
     ],
 )  # fmt: skip
-def test_advice(finished: Path, changes: dict[str, Any], words: str) -> None:
+def test_advice_for_slow_or_inaccurate_runs(finished: Path, changes: dict[str, Any], words: str) -> None:
     usual = {"ranks": 1, "wall_seconds": WALL}
     quiet = {"newton_iterations": 3.0, "linear_iterations": 30.0, "dissipation": 0.01}
     assert words not in told(finished, usual, **quiet)

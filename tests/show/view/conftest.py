@@ -1,4 +1,4 @@
-"""A run's page, served by a process of its own, and a browser without a screen."""
+"""A run's page, served by a separate process, and a headless browser."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Served:
         return self.url.partition("token=")[2]
 
     def get(self, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
-        """Ask without a browser; ``_`` in the names of headers stands for ``-``."""
+        """Send a request without a browser; ``_`` in names of headers stands for ``-``."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
         connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
         answer = connection.getresponse()
         return answer.status, dict(answer.getheaders()), answer.read()
 
     def cookie(self) -> str:
-        """What a browser sends after it has opened the address."""
+        """The cookie that a browser sends after it has opened the address."""
         return self.get(f"/?token={self.token}")[1]["Set-Cookie"].split(";")[0]
 
 
@@ -53,7 +53,7 @@ Serve = Callable[..., Served]
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Serve]:
-    """Starts ``view`` on a folder; ended with the test."""
+    """Start ``view`` for a folder; it ends with the test."""
     from launch import start
 
     pytest.importorskip("trame")
@@ -76,7 +76,7 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium without a screen, drawing by software."""
+    """Headless Chromium with software rendering."""
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     try:
         from selenium import webdriver

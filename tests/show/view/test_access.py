@@ -1,4 +1,4 @@
-"""Who may see the page."""
+"""Access to the page."""
 
 import asyncio
 import signal
@@ -26,7 +26,7 @@ def words_at_the_end(page):
     return left.err
 
 
-def test_nothing_without_the_token(serve, tmp_path):
+def test_everything_is_refused_without_the_token(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
     wrong = page.token[:-1] + ("A" if page.token[-1] != "A" else "B")
 
@@ -41,7 +41,7 @@ def test_nothing_without_the_token(serve, tmp_path):
     assert page.token.encode() not in page.get("/")[2]
 
 
-def test_the_token_opens_the_page_and_its_cookie_the_rest(serve, tmp_path):
+def test_the_token_gives_access_to_the_page_and_its_cookie_to_the_rest(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
 
     code, headers, _ = page.get(f"/?token={page.token}")
@@ -59,7 +59,7 @@ def test_the_token_opens_the_page_and_its_cookie_the_rest(serve, tmp_path):
     assert page.get("/nothing", Cookie=page.cookie())[0] == 404
 
 
-def test_what_opens_no_web_socket_is_answered_and_the_end_is_clean(serve, tmp_path):
+def test_requests_that_open_no_web_socket_are_answered(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
     for change in (
         dict.fromkeys(SOCKET),
@@ -75,7 +75,7 @@ def test_what_opens_no_web_socket_is_answered_and_the_end_is_clean(serve, tmp_pa
     assert words_at_the_end(page) == ""
 
 
-def test_what_is_no_request_is_answered_without_a_traceback(serve, tmp_path):
+def test_malformed_requests_are_answered_without_a_traceback(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
     for origin in ("http://[", "null", "http://[::1", "://", "\x80"):
         assert page.get(f"/index.html?token={page.token}", Origin=origin)[0] == 403, origin
@@ -92,7 +92,7 @@ def test_what_is_no_request_is_answered_without_a_traceback(serve, tmp_path):
     assert words_at_the_end(page) == ""
 
 
-def test_messages_that_are_none_of_the_page_end_their_web_socket_only(serve, tmp_path):
+def test_unknown_messages_end_their_web_socket_only(serve, tmp_path):
     import aiohttp
 
     page = serve(written(tmp_path / "run"))
@@ -110,7 +110,7 @@ def test_messages_that_are_none_of_the_page_end_their_web_socket_only(serve, tmp
     assert "Traceback" not in words_at_the_end(page)
 
 
-def test_other_names_and_other_sites_are_refused_with_the_token_too(serve, tmp_path):
+def test_other_host_names_and_sites_are_refused_despite_the_token(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
     cookie, path = page.cookie(), "/vue.global.js"
 
@@ -133,7 +133,7 @@ def test_other_names_and_other_sites_are_refused_with_the_token_too(serve, tmp_p
     assert page.get("/ws", Cookie=cookie, Origin=f"http://{ours}", **SOCKET)[0] == 101
 
 
-def test_another_address_only_when_asked_for(serve, tmp_path):
+def test_another_address_is_used_on_request_only(serve, tmp_path):
     folder = written(tmp_path / "run")
     own, all_ = serve(folder), serve(folder, "--host", "0.0.0.0")
 
@@ -150,12 +150,12 @@ def test_another_address_only_when_asked_for(serve, tmp_path):
     ("host", "local"),
     [("127.0.0.1", True), ("::1", True), ("localhost", True), ("127.9.9.9", True), ("0.0.0.0", False)],
 )
-def test_what_is_local(host, local):
+def test_local_addresses(host, local):
     assert is_loopback(host) is local
     assert Access("token", host).n_open == 0
 
 
-def test_the_port_is_that_asked_for_and_only_once(serve, tmp_path):
+def test_a_given_port_is_used_and_refused_if_taken(serve, tmp_path):
     from launch import lyra
 
     page = serve(written(tmp_path / "run"))

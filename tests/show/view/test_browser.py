@@ -1,4 +1,4 @@
-"""The page in a real browser: it loads, plays, and does what is clicked."""
+"""The page in a real browser: loading, playing, and controls."""
 
 import io
 import itertools
@@ -17,7 +17,7 @@ PATIENCE = 60.0
 
 
 class Seen:
-    """What is on the page."""
+    """Content of the page."""
 
     def __init__(self, browser, url):
         from selenium.webdriver.common.by import By
@@ -49,7 +49,7 @@ class Seen:
         return float(self.text("clock").split()[2])
 
     def picture(self):
-        """(height, width, 3) what is drawn of the cloth."""
+        """Picture (height, width, 3) of the cloth."""
         from PIL import Image
 
         (view,) = self.elements(".picture")
@@ -96,7 +96,7 @@ class Seen:
         )
 
     def until_drawn(self, before, differs=True):
-        """Wait for another picture than ``before``."""
+        """Wait for a picture other than ``before``."""
 
         def is_other():
             now = self.picture()
@@ -124,7 +124,7 @@ class Seen:
         self.until(lambda: not self.elements(items))
 
     def complaints(self):
-        """What the browser's console says above a mere note."""
+        """Messages of the browser's console above the level of notes."""
         return [line for line in self.browser.get_log("browser") if line["level"] not in ("INFO", "DEBUG")]
 
     def asked_elsewhere(self, url):
@@ -139,7 +139,7 @@ class Seen:
         ]
 
 
-def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
+def test_the_page_loads_plays_and_reacts_to_controls(serve, browser, tmp_path):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.keys import Keys
 
@@ -214,7 +214,7 @@ def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
 
 
 def test_obstacles_are_shown_and_move(serve, browser, tmp_path):
-    """A ball behind the sheet that moves to the right, a post that stays, and a plane seen through."""
+    """A ball behind the sheet that moves to the right, a post at rest, and a transparent plane."""
     above = {"plane": {"point": [0, 0, 5], "normal": [0, 0, -1]}}
     run = met(tmp_path / "run", MET | {"above": above})
     looks = ("position=[1.5,1.5,12]", "target=[1.5,1.5,0]")
@@ -235,8 +235,7 @@ def test_obstacles_are_shown_and_move(serve, browser, tmp_path):
     assert seen.complaints() == []
 
 
-def test_hand_and_eye(serve, browser, tmp_path):
-    """Keys, a vertex picked, range and map of the colours, handles and wind, the picture saved."""
+def test_keys_picking_colours_handles_and_pictures(serve, browser, tmp_path):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.keys import Keys
 
@@ -297,7 +296,7 @@ def test_hand_and_eye(serve, browser, tmp_path):
     assert seen.complaints() == []
 
 
-def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
+def test_a_running_simulation_is_followed(serve, browser, tmp_path):
     writer = Writer(tmp_path / "run")
     writer.write()
     page = serve(tmp_path / "run")
@@ -327,7 +326,7 @@ def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
     assert seen.complaints() == []
 
 
-def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(browser, tmp_path):
+def test_open_pages_report_the_end_of_the_run_and_stay(browser, tmp_path):
     from lyra_petsc.show.view.live import LivePage
 
     writer = Writer(tmp_path / "run")
@@ -350,7 +349,7 @@ def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(brows
     assert seen.complaints() == []
 
 
-def test_a_browser_without_the_token_sees_nothing(serve, browser, tmp_path):
+def test_a_browser_without_the_token_is_refused(serve, browser, tmp_path):
     page = serve(written(tmp_path / "run"))
     browser.get(page.url.partition("?")[0] + "?token=guess")
     assert "403" in browser.page_source

@@ -1,4 +1,4 @@
-"""Pages that are late: what they still have to fetch is kept, and they are told."""
+"""Slow pages: data that they still have to fetch are kept, and delays are shown."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytest.importorskip("trame")
 
 
 class Sent:
-    """An array that was sent, which nothing else refers to."""
+    """An array that was sent, without other references."""
 
     def __init__(self, mebibytes: float, references: int = 1) -> None:
         self._size, self._references = int(1024 * mebibytes), references
@@ -27,7 +27,7 @@ class Sent:
         return self._references
 
 
-def test_only_the_oldest_beyond_the_budget_are_forgotten() -> None:
+def test_only_the_oldest_arrays_beyond_the_budget_are_released() -> None:
     from lyra_petsc.show.view.page import release_old_arrays
 
     now = time.time()
@@ -44,7 +44,7 @@ def test_only_the_oldest_beyond_the_budget_are_forgotten() -> None:
     assert len(young) == 9
 
 
-def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None:
+def test_the_page_waits_for_slow_browsers_and_shows_it(tmp_path, monkeypatch) -> None:
     from lyra_petsc.show.view import page as module
 
     monkeypatch.setattr(module, "SLOW_DRAWING", 0.05)
@@ -72,7 +72,7 @@ def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None
     asyncio.run(watch())
 
 
-def test_a_run_that_is_late_is_said_to_be(tmp_path, monkeypatch) -> None:
+def test_the_page_shows_that_a_run_is_late(tmp_path, monkeypatch) -> None:
     from lyra_petsc.show.view import page as module
 
     monkeypatch.setattr(module, "is_locked", lambda folder: True)

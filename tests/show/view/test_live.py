@@ -1,4 +1,4 @@
-"""``run --live``: the page comes, follows, and goes with the run however that ends."""
+"""``run --live``: the page starts with the run, follows it, and ends after it."""
 
 import os
 import re
@@ -40,7 +40,7 @@ def until(condition, what):
 
 
 def address(process):
-    """Where the page is, as soon as the run says so."""
+    """Address of the page, as soon as the run prints it."""
     told = []
     for line in process.stderr:
         told.append(line)
@@ -58,7 +58,7 @@ def in_its_folder(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL)])
-def test_the_page_goes_with_the_run(tmp_path, ranks, number):
+def test_the_page_ends_with_the_run(tmp_path, ranks, number):
     write_scene(tmp_path, SLOW)
     process = start(
         ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path, ranks
@@ -74,7 +74,7 @@ def test_the_page_goes_with_the_run(tmp_path, ranks, number):
 
 
 @pytest.mark.slow
-def test_resume_has_a_page_too(tmp_path):
+def test_a_resumed_run_has_a_page(tmp_path):
     write_scene(tmp_path)
     done(["run", "scene.yaml", "--out", tmp_path / "out"], tmp_path)
     settings = ["--set", "time.end=500", "--resume", "--live", "--no-browser"]
@@ -99,7 +99,7 @@ def test_a_run_that_fails_leaves_no_page(tmp_path):
     until(lambda: not pages(tmp_path), "the page outlives its run")
 
 
-def test_a_run_ends_as_without_a_page(tmp_path):
+def test_a_run_ends_as_it_does_without_a_page(tmp_path):
     write_scene(tmp_path)
     left = done(["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path)
 
@@ -110,7 +110,7 @@ def test_a_run_ends_as_without_a_page(tmp_path):
     until(lambda: not pages(tmp_path), "the page outlives its run")
 
 
-def test_a_port_in_use_is_told_before_anything_is_written(tmp_path):
+def test_a_port_in_use_is_refused_before_files_are_written(tmp_path):
     import socket
 
     write_scene(tmp_path)
@@ -123,7 +123,7 @@ def test_a_port_in_use_is_told_before_anything_is_written(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_page_that_cannot_be_served_is_told(tmp_path):
+def test_a_page_that_cannot_be_served_is_reported(tmp_path):
     told = []
     page = LivePage("127.0.0.1", 0, told.append, told.append)
     page.show(tmp_path / "nowhere")
@@ -132,7 +132,7 @@ def test_a_page_that_cannot_be_served_is_told(tmp_path):
     assert "nowhere: no such folder" in told[0]
 
 
-def test_the_page_stays_while_it_is_open_and_goes_with_the_last_who_looks(tmp_path):
+def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
     import http.client
     from urllib.parse import urlsplit
 

@@ -1,4 +1,4 @@
-"""What the page shows of a run: colours and plots."""
+"""Content of the page: colours and plots."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_without_velocities_there_is_no_speed(tmp_path):
     assert Palette(run, "displacement").colours(0)[0].shape == (8, 3)
 
 
-def test_a_quantity_that_is_the_same_everywhere_has_a_colour(tmp_path):
+def test_a_uniform_quantity_has_a_colour(tmp_path):
     run = StoredRun(written(tmp_path, states=1))
     colours, _ = Palette(run, "displacement").colours(0)
     assert (colours == colours[0]).all()
@@ -110,12 +110,12 @@ def test_plots_have_units_and_few_points():
     assert plots.energies(history(3), "")["layout"]["xaxis"]["title"]["text"] == "load factor"
 
 
-def test_a_costly_step_is_not_left_out():
+def test_an_expensive_step_is_not_left_out():
     linear = plots.iterations(history(5000), "s")["data"][1]
     assert max(linear["y"]) == 999
 
 
-def test_numbers_that_are_none_are_gaps():
+def test_nan_values_are_gaps():
     columns = history(4)
     columns["kinetic_energy"][2] = np.nan
     kinetic = plots.energies(columns, "s")["data"][0]
@@ -128,7 +128,7 @@ def test_the_time_shown_is_marked():
     assert mark["x0"] == mark["x1"] == 0.25
 
 
-def test_a_run_that_has_just_begun_has_plots():
+def test_a_run_that_has_just_started_has_plots():
     for rows in (0, 1):
         for plot in (plots.energies, plots.iterations):
             assert all(len(line["x"]) == rows for line in plot(history(rows), "s")["data"])

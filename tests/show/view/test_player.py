@@ -1,4 +1,4 @@
-"""Which state is shown when."""
+"""Choice of the state that is shown at a time."""
 
 import math
 
@@ -25,7 +25,7 @@ def clock(monkeypatch):
     return clock
 
 
-def test_playing_keeps_to_the_times_of_the_states(tmp_path, clock):
+def test_states_are_played_at_their_times(tmp_path, clock):
     player = Player(StoredRun(written(tmp_path, states=6)))  # 0.1 s apart
     player.go(0)
     assert math.isinf(player.next_due())
@@ -38,7 +38,7 @@ def test_playing_keeps_to_the_times_of_the_states(tmp_path, clock):
     assert not player.playing
 
 
-def test_the_speed_changes_from_there_on(tmp_path, clock):
+def test_a_change_of_speed_acts_from_then_on(tmp_path, clock):
     player = Player(StoredRun(written(tmp_path, states=6)))
     player.go(0)
     player.play()
@@ -52,7 +52,7 @@ def test_the_speed_changes_from_there_on(tmp_path, clock):
     assert player.due() == 3
 
 
-def test_scrubbing_stays_within_the_states_and_goes_on_from_there(tmp_path, clock):
+def test_the_slider_stays_within_the_states_and_playing_continues_there(tmp_path, clock):
     player = Player(StoredRun(written(tmp_path, states=6)))
     player.go(-3)
     assert player.due() == 0
@@ -67,7 +67,7 @@ def test_scrubbing_stays_within_the_states_and_goes_on_from_there(tmp_path, cloc
     assert player.due() == 4
 
 
-def test_play_at_the_end_begins_anew(tmp_path, clock):
+def test_play_at_the_end_starts_again(tmp_path, clock):
     player = Player(StoredRun(written(tmp_path, states=3)))
     player.go(2)
     player.play()
@@ -75,7 +75,7 @@ def test_play_at_the_end_begins_anew(tmp_path, clock):
     assert player.playing
 
 
-def test_a_run_that_goes_on_is_followed_by_who_looks_at_its_newest_state(tmp_path, clock):
+def test_new_states_are_followed_if_the_newest_is_shown(tmp_path, clock):
     writer = Writer(tmp_path)
     writer.write()
     writer.write()
@@ -95,7 +95,7 @@ def test_a_run_that_goes_on_is_followed_by_who_looks_at_its_newest_state(tmp_pat
 @pytest.mark.parametrize(
     ("end", "speed"), [(0.0, 1.0), (1.0, 1.0), (60.0, 1.0), (3600.0, 1000.0), (0.02, 0.001)]
 )
-def test_the_first_speed_suits_the_eye(end, speed):
+def test_the_first_speed_depends_on_the_length_of_the_motion(end, speed):
     class Between:
         times = (0.0, end)
 

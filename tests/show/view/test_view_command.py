@@ -1,4 +1,4 @@
-"""``view`` as a program: how it begins and ends."""
+"""The command ``view``: start and end."""
 
 import signal
 
@@ -45,7 +45,7 @@ def test_a_signal_ends_it_without_a_traceback(serve, tmp_path, number, code):
     assert left.ours == ([] if code == 0 else ["lyra-petsc: ended by SIGTERM"])
 
 
-def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
+def test_under_mpirun_one_rank_serves_and_all_end_alike(serve, tmp_path):
     folder = written(tmp_path / "run")
     page = serve(folder, ranks=2)
     assert page.get("/?token=" + page.token)[0] == 302
@@ -59,7 +59,7 @@ def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
 
 
 @pytest.mark.parametrize("option", [["--host", "127.0.0.1"], ["--port", "0"], ["--no-browser"]])
-def test_options_of_the_page_without_a_page(tmp_path, option):
+def test_options_of_the_page_without_live_are_refused(tmp_path, option):
     refused(["run", *option], tmp_path, f"{option[0]}: says where the page of --live is")
     assert not (tmp_path / "runs").exists()
 
@@ -68,7 +68,7 @@ def test_options_of_the_page_without_a_page(tmp_path, option):
     ("variables", "opened"),
     [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "b"}, True)],
 )
-def test_a_browser_is_opened_where_there_is_a_desktop(monkeypatch, variables, opened):
+def test_a_browser_is_opened_on_desktops(monkeypatch, variables, opened):
     import webbrowser
 
     from lyra_petsc.show.view import server
