@@ -1,7 +1,7 @@
-"""Lets processes that need a kernel for the first time wait for the one that compiles it.
+"""Lets processes wait for a kernel that another process is compiling.
 
-All processes of pytest-xdist, and the programs that they start, begin with the same empty cache; what one has
-compiled the others load.
+All processes of pytest-xdist, and the programs that they start, begin with the same empty cache. Each kernel
+is compiled by one of them and loaded by the others.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from zlib import crc32
 
 
 def compile_once() -> None:
-    """From now on in this process, and in those that are forked from it."""
+    """Enable this in the present process, and in those that are forked from it."""
     from numba.core.dispatcher import Dispatcher
 
     compile_it = Dispatcher.compile

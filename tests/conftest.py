@@ -1,18 +1,18 @@
-"""Fixtures for all tests, and what keeps a parallel run of pytest from hanging.
+"""Fixtures for all tests; agreement of ranks, so that parallel runs of pytest do not hang.
 
-``tests/NAME`` has the tests of the package ``lyra_petsc/NAME``, and is what to run first after a change of
-it: ``bash scripts/test.sh tests/NAME``. Beside these, ``scenes`` follows whole scenes, ``surviving`` kills
-runs and fills disks, ``fuzz`` draws damaged input, ``docs`` runs what the documentation shows, ``scripts``
-tests the scripts, and ``test_house.py`` the order of imports. ``physics.py`` builds and steps a small scene
-in the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` writes a run without one.
+``tests/NAME`` has the tests of the package ``lyra_petsc/NAME``; run them first after a change of it:
+``bash scripts/test.sh tests/NAME``. In addition, ``scenes`` tests whole scenes, ``surviving`` kills runs and
+fills disks, ``fuzz`` generates damaged input, ``docs`` runs the commands of the documentation, ``scripts``
+tests the scripts, and ``test_house.py`` the order of imports. ``physics.py`` builds and steps small scenes in
+the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` writes a run without simulating.
 
-Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
-running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
-``parallel(2)`` keeps a test of which three ranks show no more to two, ``parallel(3)`` one of how data lie
-on ranks to three, ``parallel(1)`` one of a module that is marked to one. ``parallel(alone=False)`` leaves out
-one rank, of a test that compares ranks, or repeats there what several show.
-After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
-shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
+Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``: every rank runs the same
+test at the same time on ``COMM_WORLD``. Without mpirun they run on one rank. ``parallel(2)`` limits a test to
+two ranks if three show nothing more, ``parallel(3)`` to three if it is about data on several ranks, and
+``parallel(1)`` to one in a module that is marked as a whole. ``parallel(alone=False)`` omits one rank for a
+test that compares ranks, or that repeats there what others show. After each such test the ranks agree on its
+outcome: a failure on any rank is a failure on all, and is shown by rank 0; a rank whose partners never reach
+this agreement ends the whole job.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def comm() -> MPI.Comm:
 
 @pytest.fixture(autouse=True)
 def petsc_options() -> Iterator[None]:
-    """Give every test the options database that it would have alone."""
+    """Remove the PETSc options that a test has set, so that tests do not affect each other."""
     from petsc4py import PETSc
 
     database = PETSc.Options()
@@ -101,7 +101,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect tests that are to run on other numbers of ranks."""
+    """Deselect tests that are meant for other numbers of ranks."""
     chosen = [
         item
         for item in items
@@ -112,12 +112,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def meant(*ranks: int, alone: bool = True) -> bool:
-    """Whether a test with this mark runs on as many ranks as there are."""
+    """Whether a test with this mark runs on the present number of ranks."""
     return alone if WORLD.size == 1 else WORLD.size in (ranks or (WORLD.size,))
 
 
 def pytest_collection_finish() -> None:
-    """Leave what imports made out of garbage collections, with one of which each parallel test ends."""
+    """Exclude objects of imports from garbage collections, of which each parallel test ends with one."""
     gc.collect()
     gc.freeze()
 
@@ -166,7 +166,7 @@ def agree(item: pytest.Item) -> None:
 
 
 def collect_garbage() -> None:
-    """Objects that are freed collectively must be freed by all ranks at the same place."""
+    """Objects that are freed collectively must be freed at the same place on all ranks."""
     gc.collect()
     if "petsc4py.PETSc" in sys.modules:
         from petsc4py import PETSc

@@ -1,4 +1,4 @@
-"""A term of tests with one unknown on every interior edge: a hinge of two springs in a row.
+"""A term of the tests with one unknown on every interior edge: a hinge of two springs in series.
 
 Per interior edge with the dihedral angle θ and the unknown φ: energy = ½ k₁ (φ − θ)² + ½ k₂ φ². In
 equilibrium it is a hinge of k₁ k₂/(k₁ + k₂), which here is the one of ``terms.bending``. φ is stored times
@@ -102,4 +102,4 @@ EDGE_ANGLE = Registration(
 )
 
 IN_PLACE_OF_HINGES = [entry for entry in REGISTRY if entry.name != "bending"] + [EDGE_ANGLE]
-"""All terms, but for the plain hinges."""
+"""All terms except plain hinges."""

@@ -1,4 +1,4 @@
-"""Scripts as modules."""
+"""Import of scripts as modules."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import ModuleType
 
 
 def module_of(path: Path, name: str = "") -> ModuleType:
-    """Import a script that is in no package, by the name of its file or another."""
+    """Import a script that belongs to no package, under the name of its file or another one."""
     name = name or path.stem
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None

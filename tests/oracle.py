@@ -1,4 +1,4 @@
-"""Plain, slow versions of what terms compute: dense Hessians, and differences of what they derive from."""
+"""Plain, slow versions of the results of terms: dense Hessians and finite differences."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Ints = NDArray[np.int64] | NDArray[np.int32]
 
 
 def frozen_by(term: Elastic | Viscous, system: StageEquations, x: Array | None = None) -> Any:
-    """What a term freezes for a step from 0 s to 0.01 s, at positions x instead of the state's."""
+    """Frozen data of a term for a step from 0 s to 0.01 s, at positions x instead of the state's."""
     return term.freeze(UpcomingStep(0.0, 0.01, 0.01, system.x if x is None else x, system.reference.at))
 
 
@@ -87,7 +87,7 @@ def hessian(
 
 
 def element_hessians(term: Elastic, x: Array, frozen: Any, blend: float = 0.0) -> Array:
-    """The Hessian of each element alone, (E, 3 n, 3 n) over all n points."""
+    """Hessian of each element alone, (E, 3 n, 3 n) for all n points."""
     size = x.size
     return np.array(
         [hessian(term, x, frozen, blend, weight=w).reshape(size, size) for w in np.eye(term.n_elements)]
@@ -105,7 +105,7 @@ def summed(stencil: Ints, blocks: Array, n: int) -> Array:
 
 
 def directors_along_normals(term: MidEdge, x: Array) -> Array:
-    """Unknowns (n,) of edges that let directors be the means of the normals of their triangles."""
+    """Unknowns (n,) of edges whose directors are the means of the normals of their triangles."""
     edges = term.of_edges
     tangent = unit(x[edges.ends[:, 1]] - x[edges.ends[:, 0]])
     across = transported(term.frames, tangent)
@@ -152,7 +152,7 @@ def membrane_blocks(
 
 
 def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
-    """Element Hessians (E, 4, 4, 3, 3) of hinges, each from its four points."""
+    """Element Hessians (E, 4, 4, 3, 3) of hinges, each computed from its four points."""
     sides = term._triangles.sides
     out, g = np.empty((term.n_elements, 4, 4, 3, 3)), np.empty((4, 3))
     angles, limits = dihedral_angles(x, term.stencil), term._limit[sides[:-1] >> 2]
@@ -167,7 +167,7 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
 def midedge_blocks(
     term: MidEdge | MidEdgeFriction, x: Array, frames: Frames, blend: float, out: Array
 ) -> None:
-    """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
+    """Element Hessians (E, 12, 12) of triangles with directors, each computed separately."""
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
         (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
@@ -253,7 +253,7 @@ def blocks_of(
     blend: float = 0.0,
     predicted: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Element Hessians (E, k, k, 3, 3) by the plain formulas, or what a term has for each element."""
+    """Element Hessians (E, k, k, 3, 3) by plain formulas, or by the term itself for single elements."""
     if isinstance(term, Membrane):
         return membrane_blocks(term, at, blend, predicted)
     if isinstance(term, Bending):

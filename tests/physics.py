@@ -28,7 +28,7 @@ CLOTH = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0,
 """The orthotropic cloth of reference A6, without bending."""
 
 TIGHT = {"force_tolerance": 1e-9, "step_tolerance": 1e-9}
-"""What a test asks of Newton: being quadratic, it ends far below."""
+"""Tolerances of tests; Newton's method ends far below, as its convergence is quadratic."""
 
 SOLVERS: dict[str, dict[str, Any]] = {
     "block Jacobi": {"pc_type": "pbjacobi"},
@@ -37,7 +37,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
     "algebraic multigrid": {"pc_type": "gamg"},
     "direct": {"pc_type": "cholesky"},
 }
-"""Linear solvers that a test of a new term runs through, by the options that choose them."""
+"""Options of all linear solvers with which a new term is tested."""
 
 REFERENCE = Path(__file__).parent / "reference"
 
@@ -59,7 +59,7 @@ def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal
 
 
 def direct_solver(comm: MPI.Comm) -> dict[str, str]:
-    """Options of a direct solver that this PETSc has on so many ranks."""
+    """Options of a direct solver that this PETSc has on this number of ranks."""
     if comm.size == 1:
         return {"pc_type": "lu"}
     if PETSc.Sys.hasExternalPackage("mumps"):
@@ -70,7 +70,7 @@ def direct_solver(comm: MPI.Comm) -> dict[str, str]:
 def obj_file(
     path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]
 ) -> dict[str, Any]:
-    """Write an .obj without ``vt`` (rest shape: the surface itself); the mesh block that names it."""
+    """Write an .obj without ``vt``, so that the surface itself is the rest shape; returns its mesh block."""
     rows = [f"v {float(x)!r} {float(y)!r} {float(z)!r}" for x, y, z in vertices]
     rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
@@ -98,7 +98,7 @@ def gathered(layout: Layout, owned: Array) -> Array:
 
 @contextmanager
 def options(given: Mapping[str, Any]) -> Iterator[None]:
-    """With options of PETSc: these, and all that are set meanwhile, are removed again."""
+    """Set PETSc options; these, and all others set meanwhile, are removed again."""
     database = PETSc.Options()
     before = set(database.getAll())
     for name, value in given.items():
@@ -112,7 +112,7 @@ def options(given: Mapping[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def stepped(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Iterator[SteppedScene]:
-    """A scene, or a scene's content, with options of PETSc; freed, which is collective, unless this fails."""
+    """A stepped scene, with PETSc options; freed collectively unless the body fails."""
     with options(petsc):
         simulation = SteppedScene(comm, scene if isinstance(scene, Scene) else scene_of(scene))
         yield simulation
@@ -121,7 +121,7 @@ def stepped(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Iter
 
 @contextmanager
 def finished(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Iterator[SteppedScene]:
-    """The same after all of its steps."""
+    """A stepped scene after all of its steps."""
     with stepped(comm, scene, **petsc) as simulation:
         while not simulation.finished:
             simulation.step()
@@ -222,7 +222,7 @@ class Simulation:
     # -- steps -----------------------------------------------------------------------------------------
 
     def step(self, dt: float) -> Attempt:
-        """One step, which must converge."""
+        """Compute one step, which must converge."""
         self.system.set_references(self.time)
         end = self.time + dt
         attempt = self.stepper.attempt(self.time, end)
@@ -231,7 +231,7 @@ class Simulation:
         return attempt
 
     def run(self, dt: float, steps: int) -> Array:
-        """So many steps; the positions (V, 3) after them."""
+        """Compute a number of steps; returns the positions (V, 3)."""
         for _ in range(steps):
             self.step(dt)
         return self.x

@@ -1,4 +1,4 @@
-"""A term of tests whose stencils change: vertices that come near repel each other.
+"""A term of the tests whose stencils change: near vertices repel each other.
 
 Per pair of vertices at a distance r below d: energy = k (d − r)³ / 3.
 """
@@ -85,7 +85,7 @@ class Repulsion(Elastic):
 
 
 def elements(rest: RestShape) -> None:
-    """There are none before the vertices move."""
+    """No elements before the vertices move."""
 
 
 def make(elements: None, scene: Scene, mass: Array) -> Repulsion:

@@ -1,4 +1,4 @@
-"""VTK's reader of VTKHDF files; a test that imports this is skipped where VTK is not."""
+"""VTK's reader of VTKHDF files; tests that import this are skipped without VTK."""
 
 import numpy as np
 import pytest

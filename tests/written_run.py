@@ -1,4 +1,4 @@
-"""Run folders made by the writers of a run, without simulating."""
+"""Run folders written by the writers of a run, without a simulation."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,10 @@ TRIANGLES = np.array([[0, 2, 6], [0, 6, 4], [2, 1, 5], [2, 5, 6], [1, 3, 7], [1,
 
 
 def ring(vt: str = "each vertex") -> Mesh:
-    """``vt``: ``none``, ``each vertex``, or ``seam``: one triangle lies elsewhere in the texture."""
+    """The ring with ``vt``:
+
+    ``none``, ``each vertex``, or ``seam``, with one triangle elsewhere in the texture.
+    """
     uv = REST[TRIANGLES][..., :2] / 3.0
     if vt == "seam":
         uv[3] += 0.25
@@ -39,7 +42,7 @@ def ring(vt: str = "each vertex") -> Mesh:
 
 
 def position(state: int) -> np.ndarray:
-    """(V, 3) of a state; numbers that no short decimal hits."""
+    """Positions (V, 3) of a state, with numbers that have no short decimal form."""
     return REST + np.sin(state) * np.array([0.1, 0.0, 1.0]) * REST[:, :1] / 3.0 + [0.0, 0.0, state / 7.0]
 
 
@@ -52,7 +55,7 @@ def stress(state: int) -> np.ndarray:
 
 
 def tensor(state: int) -> np.ndarray:
-    """The stress with six components, as it is written now: uu, uv, uw, vv, vw, ww."""
+    """The stress with six components, in the present format: uu, uv, uw, vv, vw, ww."""
     uu, vv, uv = stress(state).T
     none = np.zeros_like(uu)
     return np.stack([uu, uv, none, vv, none, none], axis=1)
@@ -100,7 +103,7 @@ class Writer:
 def written(
     folder: Path, states: int = 3, vt: str = "each vertex", fields: bool = True, six: bool = False
 ) -> Path:
-    """The folder of a run with some states; without ``six``, stresses are as older versions wrote them."""
+    """A run's folder with some states; without ``six``, stresses are in the format of older versions."""
     writer = Writer(folder, vt, fields, six)
     for _ in range(states):
         writer.write()
@@ -109,7 +112,7 @@ def written(
 
 
 POST = TriangleSurface(np.array([[3.2, 0, 1], [4, 0, 1], [3.2, 1, 1.0]]), np.array([[0, 1, 2]]))
-"""Half a square beside the ring."""
+"""An obstacle: half a square beside the ring."""
 MET = {
     "ball": {
         "sphere": {"center": [0, 3.6, 0], "radius": 0.3},
@@ -120,7 +123,7 @@ MET = {
 
 
 def met(folder: Path, obstacles: dict[str, object] = MET) -> Path:
-    """The run of the ring in a scene with obstacles, of which no mesh file is left."""
+    """The run of the ring in a scene with obstacles, without the mesh files."""
     run = written(folder, states=6)
     write_mesh(run, replace(ring(), obstacles={"post": POST}), MPI.COMM_SELF)
     data = parse_yaml((run / "scene.yaml").read_text(), file=None) | {

@@ -17,7 +17,7 @@ LEFT_BY_MPI_INIT = {
     "ORTE_SCHIZO_DETECTION": "ORTE",
     "PMIX_RANK": "0",
 }
-"""Of Open MPI 4, in a process that no launcher has started."""
+"""Variables that Open MPI 4 sets in a process without a launcher."""
 
 
 def test_a_launcher_can_be_started_after_mpi_init(monkeypatch: pytest.MonkeyPatch) -> None:

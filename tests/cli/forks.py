@@ -1,4 +1,10 @@
-"""The program with half of its imports done, forked for each command line of ``rank.py`` or of a test."""
+"""The program with half of its imports done, forked for each command line of ``rank.py`` or of a test.
+
+The process listens on the socket that is its standard input. A message has arguments, folder and environment,
+and descriptors for stdout and stderr; the answer is the exit code, negative for a signal. If a client closes
+its connection before, the forked process is killed. MPI and PETSc are not loaded here: each forked process
+starts and ends them as any other process does, also under mpirun.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +33,7 @@ EARLY = (
     *("stepping.step_control", "output.read_run", "output.run_folder"),
     *("output.vtkhdf_file", "output.summary"),
 )
-"""Modules that runs load, and that know nothing of MPI."""
+"""Modules that runs load, and that do not use MPI."""
 
 DRAWING = (
     "jinja2",
@@ -37,7 +43,7 @@ DRAWING = (
     "scipy.spatial",
     "scipy.special",
 )
-"""What verbs that write a report take longest to load."""
+"""Slowest imports of commands that write reports."""
 
 REPORTING = ("render", "report", "stress", "study", "verify")
 

@@ -1,4 +1,8 @@
-"""Starts the program as a user does, in another process or in several under mpirun."""
+"""Starts the program as a user does, in another process or in several under mpirun.
+
+Runs that tests do not watch are forked, on each rank, from a process that has done half of the imports (see
+``forks``), which take longer than most of these runs.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +56,7 @@ output: {every: 0.02}
 DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
 
 REDUNDANT = ("-ksp_type", "preonly", "-pc_type", "redundant")
-"""Factors on any number of ranks, which wait for each other less often than in an iterative method."""
+"""Options of a direct solver on any number of ranks, which communicates less often than iterative ones."""
 
 PICTURES = ("matplotlib", "jinja2")
 """Packages without which reports have no pictures."""

@@ -1,4 +1,7 @@
-"""Lets ``forks`` run a command line instead of this process, on one rank or on several under mpirun."""
+"""Lets ``forks`` run a command line instead of this process, on one rank or on several under mpirun.
+
+Arguments: the name of the socket of ``forks``, then those of the command line.
+"""
 
 import json
 import os

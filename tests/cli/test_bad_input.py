@@ -116,7 +116,7 @@ MISTAKES = {
 OF_PETSC = [
     name for name, (_, words, _) in MISTAKES.items() if any(re.match("-[a-z]", word) for word in words)
 ]
-"""Mistakes in what PETSc reads as it starts, which it does once in a process."""
+"""Mistakes in options that PETSc reads only at its start, once per process."""
 
 ONE_BY_ONE = """
 import json
@@ -146,7 +146,9 @@ QUICK = (
     "folder in use",
     "runn scene.yaml",
 )
-"""One mistake of each kind: in the scene, its files and its mesh, PETSc's options, ours, and the verb."""
+"""One mistake of each kind: in the scene, its files and mesh, PETSc's and the program's options, the command.
+
+"""
 
 Listing = dict[Path, int]
 

@@ -25,11 +25,11 @@ REST = np.array([[0, 0, 0], [2, 1, 0], [2, -1, 0], [2, 0, 1], [2, 0, 2], [1, 0, 
 TRIANGLES = np.array([[0, 1, 2], [3, 0, 4], [5, 6, 7]])
 
 DOWN = REST - [0, 0, 1.5] * (np.arange(8) == 3)[:, None]
-"""The second goes through the first, from their common vertex on."""
+"""The second triangle crosses the first, from their common vertex on."""
 
 ALL = DOWN.copy()
 ALL[5:] = [[1, 0, 9], [1.5, 0.25, -9], [1.5, -0.25, -9]]
-"""And the third through both."""
+"""The third triangle crosses both."""
 
 
 BASE = {

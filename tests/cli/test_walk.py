@@ -14,7 +14,7 @@ from launch import SCENE, done, environment, lyra, write_scene
 
 LISTS = ("ksp_type", "pc_type", "snes_type", "snes_linesearch_type")
 SLOW = ("cp", "deflation")
-"""Halve Δt twelve times before they give up."""
+"""Runs that halve Δt twelve times before they fail."""
 
 REFUSED = [
     ["-ksp_rtol", "nan"],
@@ -170,7 +170,7 @@ AT_THE_START_OR_END = [
     ["-ts_monitor_sp_swarm"],
 ]
 NEEDS_A_DISPLAY = ("-ts_monitor_sp_swarm",)
-"""PETSc says that there is none, and goes on."""
+"""PETSc reports that there is no display, and continues."""
 
 
 @pytest.mark.parametrize("words", AT_THE_START_OR_END, ids=" ".join)

@@ -1,4 +1,8 @@
-"""Many runs with different PETSc options, forked from one process that has loaded everything."""
+"""Many runs with different PETSc options, forked from one process that has loaded everything.
+
+Arguments: a folder with ``scene.yaml``. Each line of the standard input is a list of command lines' PETSc
+options in JSON; the answer is a line with exit code, stdout and stderr of each run.
+"""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
-"""Code blocks of the documentation, with what the comment before each says to its test.
+"""Code blocks of the documentation, with the instructions to their tests in the comments before them.
 
-``<!-- test: WORDS -->`` on the line before a block, invisible to readers, with words among
+A comment ``<!-- test: WORDS -->`` on the line before a block, invisible to readers, has words among
 
 ``exit=N``
     the last command ends with this exit code;
 ``by=PATH``
-    cannot run here, or not in this time: the test at PATH does it with other sizes;
+    is not run, as it takes too long: the test at PATH does the same with other sizes;
 ``not here: REASON``
     cannot run here at all (a cluster, another installation); its syntax is checked.
 
-A block whose first line of fences has ``title="NAME"`` is a file, written before the commands that follow it.
+A block with ``title="NAME"`` in its first line is a file, which is written before later commands run.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ class Block:
     ----------
     page : Path
     line : int
-        Of its first fence, from 1.
+        Line of its first fence, from 1.
     language : str
-        Empty for what a program prints.
+        Empty for output of a program.
     text : str
     title : str
-        Name of the file that it is, or empty.
+        Name of its file, or empty.
     said : str
-        What its comment says.
+        Text of its comment.
     """
 
     page: Path
@@ -58,18 +58,18 @@ class Block:
 
     @property
     def place(self) -> str:
-        """Page and line."""
+        """Page and line of the block."""
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
     @property
     def runs(self) -> bool:
-        """Whether it is a program or commands that the tests of the documentation run as they stand."""
+        """Whether the tests of the documentation run the block as a program or as commands."""
         elsewhere = self.said.startswith(("not here: ", "by="))
         return self.language in ("sh", "python") and not self.title and not elsewhere
 
     @property
     def exit_code(self) -> int:
-        """With which its last command ends."""
+        """Exit code of its last command."""
         found = re.search(r"exit=(\d+)", self.said)
         return int(found[1]) if found else 0
 
@@ -103,7 +103,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 def commands_of(page: Path) -> list[tuple[str, list[str]]]:
-    """Each call of the program on a page, in blocks or in the text: as it begins, and its words."""
+    """Each call of the program on a page, in code blocks or in the text: its beginning, and its words."""
     texts = [block.text.replace("\\\n", " ") for block in blocks_of(page) if block.language == "sh"]
     texts += _INLINE.findall(page.read_text(encoding="utf-8"))
     found = []

@@ -1,4 +1,4 @@
-"""The commands of the documentation are started as those of the command line's tests."""
+"""Helpers of tests/cli for the tests of the documentation, which start the program."""
 
 import sys
 from pathlib import Path

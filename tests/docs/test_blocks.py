@@ -20,10 +20,10 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml
 
 END = 0.05
-"""Seconds that runs are shortened to."""
+"""Length [s] of shortened runs."""
 
 COARSE = "size = 0.2"
-"""Edges [m] of meshes made from the scripts that pages show: most pages run one."""
+"""Element size [m] in the mesh scripts of pages, most of which are run."""
 
 PATIENCE = 300.0
 
@@ -33,7 +33,7 @@ BASE = {
     "time": {"end": 1, "step": 0.01},
     "motions": {"swing": [{"time": 0}]},
 }
-"""What a piece of a scene is put into."""
+"""A scene to which an incomplete scene is added."""
 
 PROGRAM = f"""\
 #!{sys.executable} -IS
@@ -57,12 +57,12 @@ ALL = {page: blocks_of(page) for page in PAGES}
 
 
 def shown(page: Path) -> str:
-    """A page's name in a test's."""
+    """A page's name in the names of tests."""
     return str(page.relative_to(ROOT))
 
 
 def coarse(script: str) -> str:
-    """A mesh script with long edges, whichever it has."""
+    """A mesh script with long edges, whatever its own are."""
     script = re.sub(r"\bsize = [0-9.]+", COARSE, script)
     assert COARSE in script or "size" not in script
     return script
@@ -73,7 +73,7 @@ LANGUAGES = {"", "sh", "yaml", "json", "python", "geo", "text", "diff"}
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
-    """What a reader has: a checkout with ``.venv`` and an installed program; and the environment."""
+    """What a reader has, a checkout with ``.venv`` and an installed program; and the environment."""
     folder = tmp_path / "lyra_petsc"
     folder.mkdir()
     for name in ("docs", "lyra_petsc", "pyproject.toml", "README.md"):
@@ -119,7 +119,7 @@ def test_commands_run(page: Path, checkout: tuple[Path, dict[str, str]]) -> None
 
 
 def check_scene(block: Block) -> None:
-    """A whole scene, or a piece of one, is accepted; meshes and names in it need not exist."""
+    """Check that a scene, or a part of one, is accepted; its meshes and names need not exist."""
     data = parse_yaml(block.text, file=block.place)
     assert isinstance(data, dict), block.place
     Scene.model_validate(BASE | data, context={"directory": ROOT})

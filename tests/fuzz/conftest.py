@@ -1,4 +1,4 @@
-"""Makes the helpers of tests/cli importable, which start the program."""
+"""Makes the helpers of tests/cli importable."""
 
 import sys
 from pathlib import Path

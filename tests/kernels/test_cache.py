@@ -30,7 +30,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def compiled(x: Any) -> tuple[Any, int]:
-    """Result of a new dispatcher, as of a new process, and how many types it found in the cache."""
+    """Result of a new dispatcher, as in a new process, and the number of types that it found in the cache."""
     dispatcher = cached()(twice)
     result = dispatcher(x)
     return result, sum(dispatcher.stats.cache_hits.values())

@@ -17,7 +17,7 @@ N = 40
 
 @cache
 def calls(module: Any) -> Any:
-    """A compiled function that calls every operation of the module, each on an array of its own."""
+    """A compiled function that calls every operation of the module on separate arrays."""
     gather, scatter, add_outers = module.gather, module.scatter, module.add_outers
     add_six, add_triangle = module.add_six, module.add_triangle
     store_block, fetch = module.store_block, module.fetch

@@ -61,7 +61,7 @@ def test_blocks_of_other_ranks_are_not_added() -> None:
 
 
 PLACES = [[0, 3, 4, 6, 9, 10], [2, 5, -1, -1, -1, -1], [-1, 4, 7, 0, -1, 2], [-1] * 6]
-"""Of couplings (0, 0), (0, 1), …, (2, 2): all ours, those of a point or two, none."""
+"""Offsets of couplings (0, 0), (0, 1), …, (2, 2): all on this rank, those of one or two points, none."""
 
 
 def sums_at(places: list[int], blocks: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ PLATE: dict[str, Any] = {
     "handles": [{"box": [[-1, -1, -1], [1e-9, 1, 1]], "clamp": True}],
     "gravity": [1.0, 0.5, -9.0],
 }
-"""Entries of a cantilever of one equilibrium; where each step begins is remembered as a tangent, too."""
+"""Scene of a cantilever; its load steps are also extrapolated along tangents."""
 
 
 def scene_with(way: str) -> dict[str, Any]:
@@ -113,10 +113,10 @@ def table(folder: Path, name: str) -> dict[str, Array]:
 
 
 OF_THE_SOLVER = ("newton_iterations", "linear_iterations", "residual")
-"""Columns that rounding decides where the order of a sum is another."""
+"""Columns that depend on rounding if the order of a sum changes."""
 
 OF_EACH_RUN = ("versions", "wall_seconds", "resumed", "steps_of_this_run", "ranks", "partitioner")
-"""Entries of summary.json that are of the last part of a run."""
+"""Entries of summary.json about the last part of a run only."""
 
 
 def flat(numbers: dict[str, Any], above: str = "") -> dict[str, float]:

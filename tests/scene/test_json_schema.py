@@ -36,7 +36,9 @@ BEYOND_SCHEMA = (
     "must be a finite number, not nan",
     "must be a direction, not a zero vector",  # of components below 1e-150
 )
-"""Messages on what JSON Schema cannot express: comparisons of keys, other files; 2.0 is an integer to it."""
+"""Messages on rules that JSON Schema cannot express: comparisons of keys, other files, integers such as 2.0.
+
+"""
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = ("ball", "buckle", "drape", "flag", "paper", "plate", "sail", "shell", "spin", "swing", "twist")
 OF_CONTACT = ("flag-contact", "reef-knot", "stack", "tablecloth", "wring")
-"""In ``test_contact_scenes.py``."""
+"""Scenes that ``test_contact_scenes.py`` tests."""
 
 
 def simulated(name: str, *settings: str) -> AbstractContextManager[SteppedScene]:

@@ -1,4 +1,7 @@
-"""A sheet released flat with one edge held, compared with a converged one-dimensional calculation."""
+"""A sheet released flat with one edge held, compared with a converged one-dimensional calculation.
+
+References: ``tests/reference/swing.json``, made by ``scripts/references/swing.py``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The modules of the bench stand beside each other in a folder of their own."""
+"""Makes the modules of the bench importable, which are in a folder of their own."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Environments in which no package is real, for the scripts that look for one."""
+"""Environments with fake packages, for scripts that look for packages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEEDED = {
     "jinja2": "3.1.4",
     "scipy": "1.14",
 }
-"""What the program and its studies need."""
+"""Packages that the program and its studies need."""
 YIELD = "OMPI_MCA_mpi_yield_when_idle"
 MODULES = {"pillow": "PIL", "usd-core": "pxr"}
 
@@ -34,7 +34,7 @@ def site_packages(environment: Path) -> Path:
 
 
 def put(environment: Path, name: str, version: str) -> None:
-    """A package that only exists: a module and its metadata."""
+    """Create a package: an empty module and its metadata."""
     site = site_packages(environment)
     module = site.joinpath(*MODULES.get(name, name.replace("-", "_")).split("."))
     module.mkdir(parents=True)
@@ -45,7 +45,7 @@ def put(environment: Path, name: str, version: str) -> None:
 
 
 def make(folder: Path) -> None:
-    """An environment with all that is needed and a launcher that only speaks."""
+    """Create an environment with all necessary packages, and a launcher that prints its arguments."""
     venv.create(folder, symlinks=True)
     for name, version in NEEDED.items():
         put(folder, name, version)
@@ -55,14 +55,14 @@ def make(folder: Path) -> None:
 
 
 def surroundings(folder: Path) -> dict[str, str]:
-    """Variables without those that tell a script of ours about this environment; nothing is fetched."""
+    """Environment variables without those about the present environment; nothing is downloaded."""
     names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME", YIELD)
     clean = {name: value for name, value in os.environ.items() if name not in names}
     return {**clean, "LYRA_VENV": str(folder / "laid over"), "PIP_NO_INDEX": "1"}
 
 
 def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a script of ours."""
+    """Run a script of the repository."""
     return subprocess.run(
         ["bash", str(ROOT / "scripts" / script), *arguments],
         cwd=cwd,

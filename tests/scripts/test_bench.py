@@ -43,7 +43,7 @@ program = module_of(SCRIPTS / "benchmarks" / "__main__.py", "bench_program")
 
 
 class Done(NamedTuple):
-    """What the program left behind."""
+    """Output of the program."""
 
     returncode: int
     stdout: str
@@ -51,7 +51,7 @@ class Done(NamedTuple):
 
 
 def bench(folder: Path, *words: str) -> Done:
-    """The program in this process, which starts those that are measured."""
+    """Run the program in this process; it starts the measured processes."""
     heeded = signal.getsignal(signal.SIGTERM)
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as out:
         patch.chdir(folder)
@@ -65,7 +65,7 @@ def bench(folder: Path, *words: str) -> Done:
 
 
 def tables_of(markdown: str) -> list[list[list[str]]]:
-    """The cells of every table of a Markdown text, without the line of dashes."""
+    """Cells of every table of a Markdown text, without separator lines."""
     found: list[list[list[str]]] = [[]]
     for line in markdown.splitlines():
         if line.startswith("|"):

@@ -39,7 +39,7 @@ Tests = Callable[..., "subprocess.CompletedProcess[str]"]
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment in which pytest only says how it was called, and ends as it is told."""
+    """An environment in which pytest prints its arguments and ends with a given code."""
     folder = tmp_path_factory.mktemp("tests") / "environment"
     make(folder)
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
@@ -63,14 +63,14 @@ def tests(made: Path, tmp_path: Path) -> Tests:
 
 
 def first_part(done: subprocess.CompletedProcess[str]) -> str:
-    """How pytest was called on one rank."""
+    """Arguments of pytest on one rank."""
     found = re.search(r"^\d+ workers, .*", done.stdout, re.MULTILINE)
     assert found is not None, done.stderr
     return found[0]
 
 
 def parallel_part(done: subprocess.CompletedProcess[str], ranks: int) -> str:
-    """How pytest was called under mpirun; empty if it was not."""
+    """Arguments of pytest under mpirun; empty if it was not called."""
     found = re.search(rf"^launched in .* -n {ranks} (.*\n)*?exit \$code sh (.*)", done.stdout, re.MULTILINE)
     return found[2] if found else ""
 
@@ -141,7 +141,7 @@ def test_number_of_processes(
 
 
 def at_work(pid: int) -> bool:
-    """Whether a process has not ended."""
+    """Whether a process is still running."""
     words = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
     return words.strip()[:1] not in ("", "Z")
 

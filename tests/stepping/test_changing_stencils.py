@@ -20,7 +20,7 @@ from lyra_petsc.terms import registry
 pytestmark = pytest.mark.parallel
 
 GAP = 0.11
-"""Between the sheets at first [m]: more than the distance at which they feel each other."""
+"""Initial distance of the sheets [m], at which they do not repel each other yet."""
 
 LOWER = grid(0.6, 0.4, 5, 4, "alternating")
 UPPER = grid(0.55, 0.4, 4, 4) | {"transform": {"translate": [0.03, 0.01, GAP]}}
@@ -32,7 +32,7 @@ SCENE: dict[str, Any] = {
 }
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 SPEED = 2.0
-"""Of either sheet towards the other [m/s]."""
+"""Speed of either sheet towards the other [m/s]."""
 
 
 @pytest.fixture(autouse=True)

@@ -29,7 +29,7 @@ SCENE: dict[str, Any] = {
     "obstacles": {"floor": PLANE},
     "time": {"end": 1.0, "step": 0.005},
 }
-"""A sheet thrown on a floor, every vertex of which touches."""
+"""A sheet thrown on a floor, which every vertex touches."""
 
 KINDS: dict[str, dict[str, str]] = {
     "jacobi": {"pc_type": "jacobi"},

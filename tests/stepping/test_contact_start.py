@@ -16,7 +16,7 @@ from lyra_petsc.terms.contact import ContactBarrier
 pytestmark = pytest.mark.parallel(2)
 
 SHEET: dict[str, Any] = {"mesh": grid(1.0, 1.0, 4, 4), "contact": {"gap": 0.02}}
-"""In the plane z = 0, from x, y = 0 to 1."""
+"""A sheet in the plane z = 0, from x, y = 0 to 1."""
 
 
 def sheet(**changes: Any) -> dict[str, Any]:

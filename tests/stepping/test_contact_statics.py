@@ -25,7 +25,7 @@ pytestmark = pytest.mark.parallel(2)
 CELLS = 8
 STATIC = {"analysis": "static", "step": 1.0}
 WEIGHT = 0.187 * 9.81
-"""Of the cloth [N/m²]."""
+"""Weight of the cloth [N/m²]."""
 
 BALL = {"ball": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}}
 TABLE = {"table": {"box": {"min": [-0.4, -0.4, -0.05], "max": [0.4, 0.4, 0]}}}
@@ -76,7 +76,7 @@ LAID = {
     "on a ball": ((1.0, [-0.5, -0.48, 0.32], BALL, 0.5), 400),
     "on a table": ((1.2, [-0.6, -0.6, 0.02], TABLE, 0.3), 120),
 }
-"""Scenes, and Newton iterations that suffice."""
+"""Scenes, and upper bounds of Newton iterations."""
 
 
 @pytest.mark.parametrize("where", LAID)

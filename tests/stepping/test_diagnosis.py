@@ -32,7 +32,7 @@ SCENE: dict[str, Any] = {
 }
 STIFF = CLOTH | {"membrane": {"c11": 1.2e6, "c22": 1.2e6, "c12": 0.0, "c33": 6e5}, "bending": 1e-4}
 ONE_ATTEMPT = {"ts_adapt_dt_min": "1.0"}
-"""No Δt is that large, so that none is tried twice."""
+"""A smallest Δt above every Δt, so that a failed step is not repeated."""
 
 
 @contextmanager

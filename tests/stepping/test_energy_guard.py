@@ -24,7 +24,7 @@ FREE: dict[str, Any] = {
     "initial": {"noise": 0.005, "angular_velocity": [0.0, 0.0, 2.0]},
     "solver": {},
 }
-"""Too stiff for a Δt of 10 ms; nothing acts on it."""
+"""A free sheet without loads, too stiff for a Δt of 10 ms."""
 
 
 def simulation(
@@ -237,7 +237,7 @@ DRIVEN: dict[str, Any] = {
         ]
     },
 }
-"""Everything that does work, with much of it by moving handles."""
+"""Handles and loads of all kinds, of which moving handles do most of the work."""
 
 
 @pytest.mark.parallel(2)

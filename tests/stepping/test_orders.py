@@ -75,7 +75,7 @@ SWITCHED = MOVING | {
         {"nodes": [17], "force": [0, 0, 0.05], "from": 0.06, "until": 0.1},
     ],
 }
-"""Forces, holds and velocities of handles jump in mid-run."""
+"""Forces, handles and their velocities jump during the run."""
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
@@ -99,7 +99,7 @@ LYING = MOVING | {
     "handles": [{"nodes": [0, 5, 10, 15], "axes": ["x", "y"], "motion": "sway"}],
     "motions": {"sway": [{"time": 0}, {"time": 0.4, "translate": [0.1, 0.05, 0.0]}]},
 }
-"""Pulled over a plane that carries it, within a gap which Δt resolves."""
+"""A sheet pulled over a plane, within a gap that Δt resolves."""
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])

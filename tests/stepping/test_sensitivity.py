@@ -18,7 +18,7 @@ from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
 
 STEP = 2e-4
-"""Relative change of a number to both sides."""
+"""Relative change of a parameter in central differences."""
 
 TIGHT = {"force_tolerance": 1e-12, "step_tolerance": 1e-14}
 

@@ -17,7 +17,9 @@ from lyra_petsc.stepping import linear_system
 from lyra_petsc.stepping.linear_system import MAX_SHIFT, MIN_SHIFT, DiagonalShift
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
-"""Positive definite, while its incomplete factors are not (Kershaw, J. Comput. Phys. 26, 1978, 43-65)."""
+"""A positive-definite matrix with indefinite incomplete factors (Kershaw, J. Comput. Phys. 26, 1978, 43-65).
+
+"""
 
 HANGING: dict[str, Any] = {
     "mesh": grid(1.0, 1.0, 29, 29),
@@ -25,7 +27,7 @@ HANGING: dict[str, Any] = {
     "gravity": [0, 0, -9.81],
     "handles": [{"nodes": [870, 899]}],
 }
-"""Without a shift factors break down in its step 22 of 40 ms."""
+"""A scene in which factors without a shift break down in step 22 of 40 ms."""
 
 
 def solver(kind: str) -> tuple[PETSc.KSP, PETSc.Mat]:

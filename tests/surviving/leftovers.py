@@ -21,7 +21,7 @@ handles: [{nodes: [0, 4]}]
 time: {end: %s, step: 0.005}
 output: {every: 0.02, fields: [velocity]}
 """
-"""A hanging square of 25 vertices; its end is put in."""
+"""A hanging square of 25 vertices; tests fill in its end."""
 
 ENDLESS = SHEET % 1000
 

@@ -465,7 +465,7 @@ HOSTILE: dict[str, dict[str, Any]] = {
         "obstacles": {"ball": {"sphere": {"center": [-0.2, 0.2, -0.2], "radius": 0.2}}},
     },
 }
-"""Each thrown downwards."""
+"""Scenes with edge-on strips and sharp or spinning obstacles; sheets are thrown downwards."""
 
 
 @pytest.mark.parametrize(

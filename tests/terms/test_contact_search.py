@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RADIUS = 0.4
-"""Of an edge of the grid."""
+"""Search radius, over an edge of the grid."""
 
 
 def grid(n: int, m: int) -> tuple[Array, Ints]:

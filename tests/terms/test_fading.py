@@ -22,7 +22,7 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 EDGE = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
 FULL = np.array([[0.3, 0.8, 0.1], [0.6, -0.7, 0.3]])
-"""Opposite vertices of the hinge before anything collapses."""
+"""Opposite vertices of the undeformed hinge."""
 
 
 def areas(x: Array) -> Array:

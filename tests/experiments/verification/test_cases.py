@@ -15,7 +15,7 @@ SOME = (
     "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip", "column",
     "frames",
 )  # fmt: skip
-"""Cases that are run whatever is selected: each takes no more than a second or two."""
+"""Cases that are always run, as each takes a second or two at most."""
 
 LONG = (
     "catenary", "catenary-unequal", "circular-membrane", "plate", "plate-vibration", "column",
@@ -27,7 +27,7 @@ LONG = (
     "heavy-cantilever", "tip-load", "catenary-elastic", "sze-end-shear", "uniaxial-pull", "wind-drag",
     "frames", "sections", "supported-disc", "pressed-strip",
 )  # fmt: skip
-"""Cases whose finest resolutions take long."""
+"""Cases whose finest resolutions are slow."""
 
 FEWER: dict[str, dict[str, object]] = {
     name: {"KINDS": ("criss-cross",)}
@@ -41,9 +41,8 @@ FEWER: dict[str, dict[str, object]] = {
     "sheets": {"SLIDERS": ("bdf2",)},
     "cusick": {"MESHES": ("irregular",), "STARTS": 2},
 }  # fmt: skip
-"""What is cut of cases that repeat it: other meshes, on which `plate`, `column` and other shells bend; the
-slope between the least and the greatest; integrators, as `tests/stepping/test_friction.py` has them all;
-starts.
+"""Parameters omitted from cases that repeat others: further meshes, which `plate`, `column` and other shells
+have; the middle slope; integrators, which `tests/stepping/test_friction.py` has; starts.
 """
 
 TOGETHER = (
@@ -51,7 +50,7 @@ TOGETHER = (
     "stretched-membrane", "sze-end-shear", "pinched-cylinder", "roll-up", "plate-curvature", "rest",
     "collision",
 )  # fmt: skip
-"""Cases of each kind that also run on several ranks; what depends on ranks is tested in `tests/stepping`."""
+"""Cases of each kind that also run on several ranks; `tests/stepping` tests the effects of ranks."""
 
 
 @pytest.mark.parametrize("name", CASES.modules)

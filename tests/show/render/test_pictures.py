@@ -25,7 +25,9 @@ from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 SIZE = "160x120"
 FRONT, BACK = "#ff0000", "#0000ff"
 LEVEL = ("render.camera.position=[1.5,1.5,9]", "render.camera.target=[1.5,1.5,0]", "render.camera.angle=30")
-"""A camera above the ring, x to the right and y up: 4.8 m high pictures in the plane z = 0."""
+"""A camera above the ring, x to the right and y upwards; pictures show 4.8 m vertically in the plane z = 0.
+
+"""
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from written_run import MET, Writer, met, written
 pytestmark = pytest.mark.slow
 
 PATIENCE = 60.0
-"""Seconds; the browser draws by software, on a machine that may have other work."""
+"""Longest wait [s]; the browser uses software rendering, on a machine that may be busy."""
 
 
 class Seen:

@@ -14,7 +14,7 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.view.live import NICENESS, LivePage
 
 SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
-"""The same without an end in sight."""
+"""The same scene with a much later end."""
 
 PATIENCE = 60.0
 
