@@ -79,16 +79,8 @@ class Inertia:
 
     def _factor(self) -> PETSc.Mat:
         self._free_solver()
-        self._ksp = ksp = PETSc.KSP().create(self._layout.comm)
-        ksp.setOptionsPrefix(PREFIX)
-        ksp.setType(PETSc.KSP.Type.PREONLY)
-        ksp.setOperators(self._matrix.mat)
-        pc = ksp.getPC()
-        pc.setType(PETSc.PC.Type.CHOLESKY)
-        pc.setFactorSolverType("mumps")
-        pc.setFactorSetUpSolverType()
-        factors = pc.getFactorMatrix()
-        factors.setOptionsPrefix(PREFIX)  # without a prefix it would take the options of the steps' factors
+        self._ksp = ksp = self._matrix.cholesky()
+        factors = ksp.getPC().getFactorMatrix()
         # no scaling; count all pivots, also those of the last dense block, and null pivots separately
         for number, value in {6: 0, 8: 0, 13: 1, 14: self._margin, 24: 1}.items():
             factors.setMumpsIcntl(number, value)
@@ -100,13 +92,7 @@ class Inertia:
     def solve(self, right: Array) -> Array:
         """Solution (n_owned, 3) for a right-hand side, by the factors of the last ``pivots``; collective."""
         assert self._ksp is not None
-        x, b = self._matrix.mat.createVecs()
-        b.setArray(right.ravel())
-        self._ksp.solve(b, x)
-        found: Array = x.getArray(readonly=True).reshape(right.shape).copy()
-        x.destroy()
-        b.destroy()
-        return found
+        return self._matrix.solve(self._ksp, right)
 
     def lowest_mode(self, start: Array) -> tuple[float, Array] | None:
         """Lowest eigenvalue [N/m] and its unit eigenvector (n_owned, 3), by inverse iteration.

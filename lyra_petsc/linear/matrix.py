@@ -255,6 +255,33 @@ class AssembledMatrix:
         if shift > 0.0 and not self._only_diagonal:
             values[self._diagonal] = diagonal
 
+    def cholesky(self) -> PETSc.KSP:
+        """A solver by Cholesky factors, by MUMPS if PETSc has it, with the matrix's prefix; collective.
+
+        The caller owns it; its ``setUp`` computes the factors.
+        """
+        ksp, prefix = PETSc.KSP().create(self.mat.getComm()), self.mat.getOptionsPrefix()
+        ksp.setOptionsPrefix(prefix)
+        ksp.setType(PETSc.KSP.Type.PREONLY)
+        ksp.setOperators(self.mat)
+        pc = ksp.getPC()
+        pc.setType(PETSc.PC.Type.CHOLESKY)
+        if PETSc.Sys.hasExternalPackage("mumps"):
+            pc.setFactorSolverType("mumps")
+            pc.setFactorSetUpSolverType()
+            pc.getFactorMatrix().setOptionsPrefix(prefix)  # else it takes the options of the steps' factors
+        return ksp
+
+    def solve(self, ksp: PETSc.KSP, right: Array) -> Array:
+        """Solution (n_owned, 3) for a right-hand side by a solver of this matrix; collective."""
+        x, b = self.mat.createVecs()
+        b.setArray(right.ravel())
+        ksp.solve(b, x)
+        found: Array = x.getArray(readonly=True).reshape(right.shape).copy()
+        x.destroy()
+        b.destroy()
+        return found
+
     def destroy(self) -> None:
         """Free the matrix; collective."""
         self.mat.destroy()

@@ -128,13 +128,7 @@ class Arcs:
             self._factor()
         assert self._matrix is not None
         assert self._ksp is not None
-        x, b = self._matrix.mat.createVecs()
-        b.setArray(np.where(free, forces, 0.0).ravel())
-        self._ksp.solve(b, x)
-        found: Array = x.getArray(readonly=True).reshape(forces.shape).copy()
-        x.destroy()
-        b.destroy()
-        return found
+        return self._matrix.solve(self._ksp, np.where(free, forces, 0.0))
 
     def _factor(self) -> None:
         self.destroy()
@@ -151,17 +145,8 @@ class Arcs:
         rows.constrain(values, mask, rows.constrained_entries(mask))
         self._matrix = AssembledMatrix(layout, self._pattern, "aij", prefix=PREFIX)
         self._matrix.set(values)
-        self._ksp = ksp = PETSc.KSP().create(layout.comm)
-        ksp.setOptionsPrefix(PREFIX)
-        ksp.setType(PETSc.KSP.Type.PREONLY)
-        ksp.setOperators(self._matrix.mat)
-        pc = ksp.getPC()
-        pc.setType(PETSc.PC.Type.CHOLESKY)
-        if PETSc.Sys.hasExternalPackage("mumps"):
-            pc.setFactorSolverType("mumps")
-            pc.setFactorSetUpSolverType()
-            pc.getFactorMatrix().setOptionsPrefix(PREFIX)  # else it takes the options of the steps' factors
-        ksp.setUp()
+        self._ksp = self._matrix.cholesky()
+        self._ksp.setUp()
 
     def destroy(self) -> None:
         """Free the factors and the matrix; collective."""
