@@ -51,6 +51,13 @@ def combined(p, u, q, w):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
+def area_normal(x, s, e):  # type: ignore[no-untyped-def]
+    """Normal of triangle e of s (E, 3) at points x (n, 3), with the length of twice its area."""
+    a = point(x, s[e, 0])
+    return cross(minus(point(x, s[e, 1]), a), minus(point(x, s[e, 2]), a))
+
+
+@kernel(inline="always")
 def angle_parts(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """|n1| |n2| sin θ and |n1| |n2| cos θ, both 0 where a triangle has no normal; |n1|² and |n2|² [m⁴]."""
     e = minus(x1, x0)

@@ -13,6 +13,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.hinge import area_normal, scaled
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
@@ -22,11 +23,7 @@ from lyra_petsc.terms.term import Load
 def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
     """Add the force [N] of ``pressure`` (E,) [Pa] to out (n_local, 3)."""
     for e in range(s.shape[0]):
-        a, b, c = s[e, 0], s[e, 1], s[e, 2]
-        px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-        qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-        w = pressure[e] / 6.0
-        fx, fy, fz = w * (py * qz - pz * qy), w * (pz * qx - px * qz), w * (px * qy - py * qx)
+        fx, fy, fz = scaled(pressure[e] / 6.0, area_normal(x, s, e))
         for k in range(3):
             i = s[e, k]
             out[i, 0] += fx

@@ -22,6 +22,7 @@ from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.hinge import area_normal, dot, scaled
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 
@@ -30,13 +31,9 @@ from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 def normals(x, s, out):  # type: ignore[no-untyped-def]
     """Write unit normals of triangles into out (E, 3); 0 for collapsed ones."""
     for e in range(s.shape[0]):
-        a, b, c = s[e, 0], s[e, 1], s[e, 2]
-        px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-        qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        scale = 1.0 / length if length > 0.0 else 0.0
-        out[e, 0], out[e, 1], out[e, 2] = nx * scale, ny * scale, nz * scale
+        n = area_normal(x, s, e)
+        length = np.sqrt(dot(n, n))
+        out[e, 0], out[e, 1], out[e, 2] = scaled(1.0 / length if length > 0.0 else 0.0, n)
 
 
 @kernel(inline="always")
