@@ -11,28 +11,15 @@ from lyra_petsc.mesh.select import find_group, select_triangles, select_vertices
 from lyra_petsc.scene.schema import AppliedLoad, Scene
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import WindowedLoad
 
 
-class Force(Load):
-    """Forces and tractions of all loads.
-
-    Parameters
-    ----------
-    elements : Elements
-        Stencil (E, 1); data ``force`` (E, 3) [N], ``load`` (E,) the number of the scene's load.
-    windows : list of Window
-        Of all loads of the scene.
-    """
-
-    def __init__(self, elements: Elements, windows: list[Window]) -> None:
-        super().__init__(elements)
-        self._load = elements.data["load"].astype(np.int64)
-        self._windows = windows
+class Force(WindowedLoad):
+    """Forces and tractions of all loads: stencil (E, 1), data ``force`` (E, 3) [N]."""
 
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        strength = np.array([window.strength(t0, t1) for window in self._windows])
-        np.add.at(out, self.stencil[:, 0], self.elements.data["force"] * strength[self._load, None])
+        force = self.elements.data["force"] * self.strength(t0, t1)[:, None]
+        np.add.at(out, self.stencil[:, 0], force)
 
 
 def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.int64], Array]:

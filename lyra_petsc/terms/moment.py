@@ -22,25 +22,14 @@ from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import unit
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Load, Term
+from lyra_petsc.terms.term import Term, WindowedLoad
 
 
-class Moment(Load):
-    """The moments of all loads.
+class Moment(WindowedLoad):
+    """The moments of all loads: stencil (E, 2), edges (E, 1), data ``moment`` (E,) [N·m/m].
 
-    Parameters
-    ----------
-    elements : Elements
-        Stencil (E, 2) and edges (E, 1); data ``moment`` (E,) [N·m/m] about the edge, directed from its
-        smaller vertex number, ``load`` (E,) the number of the scene's load.
-    windows : list of Window
-        Of all loads of the scene.
+    A moment is about its edge, directed from the smaller vertex number.
     """
-
-    def __init__(self, elements: Elements, windows: list[Window]) -> None:
-        super().__init__(elements)
-        self._load = elements.data["load"].astype(np.int64)
-        self._windows = windows
 
     def connect(self, terms: Iterable[Term]) -> None:
         assert self.edges is not None
@@ -49,8 +38,7 @@ class Moment(Load):
         self._numbers = np.searchsorted(term.of_edges.indices, self._indices)
 
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        strength = np.array([window.strength(t0, t1) for window in self._windows])
-        moment = self.elements.data["moment"] * strength[self._load]
+        moment = self.elements.data["moment"] * self.strength(t0, t1)
         np.add.at(out.reshape(-1), self._indices, moment)
         tail, head = self.stencil.T
         edge, direction = x[head] - x[tail], self._term.frames.direction[self._numbers]

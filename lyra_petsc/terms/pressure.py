@@ -16,7 +16,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.hinge import area_normal, scaled
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import WindowedLoad
 
 
 @kernel()
@@ -31,44 +31,30 @@ def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
             out[i, 2] += fz
 
 
-class Pressure(Load):
-    """The pressures of all loads.
-
-    Parameters
-    ----------
-    elements : Elements
-        Stencil (E, 3); data ``load`` (E,) the number of the scene's load.
-    pressures : (n_loads,) [Pa]
-    windows : list of Window
-        Of all loads of the scene.
-    """
+class Pressure(WindowedLoad):
+    """The pressures of all loads: stencil (E, 3), data ``pressure`` (E,) [Pa]."""
 
     is_follower = True
 
-    def __init__(self, elements: Elements, pressures: Array, windows: list[Window]) -> None:
-        super().__init__(elements)
-        self._load = elements.data["load"].astype(np.int64)
-        self._pressures, self._windows = pressures, windows
-
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        now = self._pressures * np.array([window.strength(t0, t1) for window in self._windows])
-        add_force(x, self.stencil, now[self._load], out)
+        add_force(x, self.stencil, self.elements.data["pressure"] * self.strength(t0, t1), out)
 
 
 def elements(rest: RestShape) -> Elements:
     """The triangles under each pressure load (rank 0)."""
-    stencils, loads = [], []
+    stencils, pressures, loads = [], [], []
     for number, load in enumerate(rest.scene.loads):
         if load.pressure is not None:
             chosen = select_triangles(
                 rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
             )
             stencils.append(rest.mesh.triangles[chosen])
+            pressures.append(np.full(len(chosen), load.pressure))
             loads.append(np.full(len(chosen), float(number)))
-    return Elements(np.concatenate(stencils), {"load": np.concatenate(loads)})
+    data = {"pressure": np.concatenate(pressures), "load": np.concatenate(loads)}
+    return Elements(np.concatenate(stencils), data)
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Pressure:
     """The load on one rank."""
-    pressures = np.array([load.pressure or 0.0 for load in scene.loads])
-    return Pressure(elements, pressures, [Window(load.start, load.until) for load in scene.loads])
+    return Pressure(elements, [Window(load.start, load.until) for load in scene.loads])

@@ -12,7 +12,7 @@ They are passed to every other method as ``frozen``, so that no result depends o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -24,6 +24,7 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
 if TYPE_CHECKING:
+    from lyra_petsc.terms.motion import Window
     from lyra_petsc.terms.one_sided import Springs
     from lyra_petsc.terms.registry import Registration
 
@@ -650,3 +651,24 @@ class Load(Term):
     def potential(self, x: Array) -> float:
         """Potential energy [J] of this rank's elements; 0 for a load without a potential."""
         return 0.0
+
+
+class WindowedLoad(Load):
+    """Loads of the scene that act in windows of time.
+
+    Parameters
+    ----------
+    elements : Elements
+        With data ``load`` (E,), the number of the scene's load that acts on an element.
+    windows : sequence of Window
+        Windows of all loads of the scene.
+    """
+
+    def __init__(self, elements: Elements, windows: Sequence[Window]) -> None:
+        super().__init__(elements)
+        self._load = elements.data["load"].astype(np.int64)
+        self._windows = windows
+
+    def strength(self, t0: float, t1: float) -> Array:
+        """Fraction (E,) of the load on each element that acts in the step from t0 to t1 [s]."""
+        return np.array([window.strength(t0, t1) for window in self._windows])[self._load]
