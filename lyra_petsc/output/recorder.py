@@ -165,7 +165,7 @@ class Recorder:
             for name, rows in checkpoint.elements.items()
             if name in terms
         }
-        simulation.resume(scalars, arrays, checkpoint.edges, elements)
+        simulation.resume(arrays, scalars, checkpoint.edges, elements)
         int(scalars["last_state"])  # a bad entry must raise here, where `resume` catches it
 
     def _changing_elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
@@ -360,18 +360,15 @@ class Recorder:
         """A context that gives the checkpoint of the present state, in which the caller writes it."""
         simulation = self._simulation
         system, layout = simulation.problem.system, simulation.problem.points
-        n = layout.n_owned
-        rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.checkpoint_arrays()}
+        n, (saved, scalars) = layout.n_owned, simulation.saved_state()
+        rows = {"position": system.x[:n], "velocity": system.v[:n], **saved}
         for number, start in enumerate(sorted(system.reference.late)):
             rows[f"start_{number}"] = system.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()}
         arrays |= term_states.vertex_arrays(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
         edges |= term_states.edge_arrays(system)
-        scalars = simulation.checkpoint_scalars() | {
-            "last_state": last_state,
-            "scheme": simulation.scene.time.scheme,
-        }
+        scalars |= {"last_state": last_state, "scheme": simulation.scene.time.scheme}
         began = clock.monotonic()
         elements = term_states.element_arrays(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)

@@ -592,13 +592,20 @@ class SteppedScene:
             obstacle=nearest_obstacle(system) if between_sheets else None,
         )
 
-    def checkpoint_scalars(self) -> dict[str, Any]:
-        """Numbers of a checkpoint, besides positions and velocities, to continue as if never stopped."""
-        equilibrium = self._equilibrium
-        return {
-            "time": self.time,
+    def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Arrays (n_owned, 3) and numbers of a checkpoint besides positions and velocities; collective.
+
+        With them `resume` continues as if the run had never stopped.
+        """
+        system, time = self.problem.system, self.time
+        arrays, integrator = system.integrator.saved_state()
+        balance, budget = self.energy_balance.saved_state()
+        of_stepper, stepper = self.stepper.saved_state(time)
+        arrays = arrays | balance | of_stepper
+        scalars = {
+            "time": time,
             "step": self.step_number,
-            "budget": self.energy_balance.saved_state()[1],
+            "budget": budget,
             "totals": dict(self.totals),
             "stability": self.stability,
             "repeated": dict(self._repeats),
@@ -607,35 +614,30 @@ class SteppedScene:
             "told": sorted(self._reported),
             **self.control.saved_state(),
             "estimated_error": self.estimated_error,
-            "integrator": self._integrator_numbers(),
-            **self.stepper.saved_state(self.time)[1],
-            **({} if equilibrium is None else {"equilibrium": equilibrium.saved_state(self.time)[1]}),
+            "integrator": integrator,
+            **stepper,
             "energy": None if self.guard is None else self.guard.saved_state(),
-            "late_starts": sorted(self.problem.system.reference.late),
+            "late_starts": sorted(system.reference.late),
         }
-
-    def _integrator_numbers(self) -> dict[str, float]:
-        numbers = self.problem.system.integrator.saved_state()[1]
-        return numbers if self.local_error is None else numbers | self.local_error.saved_state()[1]
-
-    def checkpoint_arrays(self) -> dict[str, Array]:
-        """Arrays (n_owned, 3) of a checkpoint besides positions and velocities."""
-        arrays = dict(self.problem.system.integrator.saved_state()[0])
-        arrays |= self.energy_balance.saved_state()[0] | self.stepper.saved_state(self.time)[0]
         if self._equilibrium is not None:
-            arrays |= self._equilibrium.saved_state(self.time)[0]
+            more, scalars["equilibrium"] = self._equilibrium.saved_state(time)
+            arrays |= more
         if self.local_error is not None:
-            arrays |= self.local_error.saved_state()[0]
-        return arrays
+            more, numbers = self.local_error.saved_state()
+            arrays, scalars["integrator"] = arrays | more, integrator | numbers
+        return arrays, scalars
 
     def resume(
         self,
-        scalars: Mapping[str, Any],
         arrays: Mapping[str, Array],
+        scalars: Mapping[str, Any],
         edges: Mapping[str, Array] = MappingProxyType({}),
         elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
     ) -> None:
-        """Continue from a checkpoint whose x and v of owned rows are in ``problem.system`` already."""
+        """Continue from a `saved_state`; x and v of the owned rows are in ``problem.system`` already.
+
+        ``edges`` and ``elements`` are those of `term_states`; collective.
+        """
         system = self.problem.system
         system.state.update_ghosts()
         term_states.restore_fixed(system, edges, elements)

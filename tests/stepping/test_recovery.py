@@ -86,7 +86,7 @@ def test_one_note_reports_number_and_cause_of_repeated_steps(comm: MPI.Comm) -> 
     assert 0.0 < float(found[2]) < 0.04
     assert "6 steps were taken where 1 of the full Δt would do" in simulation.note_of_repeats
     other = SteppedScene(comm, simulation.scene)  # as a run that is resumed
-    other.resume(simulation.checkpoint_scalars(), simulation.checkpoint_arrays())
+    other.resume(*simulation.saved_state())
     assert other.note_of_repeats == simulation.note_of_repeats
     simulation.destroy()
     other.destroy()
