@@ -55,7 +55,7 @@ KEYS = {
 
 
 @dataclass(frozen=True)
-class Circumstances:
+class FailedStep:
     """Properties of the failed step on which the advice depends.
 
     Attributes
@@ -103,22 +103,22 @@ def failure_kind(diagnosis: Diagnosis, solve: FailedSolve) -> str:
     return "nonlinear trouble" if few_failed else "linear trouble"
 
 
-def advice(diagnosis: Diagnosis, solve: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
+def advice(diagnosis: Diagnosis, solve: FailedSolve, scene: Scene, step: FailedStep) -> list[str]:
     """Changes to try, each with its reason, the most promising first; never empty."""
     kind = failure_kind(diagnosis, solve)
     if kind == "overflow":
-        return [_overflow_advice(diagnosis, now), *_step_advice(scene, now)]
-    found = _local_advice(diagnosis, scene, now)
+        return [_overflow_advice(diagnosis, step), *_step_advice(scene, step)]
+    found = _local_advice(diagnosis, scene, step)
     static = scene.time.scheme == "static"
     if static and not scene.handles:
         found.insert(0, "handles (nothing holds the sheet)")
-        return [*found, *_linear_advice(solve, scene, now)]
+        return [*found, *_linear_advice(solve, scene, step)]
     if kind == "linear trouble":
-        return [*_linear_advice(solve, scene, now), *found]
-    limit = _iteration_advice(solve, now)
-    if limit and (now.max_iterations < FEW_ITERATIONS or solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT):
-        return [*limit, *found, *_step_advice(scene, now)]
-    found += [*_tolerance_advice(diagnosis, scene, now), *limit, *_step_advice(scene, now)]
+        return [*_linear_advice(solve, scene, step), *found]
+    limit = _iteration_advice(solve, step)
+    if limit and (step.max_iterations < FEW_ITERATIONS or solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT):
+        return [*limit, *found, *_step_advice(scene, step)]
+    found += [*_tolerance_advice(diagnosis, scene, step), *limit, *_step_advice(scene, step)]
     if not found:
         found = [
             "more handles, or a damped motion instead" if static else "more material.damping, or a finer mesh"
@@ -143,11 +143,11 @@ def contact_advice(pair: NearPair, scene: Scene) -> str:
     return f"time.integrator: beuler, which is more robust at impacts than {scene.time.scheme}"
 
 
-def _overflow_advice(diagnosis: Diagnosis, now: Circumstances) -> str:
+def _overflow_advice(diagnosis: Diagnosis, step: FailedStep) -> str:
     absurd = "smaller numbers where one is absurd, or has the wrong unit: in "
     if not diagnosis.iterate_finite or not diagnosis.overflowing:
         return absurd + "material, gravity, loads, wind, initial, motions, or mesh.transform.scale"
-    if diagnosis.vertex.moved > ABSURD_MOTION * now.spacing:
+    if diagnosis.vertex.moved > ABSURD_MOTION * step.spacing:
         return (
             f"{absurd}initial.velocity, motions, gravity and loads (vertex {diagnosis.vertex.number} moves "
             f"{diagnosis.vertex.moved:.3g} m in this step)"
@@ -156,11 +156,11 @@ def _overflow_advice(diagnosis: Diagnosis, now: Circumstances) -> str:
     return f"{absurd}{keys} (overflow in: {', '.join(diagnosis.overflowing)})"
 
 
-def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
+def _local_advice(diagnosis: Diagnosis, scene: Scene, step: FailedStep) -> list[str]:
     """Advice on extreme values at the vertex and triangle with the largest residual, and on handles."""
     found = []
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
-    sizes = diagnosis.jump / now.spacing
+    sizes = diagnosis.jump / step.spacing
     if diagnosis.handle is not None and sizes > LARGE_MOTION:
         motion = scene.handles[diagnosis.handle].motion
         found.append(
@@ -183,11 +183,11 @@ def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> lis
         )
     if scene.time.scheme != "static":
         for name, keys in (("wind", "wind.velocity"), ("loads", "gravity and loads")):
-            distance = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
-            if distance > LARGE_MOTION * now.spacing:
+            distance = vertex.forces.get(name, 0.0) / vertex.mass * step.dt**2
+            if distance > LARGE_MOTION * step.spacing:
                 found.append(
                     f"less {keys}, or a smaller time.step ({name} alone would move vertex {vertex.number} by "
-                    f"{distance:.3g} m in this step, {distance / now.spacing:.2g} element sizes)"
+                    f"{distance:.3g} m in this step, {distance / step.spacing:.2g} element sizes)"
                 )
     if triangle.aspect > LARGE_ASPECT_RATIO:
         found.append(
@@ -196,20 +196,20 @@ def _local_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> lis
     return found
 
 
-def _linear_advice(solve: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
+def _linear_advice(solve: FailedSolve, scene: Scene, step: FailedStep) -> list[str]:
     direct = "a direct solver: -pc_type lu"
-    if now.ranks > 1:
+    if step.ranks > 1:
         direct += " -pc_factor_mat_solver_type mumps"
-    if solve.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR_ITERATIONS:
-        return [f"-ksp_max_it above {now.linear_iterations}", direct]
+    if solve.ksp_reason == KSP.DIVERGED_MAX_IT and step.linear_iterations < MANY_LINEAR_ITERATIONS:
+        return [f"-ksp_max_it above {step.linear_iterations}", direct]
     if solve.ksp_reason == KSP.DIVERGED_INDEFINITE_MAT and scene.solver.hessian != "regularised":
         return ["solver.hessian: regularised", direct]
-    if now.preconditioner in ("lu", "cholesky"):
+    if step.preconditioner in ("lu", "cholesky"):
         return ["-pc_factor_shift_type positive_definite, or smaller numbers where material has absurd ones"]
-    return [direct, f"another preconditioner than -pc_type {now.preconditioner}"]
+    return [direct, f"another preconditioner than -pc_type {step.preconditioner}"]
 
 
-def _iteration_advice(solve: FailedSolve, now: Circumstances) -> list[str]:
+def _iteration_advice(solve: FailedSolve, step: FailedStep) -> list[str]:
     """Advice if the limit of iterations or function evaluations ended the solve."""
     if solve.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
         return ["a larger -snes_max_funcs"]
@@ -218,27 +218,27 @@ def _iteration_advice(solve: FailedSolve, now: Circumstances) -> list[str]:
     norms = [each.residual for each in solve.iterations]
     early = 2 * len(norms) // 3
     falling = early > 0 and min(norms[early:]) < 0.5 * min(norms[1:early] or norms[:1])
-    above = f"{now.iterations_key} above {now.max_iterations}"
+    above = f"{step.iterations_key} above {step.max_iterations}"
     if falling:
         return [f"{above} (the residual was still falling)"]
-    if now.max_iterations < FEW_ITERATIONS:
+    if step.max_iterations < FEW_ITERATIONS:
         return [above]
     return [
-        f"more material.damping (the last of {now.max_iterations} iterations did not reduce the residual)"
+        f"more material.damping (the last of {step.max_iterations} iterations did not reduce the residual)"
     ]
 
 
-def _tolerance_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
+def _tolerance_advice(diagnosis: Diagnosis, scene: Scene, step: FailedStep) -> list[str]:
     """Advice if the solve had almost converged: larger tolerances."""
     tolerance = scene.solver.force_tolerance
     if diagnosis.scale == 0.0 or diagnosis.norm > SMALL_RESIDUAL * diagnosis.scale:
         return []
     relative = diagnosis.norm / diagnosis.scale
     loose = 10.0 ** math.ceil(math.log10(max(2.0 * relative, 10.0 * tolerance)))
-    if diagnosis.norm <= NEAR_ROUNDOFF * now.floor:
+    if diagnosis.norm <= NEAR_ROUNDOFF * step.floor:
         return [
             f"solver.force_tolerance: {loose:.0e} and solver.step_tolerance likewise "
-            f"(the residual is near its round-off, {now.floor:.2g} N)"
+            f"(the residual is near its round-off, {step.floor:.2g} N)"
         ]
     balance = f"(forces balance to {relative:.1e} of the largest)"
     if relative <= tolerance:
@@ -246,9 +246,9 @@ def _tolerance_advice(diagnosis: Diagnosis, scene: Scene, now: Circumstances) ->
     return [f"solver.force_tolerance: {loose:.0e}, if that is accurate enough {balance}"]
 
 
-def _step_advice(scene: Scene, now: Circumstances) -> list[str]:
-    if now.nominal > LARGE_CUT * now.dt:
+def _step_advice(scene: Scene, step: FailedStep) -> list[str]:
+    if step.nominal > LARGE_CUT * step.dt:
         return []
     if scene.time.scheme == "static":
         return ["a smaller time.step (first increment of the load), or a damped motion instead"]
-    return [f"a smaller time.step, or -ts_adapt_dt_min below {now.dt:.3g}"]
+    return [f"a smaller time.step, or -ts_adapt_dt_min below {step.dt:.3g}"]

@@ -64,7 +64,7 @@ class Failure:
     static : bool
     kind : str
         ``overflow``, ``linear trouble`` or ``nonlinear trouble``.
-    tried : list of FailedAttempt
+    attempts : list of FailedAttempt
         All attempts at this step, in order.
     diagnosis : Diagnosis
     advice : list of str
@@ -83,7 +83,7 @@ class Failure:
     dt: float
     static: bool
     kind: str
-    tried: list[FailedAttempt]
+    attempts: list[FailedAttempt]
     diagnosis: Diagnosis
     advice: list[str]
     sources: list[Source]
@@ -92,7 +92,7 @@ class Failure:
     obstacle: NearPair | None = None
 
     @property
-    def now(self) -> str:
+    def start(self) -> str:
         """Text for the time or load factor at the start of the step."""
         return f"load factor {self.time:g}" if self.static else f"t = {self.time:g} s"
 
@@ -101,7 +101,7 @@ class Failure:
         """One line: what failed, where, and the first advice."""
         last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
         near = f": {_pair_text(self.near)}" if self.near is not None and self.near.blocks else ""
-        what = f"{self.tried[-1].words}{near}"
+        what = f"{self.attempts[-1].words}{near}"
         if self.failed_solve.iterations or not near:
             what += (
                 f" ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
@@ -109,8 +109,8 @@ class Failure:
                 f"and {self._triangle()}"
             )
         return (
-            f"step {self.step} ({self.now}) did not converge even with {last}: {what}; "
-            f"the state at {self.now} is kept; try {self.advice[0]}"
+            f"step {self.step} ({self.start}) did not converge even with {last}: {what}; "
+            f"the state at {self.start} is kept; try {self.advice[0]}"
         )
 
     @property
@@ -126,7 +126,7 @@ class Failure:
     def text(self) -> str:
         """The whole report, for a file."""
         rows = [self.sentence, "", "Attempts at this step:"]
-        rows += [f"  {self._attempt(each)}: {each.words}" for each in self.tried]
+        rows += [f"  {self._attempt(each)}: {each.words}" for each in self.attempts]
         rows += ["", "The last attempt, Newton iteration by iteration:"]
         rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}    fraction"]
         for number, each in enumerate(self.failed_solve.iterations):
@@ -148,7 +148,7 @@ class Failure:
             "step": self.step,
             "load_factor" if self.static else "time": self.time,
             "kind": self.kind,
-            "attempts": [asdict(each) for each in self.tried],
+            "attempts": [asdict(each) for each in self.attempts],
             "iterations": [asdict(each) for each in self.failed_solve.iterations],
             **asdict(self.diagnosis),
             **({} if self.near is None else {"near": asdict(self.near)}),
@@ -158,17 +158,18 @@ class Failure:
 
     # -- pieces ----------------------------------------------------------------------------------------
 
-    def _attempt(self, tried: FailedAttempt) -> str:
-        length = f"increment {tried.dt:.3g}" if self.static else f"Δt {tried.dt:.3g} s"
+    def _attempt(self, attempt: FailedAttempt) -> str:
+        length = f"increment {attempt.dt:.3g}" if self.static else f"Δt {attempt.dt:.3g} s"
         return (
-            f"{length} ({tried.solver}): {tried.newton_iterations} Newton and {tried.linear_iterations} "
-            f"linear iterations, residual {tried.residual:.3g} N"
+            f"{length} ({attempt.solver}): {attempt.newton_iterations} Newton and "
+            f"{attempt.linear_iterations} linear iterations, residual {attempt.residual:.3g} N"
         )
 
     def _earlier(self) -> str:
         """A line on the attempts before the last one; empty if there was only one."""
         each = [
-            f"{tried.dt:.3g}: {tried.residual:.3g} ({tried.newton_iterations})" for tried in self.tried[:-1]
+            f"{attempt.dt:.3g}: {attempt.residual:.3g} ({attempt.newton_iterations})"
+            for attempt in self.attempts[:-1]
         ]
         step = "increment" if self.static else "Δt [s]"
         shown = ", ".join(_shortened(each))

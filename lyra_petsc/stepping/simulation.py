@@ -26,7 +26,7 @@ from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
-from lyra_petsc.stepping.failure_advice import Circumstances, advice, contact_advice, failure_kind
+from lyra_petsc.stepping.failure_advice import FailedStep, advice, contact_advice, failure_kind
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
@@ -562,7 +562,7 @@ class SteppedScene:
         near = worst_pair(system)
         between_sheets = near is not None and not near.obstacle
         on_contact = [contact_advice(near, scene)] if near is not None and near.blocks else []
-        now = Circumstances(
+        step_data = FailedStep(
             dt=end - self.time,
             nominal=self.control.step,
             spacing=whole.spacing,
@@ -576,15 +576,15 @@ class SteppedScene:
         return Failure(
             step=self.step_number + 1,
             time=self.time,
-            dt=now.dt,
+            dt=step_data.dt,
             static=not system.integrator.dynamic,
             kind=failure_kind(diagnosis, solve),
-            tried=self._failed_attempts,
+            attempts=self._failed_attempts,
             diagnosis=diagnosis,
             advice=[
                 *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
                 # contact forces grow without bounds where parts would cross, so other advice would mislead
-                *(on_contact or advice(diagnosis, solve, scene, now)),
+                *(on_contact or advice(diagnosis, solve, scene, step_data)),
             ],
             sources=whole.sources,
             failed_solve=solve,
@@ -642,7 +642,7 @@ class SteppedScene:
         system.state.update_ghosts()
         term_states.restore_fixed(system, edges, elements)
         self.time, self.step_number = float(scalars["time"]), int(scalars["step"])
-        # loads and handles which only the changed scene lets start earlier start now; the others have started
+        # loads and handles that only the changed scene starts earlier start now; the others have started
         system.set_references(self.time)
         system.hold_targets(self.time)
         refuse_contact(system, self.scene, f"at {self._time_text()}")

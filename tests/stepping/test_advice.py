@@ -10,14 +10,14 @@ import pytest
 from petsc4py import PETSc
 from physics import grid, scene_of
 
-from lyra_petsc.stepping.failure_advice import Circumstances, advice, failure_kind
+from lyra_petsc.stepping.failure_advice import FailedStep, advice, failure_kind
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis, Triangle, Vertex
 from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason
 
-NOW = Circumstances(
+NOW = FailedStep(
     dt=1e-6, nominal=0.01, spacing=0.1, floor=1e-12, max_iterations=50,
     iterations_key="solver.max_iterations",
     linear_iterations=5000, preconditioner="pbjacobi", ranks=1,
@@ -48,7 +48,7 @@ def iterations(*norms: float, linear: int = 2) -> tuple[Iteration, ...]:
 def advised(
     diagnosis: Diagnosis = DIAGNOSIS,
     solve: FailedSolve = STUCK,
-    now: Circumstances = NOW,
+    now: FailedStep = NOW,
     **scene: Any,
 ) -> list[str]:
     content = {"mesh": grid(1, 1, 2, 2), "handles": [{"nodes": [0]}, {"nodes": [8], "motion": "lift"}],
@@ -72,7 +72,7 @@ def advised(
         (DIAGNOSIS, replace(NOW, dt=0.005), "-ts_adapt_dt_min below 0.005"),
     ],
 )  # fmt: skip
-def test_advice_after_a_nonlinear_failure(diagnosis: Diagnosis, now: Circumstances, words: str) -> None:
+def test_advice_after_a_nonlinear_failure(diagnosis: Diagnosis, now: FailedStep, words: str) -> None:
     tolerances = {"force_tolerance": 1e-6, "step_tolerance": 1e-9}
     told = advised(diagnosis, now=now, solver=tolerances)
     assert failure_kind(diagnosis, STUCK) == "nonlinear trouble"
@@ -102,7 +102,7 @@ def test_advice_if_the_maximum_of_iterations_is_reached() -> None:
         (-11, replace(NOW, preconditioner="cholesky"), "-pc_factor_shift_type positive_definite"),
     ],
 )
-def test_advice_after_a_linear_failure(reason: int, now: Circumstances, words: str) -> None:
+def test_advice_after_a_linear_failure(reason: int, now: FailedStep, words: str) -> None:
     stuck = replace(STUCK, snes_reason=SNES.DIVERGED_LINEAR_SOLVE, ksp_reason=int(reason))
     assert failure_kind(DIAGNOSIS, stuck) == "linear trouble"
     assert words in advised(solve=stuck, now=now)[0]

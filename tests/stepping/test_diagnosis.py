@@ -135,8 +135,8 @@ def test_earlier_attempts_are_reported(comm: MPI.Comm) -> None:
     time = {"end": 1.0, "step": 0.04}
     scene = {"material": STIFF, "solver": {"max_iterations": 1}, "time": time}
     with failing(comm, scene, petsc={"ts_adapt_dt_min": "0.005"}) as (_, error, failure):
-        assert [tried.dt for tried in failure.tried] == pytest.approx([0.04, 0.02, 0.01, 0.005])
-        assert all(tried.newton_iterations == 1 and tried.residual > 0.0 for tried in failure.tried)
+        assert [tried.dt for tried in failure.attempts] == pytest.approx([0.04, 0.02, 0.01, 0.005])
+        assert all(tried.newton_iterations == 1 and tried.residual > 0.0 for tried in failure.attempts)
         (line,) = [line for line in error.details if line.startswith("attempts before")]
         assert line.count(" (1)") == 3
         assert "-ts_adapt_dt_min below 0.005" in " ".join(error.details)

@@ -282,7 +282,7 @@ def test_a_sheet_without_an_equilibrium_fails_soon(name: str, comm: MPI.Comm) ->
         with pytest.raises(SolverError, match=words):
             simulation.step()
         assert simulation.failure is not None
-        tried = simulation.failure.tried
+        tried = simulation.failure.attempts
         assert re.search(words, tried[-1].words)
         assert sum(each.newton_iterations for each in tried) < 2500  # it took 36,780
         assert np.array_equal(shape(simulation), start)
