@@ -251,7 +251,7 @@ class Discretisation:
             theirs, moves = self._gather_near(own, np.arange(n)[:, None], x, u, distance, own >= 0)
             numbers, points, point_u, moves = np.concatenate([own, theirs]), x[:n], u[:n], moves[:, 0]
         else:
-            surface, place = term.surface.astype(np.int64), np.arange(layout.n_local)
+            surface, number_of = term.surface.astype(np.int64), np.arange(layout.n_local)
             corners = _with_marks(layout.global_number[surface], term)
             mine = surface[:, 0] < layout.n_owned  # each triangle is sent once
             # an element of a triangle with ghost corners also acts on the triangle's owned corners
@@ -260,7 +260,7 @@ class Discretisation:
             new = ((corners[:, :3] < layout.start) | (corners[:, :3] >= layout.start + n)).all(axis=1)
             corners, moves = corners[new], moves[new].reshape(-1, 2, 3)
             ghosts = np.unique(surface[surface >= n])
-            place[ghosts] = n + np.arange(len(ghosts))
+            number_of[ghosts] = n + np.arange(len(ghosts))
             numbers = np.concatenate([own, layout.global_number[ghosts]])
             others, first = np.unique(corners[:, :3], return_index=True)
             more = ~np.isin(others, numbers[n:])
@@ -270,7 +270,7 @@ class Discretisation:
             order = n + np.argsort(numbers[n:])
             at = np.minimum(np.searchsorted(numbers[order], corners[:, :3]), max(len(order) - 1, 0))
             triangles = np.concatenate(
-                [_with_marks(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
+                [_with_marks(number_of[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
             )
         points, point_u = np.concatenate([points, moves[:, 0]]), np.concatenate([point_u, moves[:, 1]])
         found = term.neighbours(points, point_u, numbers, triangles)

@@ -299,8 +299,8 @@ class _PreallocatedFile:
         """Write a state's row of the table (rank 0)."""
         entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
         with writing(self.path), open(self.path, "r+b", buffering=0) as file:
-            for place, entry in zip(self.table.tolist(), entries, strict=True):
-                os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
+            for offset, entry in zip(self.table.tolist(), entries, strict=True):
+                os.pwrite(file.fileno(), entry.tobytes(), offset + index * entry.nbytes)
 
 
 def _discard_states_after(path: Path, last_step: int) -> None:
@@ -308,10 +308,10 @@ def _discard_states_after(path: Path, last_step: int) -> None:
     with open_stored(path) as file:
         if TABLE not in file:
             return
-        steps, place = file[TABLE]["step"][()], file[TABLE]["step"].id.get_offset()
+        steps, offset = file[TABLE]["step"][()], file[TABLE]["step"].id.get_offset()
     steps[steps > last_step] = -1
     with open(path, "r+b", buffering=0) as raw:
-        os.pwrite(raw.fileno(), steps.tobytes(), place)
+        os.pwrite(raw.fileno(), steps.tobytes(), offset)
 
 
 def state_files(folder: str | os.PathLike[str]) -> list[Path]:
@@ -367,8 +367,8 @@ def _states_of(path: Path) -> list[WrittenState]:
 
 def _fields(group: Any, on: Mapping[str, str]) -> tuple[StoredField, ...]:
     return tuple(
-        StoredField(name, place, group[name].shape, group[name].dtype.name)
-        for name, place in on.items()
+        StoredField(name, kind, group[name].shape, group[name].dtype.name)
+        for name, kind in on.items()
         if name != "position"
     )
 

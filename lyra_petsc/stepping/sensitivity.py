@@ -379,7 +379,7 @@ class Sensitivities:
         change = np.zeros((system.points.n_owned, 3))
         changed = False
         for term, reference in zip(_edged(system), _edged(self._system), strict=True):
-            places, ends, length, _ = term.of_edges
+            indices, ends, length, _ = term.of_edges
             old: Frames = system.active.frozen[term]
             new = reference.frames
             if old is new:
@@ -389,8 +389,8 @@ class Sensitivities:
             first, second = transported(old, tangent), transported(new, tangent)
             sine = np.sum(np.cross(tangent, first) * second, axis=1)
             angle = np.arctan2(sine, np.sum(first * second, axis=1))
-            own = places < 3 * system.points.n_owned
-            change.reshape(-1)[places[own]] = -(length * angle)[own]
+            own = indices < 3 * system.points.n_owned
+            change.reshape(-1)[indices[own]] = -(length * angle)[own]
             changed = True
         if changed:
             system.x[: system.points.n_owned] += change

@@ -460,14 +460,14 @@ class StageEquations:
                 curved, *term.edge_increments(x, displacement, self.active.frozen[term], along)
             )
 
-    def _set_increments(self, increment: Array, places: Ints, values: Array) -> bool:
-        """Put displacements (m,) [m] of the free unknowns ``places`` (m,) into ``increment`` (n_owned, 3).
+    def _set_increments(self, increment: Array, indices: Ints, values: Array) -> bool:
+        """Put displacements (m,) [m] of the free unknowns ``indices`` (m,) into ``increment`` (n_owned, 3).
 
         Returns whether there were any.
         """
-        own = places < increment.size
-        own[own] = self.prescribed.free.ravel()[places[own]]
-        increment.reshape(-1)[places[own]] = values[own] / self.stage.c
+        own = indices < increment.size
+        own[own] = self.prescribed.free.ravel()[indices[own]]
+        increment.reshape(-1)[indices[own]] = values[own] / self.stage.c
         return bool(own.any())
 
     @property
