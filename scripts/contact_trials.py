@@ -41,9 +41,10 @@ from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Stepper
-from lyra_petsc.terms import contact, contact_pairs, registry
-from lyra_petsc.terms.contact import HALFWAY_CURVATURE, Barrier, ContactBarrier, ObstaclePositions
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_TRIANGLE
+from lyra_petsc.terms import registry
+from lyra_petsc.terms.contact import barrier, contact_pairs
+from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, Barrier, ContactBarrier, ObstaclePositions
+from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_TRIANGLE
 from lyra_petsc.terms.term import UpcomingStep
 
 Array = NDArray[np.float64]
@@ -183,7 +184,7 @@ class Multipliers(ContactBarrier):
         return bool(settled and 1.0 - delta.min(initial=1.0) <= MAX_VIOLATION)
 
 
-elements = contact.elements
+elements = barrier.elements
 
 
 def make(given: Any, scene: Scene, mass: Array) -> Multipliers:

@@ -4,7 +4,8 @@
 
 NAME is one of the scenes (default all): 24 × 24 cells of gray interlock, 1 m wide. The table has steps,
 repeated steps, Newton iterations of accepted steps (median, maximum) and of all attempts, linear iterations,
-and CPU time [s], each with and without the contact model of the line search (`stepping/contact_model.py`).
+and CPU time [s], each with and without the contact model of the line search
+(`stepping/newton/contact_model.py`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.contact_model import ContactModel
+from lyra_petsc.stepping.newton.contact_model import ContactModel
 from lyra_petsc.stepping.simulation import SteppedScene
 
 BALL = {"sphere": {"center": [0.0, 0.0, -0.35], "radius": 0.3}}

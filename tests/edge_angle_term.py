@@ -13,8 +13,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms import bending
-from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_gradients, point
+from lyra_petsc.terms.bending import hinge
+from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle, angle_gradients, point
 from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
@@ -82,7 +82,7 @@ class EdgeAngle(Elastic):
 
 def elements(rest: RestShape) -> Elements:
     """The hinges of ``terms.bending``, each with the number of its edge among all edges."""
-    hinges = bending.elements(rest)
+    hinges = hinge.elements(rest)
     ends, n = np.sort(hinges.stencil[:, :2], axis=1), rest.mesh.n_vertices
     number = np.searchsorted(rest.edges[:, 0] * n + rest.edges[:, 1], ends[:, 0] * n + ends[:, 1])
     data = {

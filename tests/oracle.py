@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.bending import Bending, dihedral_angles
-from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
-from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.midedge import NO_REST_ROTATION, MidEdge, mean_directors
-from lyra_petsc.terms.midedge_friction import MidEdgeFriction
-from lyra_petsc.terms.midedge_shape import (
+from lyra_petsc.terms.bending.hinge import Bending, dihedral_angles
+from lyra_petsc.terms.bending.hinge_energy import add_square_hessian, fade, hinge_hessian
+from lyra_petsc.terms.bending.midedge import NO_REST_ROTATION, MidEdge, mean_directors
+from lyra_petsc.terms.bending.midedge_friction import MidEdgeFriction
+from lyra_petsc.terms.bending.midedge_shape import (
     Frames,
     coupling_tangent,
     derivatives,
@@ -24,8 +23,9 @@ from lyra_petsc.terms.midedge_shape import (
     transported,
     unit,
 )
+from lyra_petsc.terms.loads.wind import Wind
+from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
-from lyra_petsc.terms.wind import Wind
 
 Ints = NDArray[np.int64] | NDArray[np.int32]
 

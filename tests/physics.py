@@ -18,8 +18,8 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem
-from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic

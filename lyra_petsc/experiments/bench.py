@@ -20,7 +20,7 @@ from lyra_petsc.phases import Phases
 from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
-from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge import MidEdge
 
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 """Default for scenes of cases: as Newton's method converges quadratically, it ends at round-off."""

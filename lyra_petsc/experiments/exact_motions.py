@@ -147,10 +147,10 @@ class Body:
         """Whether some hinge does not start at its rest angle."""
         if not any(entry.name == "bending" for entry in needed_terms(self.scene, self.rest.shells)):
             return False
-        from lyra_petsc.terms import bending
+        from lyra_petsc.terms.bending import hinge
 
-        hinges = bending.elements(self.rest)
-        angles = bending.dihedral_angles(self.mesh.positions, hinges.stencil)
+        hinges = hinge.elements(self.rest)
+        angles = hinge.dihedral_angles(self.mesh.positions, hinges.stencil)
         return bool(np.abs(angles - hinges.data["rest_angle"]).max(initial=0.0) > 1e-7)
 
     # -- assumptions shared by solutions -----------------------------------------------------------------

@@ -50,7 +50,9 @@ class KernelCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
-        stamp = digest(Path(inspect.getfile(function)).parent)
+        file, program = Path(inspect.getfile(function)), Path(__file__).parents[1]
+        within = file.is_relative_to(program)
+        stamp = digest(program / file.relative_to(program).parts[0] if within else file.parent)
         name = f"{self._impl.filename_base}-{stamp}"
         self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
 

@@ -17,7 +17,7 @@ from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.director_rotations import DirectorRotations
+    from lyra_petsc.terms.bending.director_rotations import DirectorRotations
 
 
 COARSEST = 100

@@ -22,7 +22,7 @@ from lyra_petsc.mesh.obstacles import (
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.scene.schema import Obstacle
-from lyra_petsc.terms.motion import Motion
+from lyra_petsc.terms.handles.motion import Motion
 
 
 def run_obstacles(run: StoredRun) -> list[Solid | Container]:

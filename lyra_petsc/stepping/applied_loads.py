@@ -12,7 +12,7 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Load
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.following_loads import FollowingLoads
+    from lyra_petsc.stepping.statics.following_loads import FollowingLoads
 
 
 class AppliedLoads:

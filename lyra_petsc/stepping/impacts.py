@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms import dashpots
+from lyra_petsc.terms.contact import dashpots
 from lyra_petsc.terms.term import Elastic
 
 DAMPING = 0.5

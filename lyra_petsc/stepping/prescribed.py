@@ -8,7 +8,7 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.block_rows import BlockRows, ConstrainedEntries
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
-from lyra_petsc.terms.prescribed_handles import ExactHandles
+from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
 
 
 class Prescribed:

@@ -29,20 +29,26 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
+from lyra_petsc.stepping.failure.near_pairs import nearest_pair
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
-from lyra_petsc.stepping.near_pairs import nearest_pair
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
+from lyra_petsc.terms.handles.prescribed_handles import (
+    ExactHandles,
+    Selection,
+    conflicts,
+    is_exact,
+    select_exact,
+)
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.motion import Motion, Window, motion_of
-from lyra_petsc.terms.prescribed_handles import ExactHandles, Selection, conflicts, is_exact, select_exact
 from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.clamped_edges import ClampedEdges
-    from lyra_petsc.terms.contact import Barrier
+    from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
+    from lyra_petsc.terms.contact.barrier import Barrier
 
 
 FLAT = 1e-6
@@ -215,9 +221,9 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
         if entry.edge_state and any(handle.holds_slope for handle in scene.handles):
-            from lyra_petsc.terms import clamped_edges  # only scenes with clamps need it
+            from lyra_petsc.terms.bending import midedge_clamp  # only scenes with clamps need it
 
-            clamps = clamped_edges.elements(rest)
+            clamps = midedge_clamp.elements(rest)
             elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
     for name, selector in scene.probes.items():
         vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
@@ -284,7 +290,7 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
         free = [axis for axis in range(3) if axis not in handle.axis_numbers]
         if not handle.clamp or not free:
             continue
-        from lyra_petsc.terms.midedge import normals_of  # only clamps need its kernels
+        from lyra_petsc.terms.bending.midedge import normals_of  # only clamps need its kernels
 
         at_clamp = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
         slope = np.abs(normals_of(mesh.positions, mesh.triangles[at_clamp])[:, free]).max(initial=0.0)
@@ -311,7 +317,7 @@ def _barrier(rest: RestShape) -> Barrier | None:
     """Parameters of contact for all ranks, or None if the scene has no contact."""
     if rest.scene.contact is None:
         return None
-    from lyra_petsc.terms.contact import barrier  # only contact needs its kernels
+    from lyra_petsc.terms.contact.barrier import barrier  # only contact needs its kernels
 
     return barrier(rest)
 
@@ -323,14 +329,14 @@ def _set_up_contact(
     if whole.barrier is None or scene.contact is None:
         return
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
-    from lyra_petsc.terms.contact import ContactBarrier
+    from lyra_petsc.terms.contact.barrier import ContactBarrier
 
     obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
     self_contact, static = scene.contact.self, scene.time.static
     contact.set_up(whole.barrier, obstacles, self_contact=self_contact, static=static)
     if "friction" in terms:
-        from lyra_petsc.terms.friction import CoulombFriction
+        from lyra_petsc.terms.contact.friction import CoulombFriction
 
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 
@@ -438,8 +444,8 @@ def _clamped_edges(scene: Scene, part: LocalMesh, terms: Mapping[str, Term]) -> 
     clamping = {n: handle for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements}
     if not clamping:
         return None
-    from lyra_petsc.terms.clamped_edges import ClampedEdges
-    from lyra_petsc.terms.midedge import MidEdge
+    from lyra_petsc.terms.bending.midedge import MidEdge
+    from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
 
     term, layout = next(term for term in terms.values() if isinstance(term, MidEdge)), part.layout
     return ClampedEdges(

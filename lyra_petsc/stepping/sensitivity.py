@@ -36,13 +36,13 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.energy_balance import EnergyBalance
-from lyra_petsc.stepping.equilibrium import MAX_GROWTH
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import Frames, transported
+from lyra_petsc.stepping.statics.equilibrium import MAX_GROWTH
+from lyra_petsc.terms.bending.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge_shape import Frames, transported
 from lyra_petsc.terms.term import Term
 
 CENTRAL = {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}

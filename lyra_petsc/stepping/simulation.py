@@ -25,16 +25,16 @@ from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 from lyra_petsc.stepping.energy_guard import EnergyGuard
-from lyra_petsc.stepping.equilibrium import Equilibrium
-from lyra_petsc.stepping.failure_advice import FailedStep, advice, contact_advice, failure_kind
-from lyra_petsc.stepping.failure_diagnosis import diagnose
-from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
+from lyra_petsc.stepping.failure.failure_advice import FailedStep, advice, contact_advice, failure_kind
+from lyra_petsc.stepping.failure.failure_diagnosis import diagnose
+from lyra_petsc.stepping.failure.failure_report import FailedAttempt, Failure
+from lyra_petsc.stepping.failure.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
-from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
+from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times, refuse_contact
-from lyra_petsc.stepping.roundoff import residual_roundoff
-from lyra_petsc.stepping.stability import Stability
+from lyra_petsc.stepping.statics.equilibrium import Equilibrium
+from lyra_petsc.stepping.statics.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options

@@ -38,13 +38,13 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, resized
-from lyra_petsc.terms.prescribed_handles import ExactHandles
+from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_ROTATION, Elastic, StepInterval, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import ContactImpulses
-    from lyra_petsc.terms.one_sided import Springs
+    from lyra_petsc.terms.contact.one_sided import Springs
 
 
 MAX_TURN = 0.25

@@ -19,15 +19,15 @@ from lyra_petsc.linear.petsc_options import PYTHON_SUFFIXES, Value, culprits, fi
 from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.blend import Blend
-from lyra_petsc.stepping.conditioning import expected_iterations
-from lyra_petsc.stepping.convergence import Convergence
-from lyra_petsc.stepping.extrapolation import Extrapolation
-from lyra_petsc.stepping.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
-from lyra_petsc.stepping.initial_guess import first_guess
-from lyra_petsc.stepping.linear_system import LinearSystem
-from lyra_petsc.stepping.newton import Newton
-from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
+from lyra_petsc.stepping.newton.blend import Blend
+from lyra_petsc.stepping.newton.conditioning import expected_iterations
+from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.extrapolation import Extrapolation
+from lyra_petsc.stepping.newton.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
+from lyra_petsc.stepping.newton.initial_guess import first_guess
+from lyra_petsc.stepping.newton.linear_system import LinearSystem
+from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
+from lyra_petsc.stepping.newton.snes_callbacks import Newton
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.ts_options import hidden_options
 
@@ -204,7 +204,9 @@ class Stepper:
         if system.discretisation.stencils_change or (system.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
         if PETSc.Options().getBool("contact_monitor", False) and system.discretisation.limits_motion:
-            from lyra_petsc.stepping.contact_monitor import ContactMonitor  # needed with the option only
+            from lyra_petsc.stepping.newton.contact_monitor import (
+                ContactMonitor,  # needed with the option only
+            )
 
             snes.setMonitor(ContactMonitor(system, lambda: newton.step_fraction))
         if self._iterates:

@@ -71,7 +71,7 @@ class Registration:
         Name of the term that replaces this one on coarse levels of multigrid, which have no edge unknowns.
         This term's module then has ``coarse_elements(rest)``, the elements of that term.
     module_name : str
-        Full name of the term's module, if it is not in ``lyra_petsc.terms``.
+        Name of the term's module; with a leading dot it is relative to ``lyra_petsc.terms``.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Registration:
 
     def module(self) -> ModuleType:
         """Import and return the term's module."""
-        return import_module(self.module_name or f"lyra_petsc.terms.{self.name}")
+        return import_module(self.module_name or f".{self.name}", __package__)
 
 
 def _bends_by(model: str) -> Need:
@@ -115,7 +115,15 @@ def _has_bending_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool
 
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
-    Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True, bends=True),
+    Registration(
+        "bending",
+        _bends_by("hinge"),
+        Role.ELASTIC,
+        "bending_energy",
+        damped=True,
+        bends=True,
+        module_name=".bending.hinge",
+    ),
     Registration(
         "midedge",
         _bends_by("midedge"),
@@ -125,6 +133,7 @@ REGISTRY: list[Registration] = [
         bends=True,
         edge_state=("frame",),
         coarse="bending",
+        module_name=".bending.midedge",
     ),
     Registration(
         "midedge_friction",
@@ -133,6 +142,7 @@ REGISTRY: list[Registration] = [
         "bending_energy",
         element_vertices=3,
         coarse="bending",
+        module_name=".bending.midedge_friction",
     ),
     Registration(
         "shear_friction",
@@ -149,6 +159,7 @@ REGISTRY: list[Registration] = [
         {"contacts": "sum", "smallest_gap": "min", "friction_work": "sum"},
         neighbours=True,
         limits_step=True,
+        module_name=".contact.barrier",
     ),
     Registration(
         "friction",
@@ -158,34 +169,54 @@ REGISTRY: list[Registration] = [
         neighbours=True,
         state=("friction_work", "friction_owed"),
         element_vertices=4,
+        module_name=".contact.friction",
     ),
     Registration(
-        "clamp", _has_clamped_hinges, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True
+        "clamp",
+        _has_clamped_hinges,
+        Role.ELASTIC,
+        "bending_energy",
+        damped=True,
+        bends=True,
+        moving=True,
+        module_name=".bending.hinge_clamp",
     ),
     Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
         Role.CONSTRAINT,
+        module_name=".handles.spring",
     ),
     Registration(
         "gravity",
         lambda scene, shells: scene.gravity is not None and any(scene.gravity),
         Role.LOAD,
         "potential_energy",
+        module_name=".loads.gravity",
     ),
     Registration(
         "wind",
         lambda scene, shells: bool(scene.wind and (scene.wind.density or scene.wind.drag)),
         Role.VISCOUS,
+        module_name=".loads.wind",
     ),
     Registration(
-        "pressure", lambda scene, shells: any(load.pressure is not None for load in scene.loads), Role.LOAD
+        "pressure",
+        lambda scene, shells: any(load.pressure is not None for load in scene.loads),
+        Role.LOAD,
+        module_name=".loads.pressure",
     ),
     Registration(
-        "force", lambda scene, shells: any(load.force or load.traction for load in scene.loads), Role.LOAD
+        "force",
+        lambda scene, shells: any(load.force or load.traction for load in scene.loads),
+        Role.LOAD,
+        module_name=".loads.force",
     ),
     Registration(
-        "moment", lambda scene, shells: any(load.moment is not None for load in scene.loads), Role.LOAD
+        "moment",
+        lambda scene, shells: any(load.moment is not None for load in scene.loads),
+        Role.LOAD,
+        module_name=".loads.moment",
     ),
 ]
 

@@ -24,8 +24,8 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.motion import Window
-    from lyra_petsc.terms.one_sided import Springs
+    from lyra_petsc.terms.contact.one_sided import Springs
+    from lyra_petsc.terms.handles.motion import Window
     from lyra_petsc.terms.registry import Registration
 
 Offsets = NDArray[np.int32] | NDArray[np.int64]

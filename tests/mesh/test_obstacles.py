@@ -15,7 +15,7 @@ from lyra_petsc.mesh.obstacles import Container, Solid, build_scene_obstacles
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import scene_of
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.motion import Motion
+from lyra_petsc.terms.handles.motion import Motion
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 

@@ -10,7 +10,7 @@ from physics import Simulation, grid
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.fields import FIELDS, check_field, chosen_fields
 from lyra_petsc.scene import schema as control
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.bending.hinge import Bending
 
 MATERIAL = {"density": 0.2, "membrane": {"c11": 100, "c22": 80, "c12": 20, "c33": 30}, "bending": 1e-3}
 ALL = {"mesh": grid(1.0, 1.0, 8, 8), "material": MATERIAL, "output": {"fields": list(control.FIELDS)}}

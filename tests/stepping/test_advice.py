@@ -10,9 +10,9 @@ import pytest
 from petsc4py import PETSc
 from physics import grid, scene_of
 
-from lyra_petsc.stepping.failure_advice import FailedStep, advice, failure_kind
-from lyra_petsc.stepping.failure_diagnosis import Diagnosis, Triangle, Vertex
-from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
+from lyra_petsc.stepping.failure.failure_advice import FailedStep, advice, failure_kind
+from lyra_petsc.stepping.failure.failure_diagnosis import Diagnosis, Triangle, Vertex
+from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason

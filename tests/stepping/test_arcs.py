@@ -11,9 +11,9 @@ from physics import grid, rotation, scene_of
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
-from lyra_petsc.stepping import equilibrium
-from lyra_petsc.stepping.arcs import MAX_TURN, MIN_TURN, Arcs
+from lyra_petsc.stepping.newton.arcs import MAX_TURN, MIN_TURN, Arcs
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping.statics import equilibrium
 
 SHEET: dict[str, Any] = {
     "mesh": grid(1.0, 0.8, 6, 5, "alternating"),

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from physics import grid, scene_of
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
+from lyra_petsc.stepping.failure.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel(2)

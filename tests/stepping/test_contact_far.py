@@ -11,7 +11,7 @@ from physics import CLOTH, Simulation, gathered, grid, scene_of
 
 from lyra_petsc.stepping.impacts import damp_impacts
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.5, 0.5, 12, 12),

@@ -14,8 +14,8 @@ from physics import Simulation, direct_solver, gathered, grid, obj_file, scene_o
 
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms import contact
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact import barrier as contact_barrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 
@@ -250,7 +250,7 @@ def test_only_the_start_of_increments_through_many_parts_is_searched(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A Newton increment may move all vertices of a crumpled sheet through each other."""
-    monkeypatch.setattr(contact, "MAX_PAIRS", 0)
+    monkeypatch.setattr(contact_barrier, "MAX_PAIRS", 0)
     layers = [grid(0.3, 0.3, 8, 8) | {"transform": {"translate": [0.0, 0.0, 0.02 * n]}} for n in range(12)]
     with Simulation({"mesh": layers, "contact": {"gap": 1e-3}}, comm) as simulation:
         barrier = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from physics import Simulation, grid, obj_file
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 pytestmark = pytest.mark.parallel(2)
 

@@ -16,7 +16,7 @@ from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from physics import Simulation, grid
 
-from lyra_petsc.stepping.extrapolation import Extrapolation, lagrange_weights
+from lyra_petsc.stepping.newton.extrapolation import Extrapolation, lagrange_weights
 
 TIMES = [0.0, 0.1, 0.25, 0.3, 0.42, 0.5]  # unequal steps, as before a state is written
 

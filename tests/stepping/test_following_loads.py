@@ -17,7 +17,7 @@ from lyra_petsc.experiments.verification.cases.shells import symmetric
 from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.following_loads import FollowingLoads, newton_displacement
+from lyra_petsc.stepping.statics.following_loads import FollowingLoads, newton_displacement
 from lyra_petsc.terms.term import Load
 
 

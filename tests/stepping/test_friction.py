@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.friction import CoulombFriction
+from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact.friction import CoulombFriction
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from physics import CLOTH, Simulation, grid, rotation
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Keyframe
-from lyra_petsc.terms.motion import Motion, Window, motion_of
-from lyra_petsc.terms.spring import Spring
+from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
+from lyra_petsc.terms.handles.spring import Spring
 
 DT = 0.05
 MESH = grid(1.0, 0.6, 4, 3)

@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, grid, shape, stepped
 
-from lyra_petsc.stepping.linear_system import SET_UP, Reuse
+from lyra_petsc.stepping.newton.linear_system import SET_UP, Reuse
 
 MASK = np.zeros((1, 3), dtype=bool)
 

@@ -13,8 +13,8 @@ from physics import grid, options, scene_of, shape, stepped
 from lyra_petsc import phases as profiling
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import INCOMPLETE
-from lyra_petsc.stepping import linear_system
-from lyra_petsc.stepping.linear_system import MAX_SHIFT, MIN_SHIFT, DiagonalShift
+from lyra_petsc.stepping.newton import linear_system
+from lyra_petsc.stepping.newton.linear_system import MAX_SHIFT, MIN_SHIFT, DiagonalShift
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
 """A positive-definite matrix with indefinite incomplete factors (Kershaw, J. Comput. Phys. 26, 1978, 43-65).

@@ -10,9 +10,9 @@ from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
 from physics import CLOTH, finished, grid, scene_of, shape
 
-from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.stability import Examination
+from lyra_petsc.stepping.statics import equilibrium
+from lyra_petsc.stepping.statics.stability import Examination
 from lyra_petsc.terms import registry
 
 pytestmark = pytest.mark.parallel(2)
@@ -116,7 +116,7 @@ def test_motions_without_resistance_are_neutral(comm: MPI.Comm) -> None:
 
 
 def test_too_many_vertices_are_noted(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lyra_petsc.stepping.stability.MAX_VERTICES", 10)
+    monkeypatch.setattr("lyra_petsc.stepping.statics.stability.MAX_VERTICES", 10)
     with finished(comm, strip(0.5)) as simulation:
         assert simulation.stability["stable"] is None
         assert simulation.stability["negative_pivots"] is None

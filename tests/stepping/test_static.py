@@ -17,7 +17,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.linear import presets
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.stability import add_exact_hessian
+from lyra_petsc.stepping.statics.stability import add_exact_hessian
 
 pytestmark = pytest.mark.parallel(2)
 

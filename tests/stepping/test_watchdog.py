@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import pytest
 from petsc4py import PETSc
 
-from lyra_petsc.stepping.globalisation import PATIENCE, Watchdog
+from lyra_petsc.stepping.newton.globalisation import PATIENCE, Watchdog
 
 
 def seen(energies: Iterable[float]) -> int:

@@ -19,7 +19,7 @@ from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import behind_planes, inside_ball, outside_ball
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -23,8 +23,8 @@ from oracle import (
 from physics import Simulation, rotation
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import Frames
+from lyra_petsc.terms.bending.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge_shape import Frames
 from lyra_petsc.terms.registry import REGISTRY, Role
 from lyra_petsc.terms.term import Elastic, HandleTerm, Load, Term, UpcomingStep, Viscous
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lyra_petsc.terms import dashpots
+from lyra_petsc.terms.contact import dashpots
 
 VERTICES, PAIRS, DT, DAMPING = 20, 300, 0.01, 0.5
 

@@ -9,8 +9,8 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
 
-from lyra_petsc.terms.director_rotations import DirectorRotations
-from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.bending.director_rotations import DirectorRotations
+from lyra_petsc.terms.bending.midedge import MidEdge
 
 pytestmark = pytest.mark.parallel
 

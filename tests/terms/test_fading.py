@@ -13,10 +13,10 @@ from oracle import hessian as hessian_of
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.terms.bending import Bending
-from lyra_petsc.terms.clamp import Clamp
-from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
-from lyra_petsc.terms.motion import STILL, Window
+from lyra_petsc.terms.bending.hinge import Bending
+from lyra_petsc.terms.bending.hinge_clamp import Clamp
+from lyra_petsc.terms.bending.hinge_energy import FADES_BELOW, fading_limit
+from lyra_petsc.terms.handles.motion import STILL, Window
 from lyra_petsc.terms.registry import registration_of
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 

@@ -7,7 +7,7 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms import prescribed_handles as held
+from lyra_petsc.terms.handles import prescribed_handles as held
 
 SCENE = {
     "mesh": {"grid": {"width": 1, "height": 1, "nx": 4, "ny": 4}},

@@ -10,8 +10,8 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.topology import hinges
-from lyra_petsc.terms.bending import Bending
-from lyra_petsc.terms.hinge_triangles import triangles_of
+from lyra_petsc.terms.bending.hinge import Bending
+from lyra_petsc.terms.bending.hinge_triangles import triangles_of
 from lyra_petsc.terms.registry import registration_of
 
 

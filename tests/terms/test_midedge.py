@@ -36,10 +36,10 @@ from lyra_petsc.experiments.verification.cases.shells import (
 )
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
-from lyra_petsc.terms import midedge, midedge_energy
-from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import BATCH, tangents, unit
-from lyra_petsc.terms.moment import Moment
+from lyra_petsc.terms.bending import midedge, midedge_energy
+from lyra_petsc.terms.bending.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge_shape import BATCH, tangents, unit
+from lyra_petsc.terms.loads.moment import Moment
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from examples import BENDING, curved_sheet
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid, obj_file
 
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.bending.hinge import Bending
 
 
 def bending_of(simulation: Simulation) -> Bending:

@@ -35,12 +35,12 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.case import StoredArray, Verdict
 from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
-from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.state import resized
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.bending.hinge import Bending
+from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 from lyra_petsc.terms.term import Elastic, UpcomingStep

@@ -10,7 +10,7 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
-from lyra_petsc.terms.motion import Window
+from lyra_petsc.terms.handles.motion import Window
 
 
 def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array]:

@@ -23,7 +23,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     set_wind,
     use_directors,
 )
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.bending.hinge import Bending
 from lyra_petsc.terms.membrane import Membrane
 
 Array = np.ndarray

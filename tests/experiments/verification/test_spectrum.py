@@ -12,7 +12,7 @@ from oracle import blocks_of, expanded, summed
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.flat_plates import lowest_modes, lowest_squares
-from lyra_petsc.stepping.stability import add_exact_hessian
+from lyra_petsc.stepping.statics.stability import add_exact_hessian
 from lyra_petsc.terms.term import Elastic
 
 pytestmark = pytest.mark.parallel(2)

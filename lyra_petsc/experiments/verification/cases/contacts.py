@@ -33,7 +33,7 @@ from lyra_petsc.experiments.verification.verification_case import (
 )
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
-from lyra_petsc.terms.contact import ContactBarrier
+from lyra_petsc.terms.contact.barrier import ContactBarrier
 from lyra_petsc.terms.term import Elastic
 
 G = 9.81

@@ -30,7 +30,7 @@ from lyra_petsc.experiments.verification.verification_case import (
     load_data,
     scene,
 )
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.bending.hinge import Bending
 
 
 @dataclass(frozen=True)

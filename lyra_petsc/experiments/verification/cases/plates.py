@@ -32,7 +32,7 @@ from lyra_petsc.experiments.verification.verification_case import (
     scene,
     worst_value,
 )
-from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.bending.midedge import MidEdge
 
 EXACT = load_data("linear_plate")
 AT_ONCE = STATIC | {"step": 1.0}

@@ -1,0 +1,395 @@
+"""The callbacks of PETSc's SNES: Jacobian, corrections of the Newton step, objective, convergence test."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from petsc4py import PETSc
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.linear import failed_factors
+from lyra_petsc.linear.petsc_options import is_set
+from lyra_petsc.linear.pivots import negative_pivots
+from lyra_petsc.phases import JACOBIAN, logged
+from lyra_petsc.stepping.integrators.static import Static
+from lyra_petsc.stepping.newton.blend import Blend
+from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.globalisation import Globalisation
+from lyra_petsc.stepping.newton.inexact import COLLISION, Forcing
+from lyra_petsc.stepping.newton.linear_system import LinearSystem
+from lyra_petsc.stepping.stage_equations import StageEquations
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.newton.arcs import Arcs
+    from lyra_petsc.stepping.newton.contact_model import ContactModel
+
+
+SMALL_GAP = 0.005
+"""Half the gap over the mean edge length below which `ContactModel` is used.
+
+With larger gaps it saved a tenth of the iterations and took twice the time."""
+
+MAX_REMAINING = 0.5
+"""A correction of a step is taken if it leaves less than this fraction of the residual."""
+
+MAX_CORRECTIONS = 8
+"""Largest number of corrections of one step."""
+
+MIN_OVERLAP, MAX_OVERLAP = -1.0, 0.5
+"""Range of the correction's projection on the last step, over that step, in which Broyden's update acts."""
+
+
+def _max_norm(vector: PETSc.Vec) -> float:
+    return float(vector.norm(PETSc.NormType.INFINITY))
+
+
+def _apply_broyden(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
+    """Change a correction solved with the matrix of the first step to that of Broyden's matrix; collective.
+
+    ``steps`` are the Newton step and the corrections before this one.
+    (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.4, algorithm QNERR.)
+    """
+    for step, following in itertools.pairwise(steps):
+        correction.axpy(step.dot(correction) / step.dot(step), following)
+    repeated = steps[-1].dot(correction) / steps[-1].dot(steps[-1])
+    if MIN_OVERLAP < repeated < MAX_OVERLAP:
+        correction.scale(1.0 / (1.0 - repeated))
+
+
+class Newton:
+    """Callbacks of one SNES.
+
+    Parameters
+    ----------
+    snes : PETSc.SNES
+    system : StageEquations
+    linear : LinearSystem
+    blend : Blend
+    convergence : Convergence
+    iterates : bool
+        Whether there is more than one iteration (not so under ``semi-implicit``).
+    follow : callable
+        Updates the matrices to the present stencils, and returns whether they changed; collective.
+
+    Attributes
+    ----------
+    convergence : Convergence
+    globalisation : Globalisation
+    extra_iterations, contact_iterations : int
+        Linear iterations of repeated solves and corrections, and those of the contact model.
+    step_fraction : float
+        Fraction of the last Newton step that terms allowed.
+    """
+
+    def __init__(
+        self,
+        snes: PETSc.SNES,
+        system: StageEquations,
+        linear: LinearSystem,
+        blend: Blend,
+        convergence: Convergence,
+        *,
+        iterates: bool,
+        follow: Callable[[], bool],
+    ) -> None:
+        self._snes, self._ksp, self._system = snes, snes.getKSP(), system
+        self._linear, self._blend, self._iterates = linear, blend, iterates
+        self.convergence, self.globalisation = convergence, Globalisation(snes, system, convergence)
+        self._shape = (system.points.n_owned, 3)
+        skin = min((term.skin for term in system.active.limiting), default=np.inf)
+        self._contact: ContactModel | None = None
+        if iterates and skin < SMALL_GAP * convergence.spacing:
+            from lyra_petsc.stepping.newton.contact_model import ContactModel  # needed with small gaps only
+
+            self._contact = ContactModel(self._ksp, system, linear, follow)
+        self._last_iterate: PETSc.Vec | None = None
+        self._last_c = 0.0
+        self._convex_at_start = False
+        static = not (system.integrator.dynamic or system.discretisation.limits_motion)
+        self._corrects = static and linear.factors and bool(system.active.with_edges)
+        self._arcs: Arcs | None = None
+        if self._corrects:
+            from lyra_petsc.stepping.newton.arcs import Arcs, can_factor  # needed in equilibria only
+
+            self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
+        fixed = is_set("ksp_rtol") or not system.integrator.dynamic
+        self.forcing = Forcing(
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=system.discretisation.limits_motion
+        )
+
+    def begin_solve(self) -> None:
+        """Prepare for a new nonlinear solve; collective."""
+        self.extra_iterations = self.contact_iterations = 0
+        self._step_length, self.step_fraction = 0.0, 1.0
+        # the Hessian at the start of a step mostly resembles that at the start of the last step
+        self._convex = self._convex_at_start
+        collides = self._iterates and self._system.may_collide(COLLISION * self.convergence.spacing)
+        self._linear.begin_solve()
+        self._linear.shift.decrease()
+        self.convergence.begin_solve()
+        self.globalisation.begin_solve()
+        self.forcing.begin_solve(near=self._system.discretisation.has_near_elements, collides=collides)
+
+    @logged(JACOBIAN)
+    def assemble(self, u: PETSc.Vec) -> None:
+        """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
+        v = self._array(u)
+        if self._iterates:
+            self._system.set_iterate(v)
+            self.forcing.before_solve(self.convergence.norm)
+        # where Newton converges the geometry hardly changes, and the last preconditioner still serves
+        blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
+        self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
+        self._last_c = self._system.stage.c
+
+    def _array(self, u: PETSc.Vec) -> Array:
+        values: Array = u.getArray(readonly=True).reshape(self._shape)
+        return values
+
+    def _taken(self, u: PETSc.Vec) -> float:
+        """Fraction of the last Newton step that the line search took; 1 before the first."""
+        if self._last_iterate is None or self._step_length == 0.0:
+            return 1.0
+        self._last_iterate.axpy(-1.0, u)
+        taken = self._last_iterate.norm() / self._step_length
+        self._last_iterate.destroy()
+        self._last_iterate = None
+        return float(taken)
+
+    def correct_direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Correct the Newton step y (x − y is the next iterate) before the line search.
+
+        The linear solve is repeated with more regularisation while it meets negative curvature. The step then
+        follows contact, arcs and directors and is shortened to what terms allow. Returns whether y changed;
+        for ``SNESLineSearch.setPreCheck``.
+        """
+        if self.globalisation.return_to_best(x, y):
+            return True
+        changed = False
+        residual = self._snes.getFunction()[0]
+        failed = self._lacks_descent(residual, y)
+        self._convex = not failed
+        if self._snes.getIterationNumber() == 0:
+            self._convex_at_start = self._convex
+        while failed:
+            if not self._ease_linear_solve(self._array(x)):
+                y.zeroEntries()
+                return True
+            self._ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)
+            self._ksp.solve(residual, y)
+            self.extra_iterations += self._ksp.getIterationNumber()
+            changed = True
+            failed = self._lacks_descent(residual, y)
+        if self._contact is not None and not failed:
+            changed |= self._apply_contact_model(x, residual, y)
+        full = self.globalisation.takes_full_steps
+        curved = self._arcs is not None and full and self._apply_arcs(x, residual, y)
+        if self._system.active.with_edges and full and not curved:
+            changed |= self._turn_directors(x, residual, y)
+        if self._system.limits_steps and not curved:
+            changed |= self._limit_step(x, residual, y)
+        changed |= curved
+        if self._corrects and full:
+            exact = self._linear.uses_operator and self._blend.value == 0.0
+            changed |= self._apply_corrections(x, y, exact=exact)
+        if self._last_iterate is not None:
+            self._last_iterate.destroy()
+        self._last_iterate, self._step_length = x.copy(), y.norm()
+        self.globalisation.set_slope(residual.dot(y))
+        return changed
+
+    def _ease_linear_solve(self, v: Array) -> bool:
+        """Improve the preconditioner or regularise the matrix at velocities v after the linear solve failed.
+
+        Returns whether another solve may succeed; collective.
+        """
+        if failed_factors.replace_failed(self._ksp) or self._linear.improve_preconditioner(v):
+            return True
+        if not self._blend.increase():
+            return False
+        self._linear.reassemble_operator(v, self._blend.value)
+        return True
+
+    def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Replace a step y by that of `ContactModel`, which sees contacts along it; whether it changed."""
+        assert self._contact is not None
+        v = self._array(x)
+
+        def assemble() -> None:
+            self._linear.assemble(v, self._blend.value, keep=False, convex=self._convex)
+
+        def ease() -> bool:
+            self._linear.reassemble_operator(v, self._blend.value)
+            return self._ease_linear_solve(v)
+
+        changed = self._contact.improve(v, residual, y, assemble, ease, self.forcing.effective_tolerance)
+        self.contact_iterations += self._contact.linear_iterations
+        return changed
+
+    def _apply_corrections(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
+        """Add corrections, solved with the same factors, to a step y that is taken in full.
+
+        Each is solved for the residual at the end of the step, as long as it reduces that residual notably.
+        With ``exact``, where y is the unmodified Newton step, several are tried, else one. Returns whether y
+        changed. The first removes the stretch of a linear step (Traub, Iterative Methods for the Solution of
+        Equations, 1964, chapter 8: of third order), the others are steps of Broyden's method.
+        """
+        convergence, v = self.convergence, self._array(x)
+        first = v - self._array(y)
+        size, force = self._residual(first)
+        if size == 0.0:
+            return False
+        right, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
+        corrected = False
+        for _ in range(MAX_CORRECTIONS if exact else 1):
+            right.setArray(force.ravel())
+            self._ksp.solve(right, correction)
+            self.extra_iterations += self._ksp.getIterationNumber()
+            if exact:
+                _apply_broyden(correction, steps)
+            before = size
+            size, force = self._residual(v - self._array(y) - self._array(correction))
+            if not size < MAX_REMAINING * before:
+                break
+            corrected = True
+            y.axpy(1.0, correction)
+            if exact and convergence.correction_suffices(_max_norm(correction), _max_norm(steps[-1]), size):
+                break
+            steps.append(correction.copy())
+        if corrected:
+            self._system.linearise_to(first)
+        for vector in (right, correction, *steps):
+            vector.destroy()
+        return corrected
+
+    def _residual(self, v: Array) -> tuple[float, Array]:
+        """F (n_owned, 3) [N] at velocities v and its norm; collective."""
+        system, force = self._system, np.empty(self._shape)
+        system.residual(v, system.stage.sigma * (v - system.history), force)
+        (square,) = system.points.global_sum(float(np.vdot(force, force)))
+        return float(np.sqrt(square)), force
+
+    def curve_guess(self, v: Array, guess: Array) -> None:
+        """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs; collective.
+
+        Of all expected increments it takes the one whose end has the least energy.
+        """
+        integrator = self._system.integrator
+        if self._arcs is None or not isinstance(integrator, Static):
+            return
+        others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
+        lowest = np.inf
+        for increment in (guess - v, *others):
+            end = v + self._arcs.curve(v, increment, strains=False)[0]
+            self._system.prescribe(end)
+            energy = self._system.objective(end)[0] if others else 0.0
+            if energy < lowest:
+                lowest, guess[:] = energy, end
+
+    def tangent(self, force: Array) -> tuple[Array | None, int]:
+        """See `Stepper.tangent`."""
+        if self._arcs is None or self._last_c == 0.0:
+            return None, 0
+        b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
+        b.setArray(force.ravel())
+        self._ksp.solve(b, x)
+        displacement = self._last_c * self._array(x) if self._ksp.getConvergedReason() > 0 else None
+        b.destroy()
+        x.destroy()
+        return displacement, int(self._ksp.getIterationNumber())
+
+    def _apply_arcs(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Replace a step y that is taken in full by one along arcs if it descends; whether y changed."""
+        assert self._arcs is not None
+        v = self._array(x)
+        if not self._arcs.turns_notably(-self._array(y)):
+            return False
+        before = y.copy()
+        curved, increment = self._arcs.curve(v, -self._array(y))
+        y.setArray(-curved.ravel())
+        descends = bool(residual.dot(y) > 0.0)
+        if descends:
+            self._system.linearise_to(v + increment)
+            self.step_fraction = 1.0
+        else:
+            before.copy(y)
+        before.destroy()
+        return descends
+
+    def destroy(self) -> None:
+        """Free the PETSc objects of its own; collective."""
+        if self._arcs is not None:
+            self._arcs.destroy()
+
+    def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
+        increment = -self._array(y)
+        if not self._system.turn_directors(self._array(x), increment):
+            return False
+        before = y.copy()
+        y.setArray(-increment.ravel())
+        descends = bool(residual.dot(y) > 0.0)
+        if not descends:
+            before.copy(y)
+        before.destroy()
+        return descends
+
+    def _limit_step(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Shorten a step y to what terms allow, or separate the pairs that it brings too near.
+
+        Returns whether y changed.
+        """
+        system, v = self._system, self._array(x)
+        fraction = system.largest_step(v, -self._array(y))
+        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
+        separated = system.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
+        if separated is not None:
+            before = y.copy()
+            y.setArray(-separated.ravel())
+            farther = system.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
+            if farther > 0.0 and farther >= fraction:
+                fraction = farther
+            else:
+                before.copy(y)
+                separated = None
+            before.destroy()
+        self.step_fraction = fraction
+        y.scale(fraction)
+        return separated is not None or fraction < 1.0
+
+    def _lacks_descent(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Whether the linear solve failed or gave no direction of descent."""
+        if self._ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0:
+            return True
+        return self._linear.uses_operator and negative_pivots(self._ksp.getPC()) > 0
+
+    def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
+        """For ``SNES.setConvergenceTest``."""
+        spent = self.linear_iterations - self.contact_iterations
+        return self.convergence.test(snes, iteration, norms[2], spent)
+
+    def saved_state(self) -> dict[str, float]:
+        """Entries of a checkpoint, so that a resumed run solves the next steps alike."""
+        return {
+            "convex": self._convex_at_start,
+            "tolerance": self.forcing.tolerance,
+            "usual": self.convergence.mean_iterations,
+            **self._blend.saved_state(),
+            **self._linear.shift.saved_state(),
+        }
+
+    def restore(self, saved: Mapping[str, float]) -> None:
+        """Restore a `saved_state`; entries that older checkpoints lack keep their defaults."""
+        self._convex_at_start = bool(saved.get("convex", self._convex_at_start))
+        self.forcing.tolerance = float(saved.get("tolerance", self.forcing.tolerance))
+        self.convergence.mean_iterations = float(saved.get("usual", self.convergence.mean_iterations))
+        self._blend.restore(saved)
+        self._linear.shift.restore(saved)
+
+    @property
+    def linear_iterations(self) -> int:
+        """Linear iterations of the present solve so far."""
+        return int(self._snes.getLinearSolveIterations()) + self.extra_iterations + self.contact_iterations

@@ -1,0 +1,579 @@
+"""Static equilibrium at a load factor, by proximal steps: backward Euler from rest with growing Δτ.
+
+A load step starts from the polynomial extrapolation of the last equilibria, with their stress in the first
+Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), whose Hessian is positive definite where
+that of the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton's method
+converges in few iterations, until the out-of-balance force is small without the last term. Loads that follow
+the shape (pressure, wind) are updated before every solve, under-relaxed; pressures also change during a solve
+with their own stiffness. Friction takes the normal forces of the solve before, and solves are repeated until
+these are close to the normal forces in the equilibrium.
+
+Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.integrators.static import Static
+from lyra_petsc.stepping.newton.extrapolation import Extrapolation
+from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
+from lyra_petsc.stepping.statics.relaxation import Relaxation
+from lyra_petsc.stepping.statics.stability import Examination, Stability
+from lyra_petsc.stepping.stepper import Attempt, Stepper
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.statics.whole_stiffness import WholeStiffness
+
+MAX_SOLVES = 100
+"""Largest number of proximal steps in a load step."""
+
+PATIENCE, PROGRESS = 15, 0.9
+"""A load step is given up after so many proximal steps without progress, that is without a force below this
+fraction of the least one so far."""
+
+MAX_FAILURES = 8
+"""Number of proximal steps after which a load step is given up if none has converged."""
+
+MAX_DISPLACEMENT = 1e3
+"""Displacement in a load step, over the size of the mesh, beyond which there is no equilibrium."""
+
+MAX_IN_VAIN = 60
+"""Number of proximal steps without progress since the last equilibrium after which smaller increments are
+not tried."""
+
+EASY, FAIR = 6, 15
+"""Newton iterations up to which Δτ grows fast, and up to which it grows."""
+
+GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
+"""Factors of Δτ."""
+
+LEAP, LEAP_ITERATIONS = 1e3, 30
+"""A leap is a solve with Δτ larger by this factor, or with the last Δτ of the load step before. It is given
+up after so many iterations, and no further leaps are tried."""
+
+MAX_RESUMED = 3
+"""Number of leaps in a load step that are resumed where they ended: a snap may take more iterations."""
+
+BELOW_CEILING, CEILING_GROWTH = 0.5, 2.0
+"""With contact Δτ stays below this fraction of a ceiling, the Δτ of the last failed solve. The ceiling grows
+by the second factor in each solve: while sheets fall before they come to rest, longer Δτ fail repeatedly."""
+
+MAX_GROWTH = 1e7
+"""Largest Δτ over the first one: beyond it the last term is below round-off."""
+
+UNLIMITED = float(np.finfo(np.float64).max)
+"""A number larger than any Δτ."""
+
+HARD_STEP = 14
+"""After a load step with more Newton iterations, the next one begins with `WholeStiffness`."""
+
+NO_POTENTIAL = (
+    "pressure beside free edges has no potential, and the symmetric part of the stiffness is indefinite"
+)
+
+HANDLE_STEP = 1e-6
+"""Displacement of handles, over the mean edge length, in a finite difference of forces."""
+
+MAX_SLIDING = 5
+"""Number of proximal steps without progress after which a load step is given up if all contacts slide."""
+
+WORSE = 2.0
+"""Δτ is reduced after a solve in which the out-of-balance force grows by more than this factor."""
+
+
+MAX_DESCENTS = 5
+"""Largest number of unstable equilibria that are left along their lowest mode."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EquilibriumReport:
+    """Stability of the last equilibrium, iterations to find it, and a note for the user."""
+
+    stability: Stability
+    newton_iterations: int
+    linear_iterations: int
+    note: str
+
+
+class Equilibrium:
+    """Finds the equilibrium at one load factor after another; collective.
+
+    Parameters
+    ----------
+    system : StageEquations
+        With the integrator `Static`; its positions are the start shape.
+    stepper : Stepper
+    tolerances : Solver
+    spacing, size : float
+        Mean edge length [m] and diagonal of the bounding box [m].
+    floor : float
+        Norm [N] of the residual's round-off.
+    """
+
+    def __init__(
+        self,
+        system: StageEquations,
+        stepper: Stepper,
+        tolerances: Solver,
+        spacing: float,
+        size: float,
+        floor: float,
+    ) -> None:
+        assert isinstance(system.integrator, Static)
+        self._system, self._stepper, self._integrator = system, stepper, system.integrator
+        self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
+        self._max_pseudo_dt, self._safe_pseudo_dt = MAX_GROWTH, 1.0
+        self._whole_first = False  # whether the next load step begins with it
+        self._in_vain = 0
+        self._friction = FrictionBalance(system)
+        self._pressures: WholeStiffness | None = None
+        if system.active.following:
+            from lyra_petsc.stepping.statics.whole_stiffness import (
+                WholeStiffness,  # needed with pressures only
+            )
+
+            self._pressures = WholeStiffness(system, stepper.tangent, self._examine, self._balanced)
+        # load factor λ of the last equilibrium, change of the loads over that of λ [N], and tangent dx/dλ [m]
+        self._last_factor, self._load_rate = 0.0, np.zeros((system.points.n_owned, 3))
+        self._tangent: Array | None = None
+        # with factors the first solve may take any Δτ
+        self._last_pseudo_dt = UNLIMITED if stepper.linear.factors else 0.0
+        self._extrapolation = Extrapolation(system.points.comm)
+        self._follows = bool(system.active.viscous or system.active.following)
+        system.applied.factor = 0.0
+        system.begin_step(0.0, 0.0)
+        force, _ = system.out_of_balance()
+        self._scale = self._norm(force)
+        if self._scale > floor and not self._unstable():
+            system.applied.unbalanced = -force
+
+    def _unstable(self) -> bool:
+        """Whether the start shape with the forces that hold it is unstable, as if compressed; collective.
+
+        Reducing these forces step by step would then lead to a distant folded shape. Without them the first
+        solve finds the nearest equilibrium.
+        """
+        with self._examine() as examination:
+            return examination.stability.stable is False
+
+    def _examine(self) -> Examination:
+        return Examination(self._system, self._spacing, self._size)
+
+    def attempt(self, before: float, factor: float) -> Attempt:
+        """Find the equilibrium at load factor ``factor``; on failure the state is restored; collective."""
+        found = self._by_whole_stiffness(before, factor) if self._whole_first else None
+        if found is not None:
+            return found
+        attempt = self._by_proximal_steps(before, factor)
+        hard = not attempt.converged or attempt.newton_iterations > HARD_STEP
+        if not (attempt.converged or self._whole_first or self._stepper.stopped_by):
+            found = self._by_whole_stiffness(before, factor)
+        self._whole_first = hard
+        if found is None:
+            return attempt
+        newton = found.newton_iterations + attempt.newton_iterations
+        return dataclasses.replace(
+            found, newton_iterations=newton, linear_iterations=attempt.linear_iterations
+        )
+
+    def _by_whole_stiffness(self, before: float, factor: float) -> Attempt | None:
+        """Find the equilibrium by Newton's method with the whole stiffness of pressures; collective."""
+        if self._pressures is None:
+            return None
+        system = self._system
+        system.applied.factor = factor
+        guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
+        found = self._pressures.find(before, factor, guess)
+        if found is not None:
+            self._in_vain, self._last_factor, self._tangent = 0, factor, None
+        return found
+
+    def _by_proximal_steps(self, before: float, factor: float) -> Attempt:
+        """Find the equilibrium as described at the top of the module; collective."""
+        system, n = self._system, self._system.points.n_owned
+        x = system.x[:n].copy()
+        system.applied.factor = factor
+        newton = linear = solves = restarted_at = resumed = 0
+        moving_energy, last, solved_once, leaping = 0.0, np.inf, False, not system.active.viscous
+        ceiling, contact = np.inf, system.discretisation.limits_motion
+        contacts = system.active.contact_state()
+        self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
+        history: list[Iteration] = []
+        relaxation = Relaxation(system.points.comm)
+        self._friction.begin_step()
+        attempt = Attempt(False, 0, 0, 0.0)
+        while True:
+            force = self._out_of_balance(before, factor, first=solves == 0)
+            if not solves:
+                self._predict_by_tangent(before, factor)
+                moving_energy, frozen = system.moving_energy_before, system.active.frozen
+            history.append(_history_entry(force, attempt if solves else None))
+            balanced = solved_once and self._balanced(force, last)
+            if balanced and self._friction.is_settled():
+                self._friction.record_success(factor - before)
+                system.moving_energy_before = moving_energy
+                self._in_vain, self._last_pseudo_dt, self._last_factor = 0, self._integrator.pseudo_dt, factor
+                linear += self._compute_tangent(x, before, factor)
+                return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
+            last_progress = restarted_at + _last_progress([each.residual for each in history[restarted_at:]])
+            message = self._failure_message(solves, last_progress, x, solved_once=solved_once)
+            diverging = force > WORSE * history[last_progress].residual
+            if (
+                not message
+                and solved_once
+                and diverging
+                and solves - last_progress >= MAX_SLIDING
+                and self._friction.sliding_message()
+            ):
+                message = "no equilibrium: proximal steps lead farther off"
+            if message:
+                break
+            if force > WORSE * last:
+                self._integrator.pseudo_dt *= SHRINK
+            last = force
+            if attempt.converged:
+                system.active.accept_substep(system.x)
+            if balanced:  # except for friction
+                restarted_at = len(history)
+                longest, leaping = self._integrator.pseudo_dt, not system.active.viscous
+                last = self._out_of_balance(before, factor, first=True)
+                self._integrator.pseudo_dt = longest
+            if self._follows:
+                linear += self._update_loads(relaxation, before, factor, first=solves == 0)
+            leap = leaping and self._integrator.pseudo_dt > self._safe_pseudo_dt
+            attempt = self._proximal_step(before, factor, LEAP_ITERATIONS if leap else None)
+            if self._follows:
+                relaxation.record(system.applied.force_at(system.x))
+            system.applied.override = system.applied.following = self._integrator.predicted = None
+            self._integrator.alternatives = []
+            solves += 1
+            newton += attempt.newton_iterations
+            linear += attempt.linear_iterations
+            if attempt.converged:
+                solved_once = True
+                system.active.transport_frames(system.x)  # edges may turn far until they are in equilibrium
+                used = self._integrator.pseudo_dt
+                grown = min(used * growth(attempt.newton_iterations), BELOW_CEILING * ceiling)
+                self._safe_pseudo_dt = longest = max(grown, used)
+                ceiling *= CEILING_GROWTH
+                longest *= LEAP if leaping else 1.0
+                self._integrator.pseudo_dt = min(longest, self._max_pseudo_dt)
+            elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
+                resumed += 1
+            elif leap:  # Δτ was too long, perhaps too long to set up a preconditioner
+                leaping = self._last_pseudo_dt == UNLIMITED and not solved_once and not contact
+                self._integrator.pseudo_dt = self._safe_pseudo_dt
+            elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
+                break
+            else:
+                ceiling = self._integrator.pseudo_dt if contact else ceiling
+                self._integrator.pseudo_dt *= SHRINK
+                leaping = False
+        slides = self._friction.record_failure(factor - before) if message and solved_once else ""
+        if slides:
+            message = f"{message}; {slides}"
+        self._last_pseudo_dt = 0.0
+        self._in_vain += solves - last_progress if solved_once else 0
+        stuck = attempt.failed_solve or self._failed_solve(before, factor, history, x)
+        system.x[:n] = x
+        system.points.update_ghosts(system.x)
+        system.active.transport_frames(system.x, frozen)
+        system.active.restore_contacts(contacts)
+        return dataclasses.replace(
+            attempt,
+            converged=False,
+            newton_iterations=newton,
+            linear_iterations=linear,
+            message=message if slides else attempt.message or message,
+            failed_solve=stuck,
+        )
+
+    def _predict_by_tangent(self, before: float, factor: float) -> None:
+        """Set the predictions along the tangent of the last equilibrium; collective."""
+        if before != self._last_factor:
+            return
+        self._load_rate = self._system.out_of_balance()[0] / (factor - before)
+        if self._tangent is not None:
+            self._integrator.alternatives = self._extrapolation.tangent_predictions(factor, self._tangent)
+
+    def _compute_tangent(self, start: Array, before: float, factor: float) -> int:
+        """Compute the tangent dx/dλ of the equilibrium just found; returns linear iterations; collective.
+
+        Loads are assumed to change further as in this load step, and handles to move further as from
+        positions ``start`` (n_owned, 3) [m].
+        """
+        system, n = self._system, len(start)
+        step = factor - before
+        moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
+        (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
+        rate = self._load_rate
+        if largest > 0.0 and system.discretisation.limits_motion:
+            self._tangent = None  # with contact the first guess is another
+            return 0
+        if largest > 0.0:
+            x, part = system.x.copy(), HANDLE_STEP * self._spacing / largest
+            here = system.out_of_balance()[0]
+            system.x[:n] += part * moved
+            system.points.update_ghosts(system.x)
+            system.forget_forces()
+            rate = rate + (system.out_of_balance()[0] - here) / (part * step)
+            system.x[:] = x
+            system.forget_forces()
+        if self._pressures is None:
+            self._tangent, iterations = self._stepper.tangent(rate)
+        else:
+            loads = self._pressures.linearise_loads(before, factor)
+            self._tangent, iterations = self._pressures.tangent(rate, loads)
+        if self._tangent is not None:
+            self._tangent += moved / step
+        return iterations
+
+    def _update_loads(self, relaxation: Relaxation, before: float, factor: float, *, first: bool) -> int:
+        """Set the loads of the next solve to those of the present shape, pressures with their stiffness.
+
+        Returns linear iterations; collective.
+        """
+        system, now = self._system, self._system.applied.force.copy()
+        if self._pressures is None:
+            system.applied.override = relaxation.relax(now)
+            return 0
+        loads = system.applied.following = self._pressures.linearise_loads(before, factor)
+        displacement, iterations = None, 0
+        if system.active.viscous:  # the wind's stiffness is not known
+            pass
+        elif not first:
+            displacement, iterations = self._pressures.tangent(system.out_of_balance()[0], loads)
+        elif self._integrator.alternatives and self._tangent is not None:
+            displacement = (factor - before) * self._tangent
+        if displacement is None:
+            system.applied.override = relaxation.relax(now)
+        else:
+            system.applied.override = now + self._pressures.skew_force(loads, displacement)
+        return iterations
+
+    def _proximal_step(self, before: float, factor: float, limit: int | None) -> Attempt:
+        """One proximal step; ``limit`` bounds Newton iterations, and then also displacements; collective."""
+        snes, convergence = self._stepper.snes, self._stepper.convergence
+        maximum = snes.getTolerances()[3]
+        snes.setTolerances(max_it=min(maximum, limit or maximum))
+        convergence.max_displacement = self._size if limit else np.inf
+        attempt = self._stepper.attempt(before, factor)
+        self._stepper.snes.setTolerances(max_it=maximum)
+        self._stepper.convergence.max_displacement = np.inf
+        return attempt
+
+    def _resume_from_lowest(self, attempt: Attempt) -> bool:
+        """Set the state to the iterate of least energy of a solve that ran out of iterations; collective.
+
+        Returns whether it did: the energy must have fallen. Not with contact, whose stencils may differ
+        there, nor with loads that follow the shape.
+        """
+        system = self._system
+        ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
+        if not ran_out or self._follows or system.discretisation.limits_motion:
+            return False
+        lowest = self._stepper.lowest_energy_positions()
+        if lowest is None:
+            return False
+        system.state.set(lowest, np.zeros_like(lowest))
+        system.active.transport_frames(system.x)
+        return True
+
+    def settle(self, before: float, factor: float) -> EquilibriumReport:
+        """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
+        system, n = self._system, self._system.points.n_owned
+        moving_energy = system.moving_energy_before
+        newton = linear = followed = 0
+        message = ""
+        while True:
+            lag = self._friction.lag
+            with self._examine() as examination:
+                found = examination.stability
+                if found.stable is not False:
+                    break
+                mode, displacement = examination.lowest_mode(), None
+                if mode is None:
+                    message = "its lowest mode was not found"
+                elif self._pressures is not None and self._pressures.skew_part_stabilises(
+                    found, mode, factor
+                ):
+                    found = Stability(reason=NO_POTENTIAL)
+                elif examination.is_wrinkle(mode):
+                    message = (
+                        "sheets without bending wrinkle as finely as the mesh, which is not followed; give a "
+                        "bending stiffness"
+                    )
+                elif followed == MAX_DESCENTS:
+                    message = f"its lowest mode was followed {followed} times"
+                elif (displacement := examination.descent(mode)) is None:
+                    message = "nothing along its lowest mode has less energy"
+                if displacement is None:
+                    break
+            x = system.x[:n].copy()
+            self._last_pseudo_dt = 0.0
+            system.state.set(x + displacement, np.zeros_like(x))
+            attempt = self.attempt(before, factor)
+            newton += attempt.newton_iterations
+            linear += attempt.linear_iterations
+            if not attempt.converged:
+                system.state.set(x, np.zeros_like(x))
+                system.begin_step(before, factor)
+                system.evaluate_at_start()
+                message = "from its lowest mode no other was found"
+                break
+            followed += 1
+        system.moving_energy_before = moving_energy
+        note = _note(found, followed, message)
+        if lag > LAG:
+            note += "; " if note else ""
+            note += f"friction is known to {100.0 * lag:.1g} % of what normal forces allow"
+        return EquilibriumReport(found, newton, linear, note)
+
+    def saved_state(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Arrays (n_owned, 3) and numbers of a checkpoint at the equilibrium at ``factor``; collective."""
+        self._extrapolation.record(factor, self._system.x[: self._system.points.n_owned].copy())
+        arrays, past = self._extrapolation.saved_state()
+        numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._last_pseudo_dt}
+        numbers |= self._friction.saved_state()
+        if self._tangent is not None:
+            arrays["rate"] = self._tangent
+        return arrays, numbers | {"extrapolation": past}
+
+    def restore(self, arrays: Mapping[str, Array], saved: Mapping[str, Any], factor: float) -> None:
+        """Restore a `saved_state`; that of older checkpoints is empty."""
+        self._scale = float(saved.get("scale", self._scale))
+        self._in_vain = int(saved.get("in_vain", self._in_vain))
+        self._friction.restore(saved)
+        self._last_pseudo_dt = float(saved.get("sufficed", self._last_pseudo_dt))
+        self._last_factor = factor
+        self._tangent = np.array(arrays["rate"]) if "rate" in arrays else None
+        x = self._system.x[: self._system.points.n_owned].copy()
+        self._extrapolation.restore(arrays, saved.get("extrapolation", {}), factor, x)
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether attempts since the last equilibrium show that a smaller increment would not help."""
+        return self._in_vain >= MAX_IN_VAIN or self._friction.in_vain
+
+    def _failure_message(self, solves: int, last_progress: int, before: Array, *, solved_once: bool) -> str:
+        """Why no further proximal step is taken, or an empty string; collective.
+
+        ``before`` (n_owned, 3) [m] are the positions at the start of the load step, ``last_progress`` is the
+        number of the last solve that made progress.
+        """
+        if not solved_once:
+            return "no proximal step was found" if solves >= MAX_FAILURES else ""
+        moved = float(np.abs(self._system.x[: len(before)] - before).max(initial=0.0))
+        moved = self._system.points.comm.allreduce(moved, MPI.MAX)
+        if moved > MAX_DISPLACEMENT * self._size:
+            return f"no equilibrium within {moved:.1g} m of the start, as if nothing held the sheet"
+        if solves - last_progress >= PATIENCE:
+            idle = solves - last_progress
+            return f"no equilibrium: the last {idle} of {solves} proximal steps came no nearer"
+        return f"no equilibrium within {solves} proximal steps" if solves >= MAX_SOLVES else ""
+
+    def _failed_solve(self, before: float, factor: float, history: list[Iteration], x: Array) -> FailedSolve:
+        """The state that the proximal steps from positions x (n_owned, 3) [m] have reached; collective."""
+        system, n = self._system, self._system.points.n_owned
+        system.begin_step(before, factor)
+        force, _ = system.out_of_balance()
+        goal = x.copy()
+        if system.held:
+            system.prescribed.targets(before, factor, factor, goal)
+        return FailedSolve(
+            iterations=tuple(history),
+            norm=self._norm(force),
+            time=factor,
+            velocity=np.zeros_like(x),
+            position=system.x[:n].copy(),
+            residual=-force,
+            forces={"loads": -system.applied.force, "internal": system.applied.force - force},
+            prescribed=system.prescribed.mask[:n].copy(),
+            goal=goal,
+            snes_reason=0,
+            ksp_reason=0,
+            linear_residuals=np.empty(0),
+        )
+
+    def _out_of_balance(self, before: float, factor: float, *, first: bool) -> float:
+        """Norm [N] of the out-of-balance force; sets Δτ for the first solve of a load step; collective."""
+        system = self._system
+        system.begin_step(before, factor)
+        force, largest = system.out_of_balance()
+        norm = self._norm(force)
+        if not np.isfinite(norm):  # an obstacle has moved into the sheet
+            return norm
+        self._scale = max(self._scale, largest)
+        if first and norm > 0.0:
+            n = system.points.n_vertices
+            fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
+            if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
+                mass = system.points.global_sum(float(system.mass.sum()))[0] / system.points.n_vertices_global
+                fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
+            fastest = system.points.comm.allreduce(fastest, MPI.MAX)
+            self._safe_pseudo_dt = float(np.sqrt(self._spacing / fastest))
+            self._max_pseudo_dt = MAX_GROWTH * self._safe_pseudo_dt
+            last_pseudo_dt = 0.0 if system.active.viscous else self._last_pseudo_dt
+            self._integrator.pseudo_dt = min(max(self._safe_pseudo_dt, last_pseudo_dt), self._max_pseudo_dt)
+        return norm
+
+    def _balanced(self, force: float, last: float) -> bool:
+        """Whether a force of this norm [N] counts as zero; ``last`` [N] is that one proximal step before.
+
+        Below the round-off floor proximal steps are taken as long as they reduce the force.
+        """
+        if force <= self._tolerances.force_tolerance * self._scale:
+            return True
+        return PROGRESS * last <= force <= self._floor
+
+    def _norm(self, vector: Array) -> float:
+        return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
+
+
+def _note(found: Stability, followed: int, message: str) -> str:
+    """Note for the user on the stability of an equilibrium, or an empty string."""
+    if found.stable is None:
+        return f"whether the equilibrium is stable is not known: {found.reason}"
+    if not found.stable:
+        modes = "1 way" if found.negative == 1 else f"{found.negative} ways"
+        return f"the equilibrium is unstable, it gives way in {modes} (negative pivots): {message}"
+    notes = []
+    if followed:
+        times = "once" if followed == 1 else f"{followed} times"
+        notes.append(
+            f"the first equilibrium was unstable; its lowest mode was followed {times}, to a stable one"
+        )
+    if found.neutral:
+        notes.append(f"the equilibrium is neutral: nothing resists {found.neutral} motions (neutral pivots)")
+    return "; ".join(notes)
+
+
+def _history_entry(force: float, attempt: Attempt | None) -> Iteration:
+    """Entry of the history: the out-of-balance force [N] after a proximal step, or before the first."""
+    return Iteration(force, attempt.linear_iterations if attempt else 0, 0, 1.0 if attempt else None)
+
+
+def _last_progress(forces: list[float]) -> int:
+    """Index of the last force that was notably less than all before."""
+    last, smallest = 0, np.inf
+    for number, force in enumerate(forces):
+        if force < PROGRESS * smallest:
+            last, smallest = number, force
+    return last
+
+
+def growth(iterations: int) -> float:
+    """Factor of Δτ after a solve with this number of Newton iterations."""
+    if iterations <= EASY:
+        return GROW_FAST
+    return GROW if iterations <= FAIR else 1.0

@@ -1,0 +1,141 @@
+"""Equilibria under pressure by Newton's method with the whole stiffness, also where it is not symmetric.
+
+Beside free edges the symmetric part of the stiffness, and with it the potential that solves minimise, may be
+indefinite at a stable equilibrium. Newton's method with the whole stiffness finds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.statics.following_loads import FollowingLoads, Solve, newton_displacement
+from lyra_petsc.stepping.statics.stability import Examination, Stability
+from lyra_petsc.stepping.stepper import Attempt
+from lyra_petsc.terms.term import Load
+
+MAX_ITERATIONS, MAX_GROWTH = 20, 1e6
+"""Limits of Newton's method: iterations, and growth of the force in one of them, by stretching."""
+
+
+class WholeStiffness:
+    """Newton's method with the whole stiffness of pressures; collective.
+
+    Parameters
+    ----------
+    system : StageEquations
+    tangent : callable
+        As `Stepper.tangent`.
+    examine : callable
+        Returns an `Examination` of the present equilibrium.
+    balanced : callable
+        Whether a force of this norm [N] counts as zero, given the norm one iteration before.
+    """
+
+    def __init__(
+        self,
+        system: StageEquations,
+        tangent: Callable[[Array], tuple[Array | None, int]],
+        examine: Callable[[], Examination],
+        balanced: Callable[[float, float], bool],
+    ) -> None:
+        self._system, self._tangent, self._examine, self._balanced = system, tangent, examine, balanced
+
+    def find(self, before: float, factor: float, guess: Array) -> Attempt | None:
+        """Find the equilibrium at load factor ``factor`` from a guess of its positions (n_owned, 3) [m].
+
+        Returns None, with the state restored, if Newton's method fails or the equilibrium is unstable.
+        """
+        system, n = self._system, self._system.points.n_owned
+        if system.active.viscous or system.discretisation.limits_motion:
+            return None
+        x = system.x[:n].copy()
+        system.begin_step(before, factor)
+        frozen, anchored, last = system.active.frozen, system.moving_energy_before, np.inf
+        system.prescribed.targets(before, factor, factor, guess)
+        self._set_positions(guess)
+        for iteration in range(MAX_ITERATIONS):
+            system.begin_step(before, factor)
+            unbalanced, _ = system.out_of_balance()
+            force = float(np.sqrt(system.points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]))
+            if iteration > 0 and self._balanced(force, last):
+                if not self._is_stable(factor):
+                    break
+                system.evaluate_at_start()
+                system.moving_energy_before = anchored
+                return Attempt(True, iteration, 0, force)
+            displacement = self._displacement_by_force(unbalanced, factor) if np.isfinite(force) else None
+            if displacement is None or force > MAX_GROWTH * last:
+                break
+            last = force
+            self._set_positions(system.x[:n] + displacement)
+        system.state.set(x, np.zeros_like(x))
+        system.active.transport_frames(system.x, frozen)
+        return None
+
+    def _set_positions(self, x: Array) -> None:
+        self._system.state.set(x, np.zeros_like(x))
+        self._system.active.transport_frames(self._system.x)
+
+    def _is_stable(self, factor: float) -> bool:
+        """Whether the equilibrium is stable, or stability is not known; collective."""
+        with self._examine() as examination:
+            found = examination.stability
+            if found.stable is not False:
+                return True
+            return self.skew_part_stabilises(found, examination.lowest_mode(), factor)
+
+    def skew_part_stabilises(self, found: Stability, mode: Array | None, factor: float) -> bool:
+        """Whether the skew part of the stiffness stabilises the unstable ``mode`` u of the symmetric part S.
+
+        With one negative eigenvalue of S the determinant of all of the stiffness K has the sign of uᵀK⁻¹u, as
+        the rest of S, and so of K, is positive definite; collective.
+        """
+        if mode is None or found.negative != 1 or self._system.active.viscous:
+            return False
+        response = self._displacement_by_force(mode, factor)
+        if response is None:
+            return False
+        return bool(self._system.points.global_sum(float(np.vdot(mode, response)))[0] > 0.0)
+
+    def _displacement_by_force(self, force: Array, factor: float) -> Array | None:
+        """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the whole stiffness; collective."""
+        with self._examine() as examination:
+            return self._newton_displacement(force, self.linearise_loads(factor, factor), examination.solve)
+
+    def tangent(self, force: Array, loads: FollowingLoads) -> tuple[Array | None, int]:
+        """As `Stepper.tangent`, with the whole stiffness of ``loads``; collective."""
+        linear = 0
+
+        def solve(force: Array) -> Array | None:
+            nonlocal linear
+            u, iterations = self._tangent(force)
+            linear += iterations
+            return u
+
+        return self._newton_displacement(force, loads, solve), linear
+
+    def _newton_displacement(self, force: Array, loads: FollowingLoads, solve: Solve) -> Array | None:
+        comm = self._system.points.comm
+        return newton_displacement(force, solve, lambda u: self.skew_force(loads, u), comm)
+
+    def linearise_loads(self, before: float, factor: float) -> FollowingLoads:
+        """The pressures, linear in the displacement from the present shape."""
+
+        def force_of(load: Load, x: Array, out: Array) -> None:
+            load.add_force(x, before, factor, out)
+
+        return FollowingLoads(self._system.active.following, self._system.x, force_of, factor)
+
+    def skew_force(self, loads: FollowingLoads, u: Array) -> Array:
+        """Force (n_owned, 3) [N] of the skew part on free unknowns for a displacement (n_owned, 3) [m];
+        collective.
+        """
+        system = self._system
+        local = np.zeros_like(system.x)
+        local[: len(u)] = u
+        system.points.update_ghosts(local)
+        return np.where(system.prescribed.free, loads.skew_force(local, len(u)), 0.0)

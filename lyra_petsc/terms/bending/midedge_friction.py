@@ -1,0 +1,224 @@
+"""Dry friction in bending with directors on edges, which gives a fabric's hysteresis and lasting folds.
+
+As in ``coulomb``, for the curvature κ of a triangle (``midedge``) less the curvature κ_p to which it has
+slid, in a norm that weights directions by their limits M1 and M2 [N m/m] ::
+
+    |u|² = (M1² u11² + M2² u22² + 2 M1 M2 u12²) / (M1 M2),   u = κ − κ_p
+    energy = ½ A √(M1 M2) |u|² / κ_y  for |u| ≤ κ_y,   A √(M1 M2) (|u| − κ_y/2)  beyond
+
+κ is a linear function of the directors' tangents T, so that with constants K the energy is a function of the
+quadratic form Q of ``midedge_energy``: E = ½ Q up to r = √Q = r_y and r_y (r − r_y/2) beyond. Its gradient
+there is that of the form with K r_y/r in place of K, and its Hessian is less by p pᵀ / (r r_y) with the
+gradient p.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
+from lyra_petsc.terms.bending.hinge import edge_in_material
+from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
+from lyra_petsc.terms.bending.midedge_shape import Frames
+from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
+
+YIELD_CURVATURE = 2.0
+"""κ_y [1/m]: change of curvature at which friction reaches its limit."""
+
+
+class Sliding(NamedTuple):
+    """Sliding of the triangles at given positions.
+
+    Attributes
+    ----------
+    part : (E,)
+        r_y/r for sliding triangles, otherwise 1.
+    friction : (E, 2)
+        As `midedge_energy` expects it.
+    tangent : (E, 4)
+        As from `midedge_shape.tangents`.
+    """
+
+    part: Array
+    friction: Array
+    tangent: Array
+
+
+class MidEdgeFriction(Elastic):
+    """Friction of all triangles; `connect` must be called next.
+
+    Parameters
+    ----------
+    elements : Elements
+        As of `MidEdge`, with K for ``stiffness`` and data ``r_y`` (E,) [√J].
+
+    Attributes
+    ----------
+    bent : (E, 3)
+        Directors' tangents to which the triangles have slid.
+    """
+
+    def __init__(self, elements: Elements) -> None:
+        super().__init__(elements)
+        data = elements.data
+        self.bent: Array = data["rest"].copy()
+        self._slides: Remembered[tuple[Array, ...]] | None = None
+        self._frames: Frames | None = None
+
+    def connect(self, terms: Iterable[Term]) -> None:
+        self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
+        assert self.edges is not None
+        self._edges = np.searchsorted(sheet.of_edges.indices, self.edges).astype(np.int32)
+        theirs = sheet.elements.data["triangle"]
+        order = np.argsort(theirs)
+        self._rows = order[np.searchsorted(theirs, self.elements.data["triangle"], sorter=order)]
+
+    @property
+    def _sheet(self) -> MidEdge:
+        assert isinstance(self.partner, MidEdge)
+        return self.partner
+
+    def freeze(self, step: UpcomingStep) -> Frames:
+        return self._sheet.freeze(step)
+
+    # -- energy ------------------------------------------------------------------------------------
+
+    def _sliding(self, x: Array, frames: Frames) -> Sliding:
+        if self._slides is None or self._frames is not frames:
+            self._frames = frames
+            self._slides = Remembered(lambda at: self._computed(at, frames))
+        return Sliding(*self._slides(x))
+
+    def _computed(self, x: Array, frames: Frames) -> Sliding:
+        half, data = np.empty(self.n_elements), self.elements.data
+        tangent = self._sheet.angle_tangents(x, frames)[self._rows]
+        constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
+        midedge_energy.energies(tangent, *constants, half)
+        r_y, r = data["r_y"], np.sqrt(2.0 * np.maximum(half, 0.0))
+        larger = np.maximum(r, r_y)
+        offset = np.where(r > r_y, 0.5 * r_y * (larger - r_y), 0.0)
+        curvature = np.where(r > r_y, -1.0 / (r_y * larger), 0.0)
+        return Sliding(r_y / larger, np.column_stack([curvature, offset]), tangent)
+
+    def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
+        """Directors' tangents, K, tangents of rest, limits and friction: arguments of kernels."""
+        data = self.elements.data
+        stiffness = data["stiffness"] * sliding.part[:, None]
+        return sliding.tangent, stiffness, self.bent, data["limit"], sliding.friction
+
+    def energies(self, x: Array, frozen: Frames) -> Array:
+        out = np.empty(self.n_owned)
+        midedge_energy.energies(*self._constants(self._sliding(x, frozen)), out)
+        return out
+
+    def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
+        numbers = self.stencil, self._edges, self.edges, self.elements.data["sign"]
+        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
+        midedge_energy.add_gradient(x, *numbers, frozen.direction, *constants, out)
+
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: Frames,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        predicted: tuple[Array, Array] | None = None,
+    ) -> None:
+        constants = *self._constants(self._sliding(x, frozen)), self._sheet.of_edges.length
+        numbers = self._edges, self.elements.data["sign"], frozen.direction
+        at = offsets[f"{self.name} vertices"], offsets[self.name]
+        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
+
+    def force_scale(self, size: float) -> Array:
+        data = self.elements.data
+        return data["stiffness"][:, [0, 3, 5]].sum(axis=1) * size / data["height"] ** 2
+
+    # -- state -------------------------------------------------------------------------------------
+
+    def initialise(self, x: Array) -> None:
+        self.accept(x, self._sheet.frames)
+
+    def _bent_at(self, x: Array, frames: Frames) -> Array:
+        """The value of ``bent`` after a step that ends at x."""
+        sliding = self._sliding(x, frames)
+        tangent, part = sliding.tangent[:, :3], sliding.part[:, None]
+        slid = tangent - part * (tangent - self.bent)
+        return np.where((part < 1.0) & np.isfinite(tangent), slid, self.bent)
+
+    def _become(self, bent: Array) -> None:
+        self.bent, self._slides = bent, None
+
+    def accept(self, x: Array, frozen: Frames) -> None:
+        self._become(self._bent_at(x, frozen))
+
+    def heat(self, x: Array, frozen: Frames) -> float:
+        part = self._sliding(x, frozen).part
+        if not (part < 1.0).any():
+            return 0.0
+        before, bent = float(self.energies(x, frozen).sum()), self.bent
+        self._become(self._bent_at(x, frozen))
+        after = float(self.energies(x, frozen).sum())
+        self._become(bent)
+        return before - after
+
+    def element_values(self) -> Array:
+        return self.bent
+
+    def restore_values(self, values: Array) -> None:
+        self._become(values.copy())
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles that bend by this model and have friction (rank 0)."""
+    notes = list(rest.notes)
+    triangles = midedge.elements(rest)
+    rest.notes = notes  # those of the sheet only
+    data = dict(triangles.data)
+    moments = np.array([shell.friction_moment for shell in rest.shells])
+    m1, m2 = moments[rest.shell_of[data["triangle"].astype(np.int64)]].T
+    has_friction = m1 > 0.0
+    weight = np.stack(
+        [m1 / np.where(has_friction, m2, 1.0), m2 / np.where(has_friction, m1, 1.0), 0.5 + 0.0 * m1], axis=1
+    )
+    mean, curvature = np.sqrt(m1 * m2), midedge.curvatures_of_tangents(data["material"])
+    area = midedge.areas(data["material"])
+    scale = (area * mean / YIELD_CURVATURE)[:, None, None]
+    form = scale * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
+    data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
+    data["r_y"] = np.sqrt(area * mean * YIELD_CURVATURE)
+    for name in ("direction", "director", "material", "length", "rest_rotation", "damping"):
+        del data[name]
+    assert triangles.edges is not None
+    chosen = {name: values[has_friction] for name, values in data.items()}
+    return Elements(triangles.stencil[has_friction], chosen, edges=triangles.edges[has_friction])
+
+
+def coarse_elements(rest: RestShape) -> Elements:
+    """Hinges between the same triangles, which bend like them while nothing slides."""
+    quad, faces = rest.hinges.vertices, rest.hinges.triangles
+    moments = np.array([shell.friction_moment for shell in rest.shells])
+    limit, bends = np.full(len(quad), np.inf), np.ones(len(quad), dtype=bool)
+    for side in range(2):
+        edge, stiffness = edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], "midedge")
+        across = edge[:, ::-1] ** 2 / np.sum(edge * edge, axis=1, keepdims=True)
+        limit = np.minimum(limit, np.sum(across * moments[rest.shell_of[faces[:, side]]], axis=1))
+        bends &= stiffness > 0.0
+    hinges, limit = hinge.elements(rest, "midedge"), limit[bends]
+    rows, data = limit > 0.0, dict(hinges.data)
+    data["k"] = limit * data["length"] / (YIELD_CURVATURE * data["rest_height"])
+    return Elements(hinges.stencil[rows], {name: values[rows] for name, values in data.items()})
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> MidEdgeFriction:
+    """The term on one rank."""
+    return MidEdgeFriction(elements)

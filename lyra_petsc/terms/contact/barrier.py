@@ -1,0 +1,921 @@
+"""Contact of sheets with themselves, each other and obstacles by a barrier on the distances of simplices.
+
+Pairs of a vertex and a triangle, and of two edges, without a common vertex repel each other if their distance
+less ``thickness`` and less the radius of the obstacle is below ``gap`` (`contact_pairs`). The barrier's
+stiffness k is chosen such that b″ in the middle of the gap is the membrane stiffness of the sheet, which is
+about the diagonal of its Jacobian.
+
+Nothing can pass through anything else: Newton's increments are limited by continuous collision detection, and
+also such that pairs which the last search did not return cannot come into contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh import patches
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.measures import edge_lengths
+from lyra_petsc.mesh.near import near_pairs, swept_boxes
+from lyra_petsc.mesh.obstacles import Container, Solid
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.contact import contact_pairs, surface_shares
+from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact.contact_search import SheetSearch, Simplices
+from lyra_petsc.terms.contact.one_sided import Springs
+from lyra_petsc.terms.remembered import Remembered, unwritable
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, StepInterval, UpcomingStep
+
+KEPT_FRACTION = 0.2
+"""Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
+
+TARGET_FRACTION = 0.7
+"""Part of the gap at which pairs that become active in a Newton iteration shall be after it."""
+
+TARGET_TOLERANCE = 0.05
+"""Part of the gap by which pairs may be nearer than their target distance after a Newton iteration."""
+
+PARALLEL = 1e-3
+"""Squared sine of the angle of two edges below which their energy is multiplied by the mollifier."""
+
+MAX_DEVIATION = 0.1
+"""Largest deviation over the gap of an obstacle's paths from straight lines, where these are used instead."""
+
+HALFWAY_CURVATURE = 14.0
+"""b″ / k in the middle of the gap."""
+
+EDGE_GAP = 0.3
+"""Part of the gap below which two edges repel each other, except for sharp edges of obstacles. Sheets that
+lie on each other are kept apart by pairs of vertices and triangles, two for each vertex; pairs of edges, of
+which there are ten times as many, are needed only for what these miss. The same holds for edges and points of
+obstacles' smooth surfaces, so that forces on the vertices of a sheet do not depend on the obstacle's mesh."""
+
+SHARP_ANGLE = 0.5
+"""Angle [rad] between two triangles of an obstacle above which their common edge has the full gap."""
+
+SKIN = 0.5
+"""Distance over the gap by which points may approach each other between two searches."""
+
+SAG = 0.01
+"""Part of the gap by which a sheet's edges may sag between its vertices on a sphere or rod for the obstacle
+to count as nearly flat: there, as on planes, vertices carry the contact, and edges and triangles have the gap
+of two edges only, because their nearest points are not well defined."""
+
+MAX_PAIRS, MAX_PAIRS_PER_VERTEX = 500_000, 100
+"""If a search finds more pairs than both (the second per vertex), it is repeated with shorter displacements:
+a Newton increment may lead through all of a crumpled sheet, but only a small part of it will be possible. Not
+in a static analysis, whose first load step may lead far while nothing holds the sheet."""
+
+MIN_STRAIN = 0.01
+"""Least strain of an edge under the force k · gap. With a softer barrier a small force would nearly close a
+small gap, which takes Newton's method many iterations."""
+
+
+TO_STAGE = StepInterval(0.0, 1.0)
+
+AREA_UNITS = 1_000_000_000
+"""Area factors of vertices are stored as multiples of 1 / `AREA_UNITS`: integers are sent to other ranks with
+the triangles."""
+
+MIN_AREA_FACTOR, MAX_AREA_FACTOR = 1e-3, 1e3
+"""Bounds of the area factors."""
+
+
+class Barrier(NamedTuple):
+    """Constants of the barrier, the same on all ranks.
+
+    Attributes
+    ----------
+    gap, thickness : float [m]
+    stiffness : float [N/m]
+        k in the interior of a regular mesh.
+    parallel : float
+        Squared sine of the angle of edges below which their energy is mollified.
+    flat : float
+        Radius [m] of spheres and rods from which on they count as nearly flat (`SAG`).
+    """
+
+    gap: float
+    thickness: float
+    stiffness: float
+    parallel: float
+    flat: float = np.inf
+
+
+class ObstaclePositions(NamedTuple):
+    """Obstacles in one step.
+
+    Attributes
+    ----------
+    start, stage, end : (m, 3)
+        Points of all obstacles [m], and normals of planes, at the start, the stage and the end of the step.
+    stage_motions, end_motions : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle from the start to the stage, and to the end.
+    """
+
+    start: Array
+    stage: Array
+    end: Array
+    stage_motions: list[tuple[Array, Array]]
+    end_motions: list[tuple[Array, Array]]
+
+
+class ActivePairs(NamedTuple):
+    """Pairs nearer than the gap; of those with the same nearest vertices only one.
+
+    Attributes
+    ----------
+    lower_bound : (E,)
+        Lower bound of the distance less offset [m] of every pair, exact below the gap.
+    pair, weight, owned_weight, beta, energy, derivatives : (m, …)
+        Data of the active pairs, as `contact_pairs.find_active` writes them.
+    """
+
+    lower_bound: Array
+    pair: Ints
+    weight: Array
+    owned_weight: Array
+    beta: Array
+    energy: Array
+    derivatives: Array
+
+    @property
+    def square(self) -> Array:
+        """|g|² [m²], (m,)."""
+        g = self.derivatives[:, :3]
+        square: Array = np.einsum("mk,mk->m", g, g)
+        return square
+
+    @property
+    def stiffness(self) -> Array:
+        """b″ [N/m], (m,)."""
+        return self.derivatives[:, 4] * self.square
+
+    @property
+    def forces(self) -> tuple[Ints, Array, Array, Array]:
+        """The arguments of kernels: pair, weight, β and derivatives."""
+        return self.pair, self.weight, self.beta, self.derivatives
+
+
+_EMPTY = np.empty(0)
+_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 5))
+NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
+
+
+class Obstacles:
+    """The points of all obstacles in one array, and their simplices.
+
+    Attributes
+    ----------
+    triangles, edges, points, planes, segments : (n, 5)
+        Numbers of three points, number of the obstacle, and for triangles the code of `surface_shares.rings`.
+        A plane is a point and a normal. The axis of a nearly flat sphere or rod is also a degenerate
+        triangle.
+    radius : (obstacles + 1,)
+        Offset [m] of each; the last, 0, is that of sheets.
+    moving : bool
+        Whether any obstacle moves.
+    smooth_points : (n,) bool
+        Which points are vertices of triangles, but not of sharp edges.
+    smooth_edges : (m,) int64
+        Edges of triangles that are not sharp, in ascending order: lower number × ``n_points`` + higher
+        number.
+    """
+
+    def __init__(self, obstacles: Sequence[Solid | Container], flat: float = np.inf) -> None:
+        self.each = list(obstacles)
+        parts: dict[str, list[Ints]] = {
+            kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
+        }
+        radius, first, begins = np.zeros(len(obstacles) + 1), 0, []
+        smooth_points, smooth_edges = [np.empty(0, dtype=np.bool_)], [np.empty((0, 2), dtype=np.int64)]
+        for number, obstacle in enumerate(obstacles):
+            n = len(obstacle.points)
+            begins.append(first)
+
+            def rows(simplices: Ints, number: int = number, first: int = first) -> Ints:
+                n, m = simplices.shape
+                filled = np.concatenate([simplices, np.repeat(simplices[:, :1], 3 - m, axis=1)], axis=1)
+                rings = surface_shares.rings(simplices) if m == 3 else np.zeros(n, dtype=np.int64)
+                return np.column_stack([filled + first, np.full(n, number), rings])
+
+            if isinstance(obstacle, Solid):
+                radius[number] = obstacle.radius
+                edges, sharp = _triangle_edges(obstacle)
+                smooth_edges.append(first + edges[~sharp])
+                points = np.zeros(n, dtype=np.bool_)
+                points[obstacle.triangles] = True
+                points[edges[sharp]] = False
+                smooth_points.append(points)
+                parts["triangles"].append(rows(obstacle.triangles))
+                parts["edges"].append(rows(obstacle.edges))
+                parts["points"].append(rows(np.arange(n)[:, None]))
+                if obstacle.radius >= flat:
+                    points[:] = True
+                    smooth_edges.append(first + obstacle.edges)
+                    axis = np.array([[0, n - 1, n - 1]])
+                    parts["triangles"].append(np.column_stack([axis + first, [number], [0]]))
+            elif obstacle.kind == "planes":
+                parts["planes"].append(rows(np.column_stack([np.arange(n), np.arange(n, 2 * n)])))
+                n *= 2
+            else:
+                radius[number] = -obstacle.radius
+                parts["segments"].append(rows(np.array([[0, n - 1]])))
+            if not isinstance(obstacle, Solid):
+                smooth_points.append(np.zeros(n, dtype=np.bool_))
+            first += n
+        smooth = np.concatenate(smooth_edges)
+        self.smooth_points = np.concatenate(smooth_points)
+        self.smooth_edges = np.sort(smooth[:, 0] * first + smooth[:, 1])
+        empty = np.empty((0, 5), dtype=np.int64)
+        self.triangles, self.edges, self.points, self.planes, self.segments = (
+            np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
+        )
+        self.radius, self.n_points = radius, first
+        self.moving = any(obstacle.motion is not None for obstacle in obstacles)
+        self._first = np.array(begins, dtype=np.int64)
+        self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
+        self._fixed_positions: Array | None = None
+        if not self.moving:
+            self._fixed_positions = self.positions(0.0)
+
+    def positions(self, time: float) -> Array:
+        """Points and normals (m, 3) at a time [s]."""
+        if self._fixed_positions is not None:
+            return self._fixed_positions
+        rows = [np.empty((0, 3))]
+        for obstacle in self.each:
+            rows.append(obstacle.positions(time))
+            if isinstance(obstacle, Container) and obstacle.kind == "planes":
+                rows.append(obstacle.normals_at(time))
+        return np.concatenate(rows)
+
+    def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
+        """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
+        low, high = x.min(axis=0), x.max(axis=0)
+        return np.minimum.reduceat(low, self._first), np.maximum.reduceat(high, self._first)
+
+    def path_deviations(self, start: float, end: float) -> Array:
+        """Largest deviation [m] of each obstacle's paths from straight lines between two times [s],
+        (obstacles,).
+        """
+        times, out = np.linspace(start, end, 9), np.zeros(len(self.each))
+        for number, each in enumerate(self.each):
+            if each.motion is not None:
+                first, *between, last = (each.positions(time) for time in times)
+                chord = last - first
+                square = np.maximum(np.sum(chord * chord, axis=1, keepdims=True), np.finfo(float).tiny)
+                for x in between:
+                    t = np.clip(np.sum((x - first) * chord, axis=1, keepdims=True) / square, 0.0, 1.0)
+                    deviation = np.linalg.norm(x - first - t * chord, axis=1).max(initial=0.0)
+                    out[number] = max(out[number], float(deviation))
+        return out
+
+    def rigid_motions(self, start: float, end: float) -> list[tuple[Array, Array]]:
+        """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
+        if not self.moving:
+            return self._at_rest
+        motions = []
+        for each in self.each:
+            (r0, t0), (r1, t1) = each.rigid_motion(start), each.rigid_motion(end)
+            rotation = r1 @ r0.T
+            motions.append((rotation, t1 - rotation @ t0))
+        return motions
+
+    def contact_displacements(
+        self, x: Array, points: Ints, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
+    ) -> Array:
+        """Displacements (m, 3) [m] of obstacles at their contacts, times Σ β_i of the sheet's points.
+
+        ``points``, ``beta`` (m, 4) and ``obstacle`` (m,) are the pairs at positions x (n_local, 3) after the
+        ``motions``; 0 for pairs between sheets, whose obstacle is −1.
+        """
+        out = np.zeros((len(points), 3))
+        for number, (rotation, translation) in enumerate(motions if self.moving else []):
+            rows = np.flatnonzero(obstacle == number)
+            sheet_beta = np.where(points[rows] >= 0, beta[rows], 0.0)
+            side = sheet_beta.sum(axis=1, keepdims=True)
+            contact = np.einsum("ei,eik->ek", sheet_beta, x[np.maximum(points[rows], 0)]) / side
+            out[rows] = side * (contact - (contact - translation) @ rotation)
+        return out
+
+
+class ContactBarrier(Elastic):
+    """The barrier energy of all near pairs.
+
+    Parameters
+    ----------
+    surface : (F, 3)
+        Triangles of this rank, in local rows.
+    uv : (F, 3, 2)
+        Material coordinates [m] of their corners.
+    marks : (F, 4)
+        Code of the triangles' surroundings (`surface_shares.rings`) and `area_factors` of their corners.
+    """
+
+    def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
+        empty = {"what": np.empty((0, 8)), "number": np.empty((0, 4))}
+        self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
+        self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
+        self._obstacle_x, self._deviations = np.empty((3, 0, 3)), np.zeros(1)
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
+        self.surface = np.ascontiguousarray(surface, dtype=np.int32)
+        self.surface_marks = marks
+        self._capacity = 0
+        self._obstacle_boxes: tuple[Array, Array] | None = None  # of obstacles in ``_obstacle_x``
+        self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
+        self._searched: Ints | None = None  # triangles that the search has
+        self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
+        self._remembered = Remembered(self._find_active)
+
+    def set_up(
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, self_contact: bool, static: bool
+    ) -> None:
+        """Take the data that are the same on all ranks; must be called first.
+
+        ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
+        """
+        self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat)
+        self.self_contact, self.static = self_contact, static
+        self.skin = SKIN * barrier.gap
+        self.search_distance = barrier.thickness + barrier.gap + self.skin
+        self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
+        self._obstacle_x = self._next_obstacle_x = np.stack([self.obstacles.positions(0.0)] * 3)
+        self.stale = False
+        self._deviations, self._obstacle_boxes = np.zeros(1), None
+
+    def set_elements(self, elements: Elements) -> None:
+        super().set_elements(elements)
+        what = elements.data["what"].reshape(-1, 8).astype(np.int64)
+        self.number = elements.data["number"].astype(np.int64)
+        self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
+        self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
+        self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+        self.shares = surface_shares.shares(what[:, 6])
+        self._stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
+        self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
+        self._remembered = Remembered(self._find_active)
+        self._expected = np.full(self.n_elements, np.nan)
+        largest = np.append(np.abs(self._obstacle_x).max(axis=(0, 2)), 0.0)
+        of_points = largest[np.where(self.points < 0, ~self.points, -1)]
+        self._largest_coordinate = np.maximum(np.abs(self.offset), of_points.max(axis=1))
+        self._springs: Springs | None = None
+
+    def _are_secondary(self) -> NDArray[np.bool_]:
+        """Which pairs (E,) have the gap `EDGE_GAP`: two edges of sheets, and edges and points of obstacles
+        where their triangles are smooth.
+        """
+        obstacles, points = self.obstacles, self.points
+        out: NDArray[np.bool_] = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
+        corners = np.flatnonzero((self.kind == VERTEX_TRIANGLE) & (points[:, 0] < 0))
+        out[corners] = obstacles.smooth_points[~points[corners, 0]]
+        edges = np.flatnonzero((self.kind == EDGE_EDGE) & (self.obstacle >= 0))
+        ends = np.sort(~points[edges, 2:], axis=1)
+        keys = ends[:, 0] * obstacles.n_points + ends[:, 1]
+        first, last = (np.searchsorted(obstacles.smooth_edges, keys, side=s) for s in ("left", "right"))
+        out[edges] = first < last
+        return out
+
+    # -- obstacles ---------------------------------------------------------------------------------
+
+    def freeze(self, step: UpcomingStep) -> ObstaclePositions:
+        if not self.moving:
+            start, stage, end = self._obstacle_x
+            at_rest = self.obstacles.rigid_motions(step.start, step.target_time)
+            return ObstaclePositions(start, stage, end, at_rest, at_rest)
+        times = step.start, step.target_time, step.end
+        self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in times])
+        largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
+        self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and len(self.obstacles.planes) > 0))
+        self._deviations = self.obstacles.path_deviations(step.start, step.end)
+        start, stage, end = self._next_obstacle_x
+        motions = (self.obstacles.rigid_motions(step.start, time) for time in times[1:])
+        return ObstaclePositions(start, stage, end, *motions)
+
+    @property
+    def moving(self) -> bool:
+        return self.obstacles.moving
+
+    # -- search ------------------------------------------------------------------------------------
+
+    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
+        if self.moving:
+            self._obstacle_x, self._obstacle_boxes = self._next_obstacle_x, None
+        self.stale = False
+        if triangles is not self._searched:
+            self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
+            self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
+            self._vertex_units[triangles[:, :3]] = triangles[:, 4:]
+            self._searched = triangles
+        limit = np.inf
+        if dx.any() and not self.static:
+            limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
+        boxes = self._sheet_search.boxes(x, dx)
+        found = [np.empty((0, 7), dtype=np.int64)]
+        if self.obstacles.each:
+            found += self._obstacle_pairs(x, dx, boxes)
+        if self.self_contact:
+            radius = self.search_distance
+            edge_radius = radius - (1.0 - EDGE_GAP) * self.barrier.gap
+            pairs = self._sheet_search.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
+            if pairs is None:
+                return None
+            found.append(pairs)
+        every = np.concatenate(found)
+        if len(every) > limit:
+            return None
+        if not len(every):
+            return every[:, :4], every
+        kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
+        sheet = points >= 0
+        first = points[np.arange(len(points)), sheet.argmax(axis=1)]
+        vertex = np.where((kind != EDGE_EDGE) & sheet[:, 0], points[:, 0], -1)
+        units = self._vertex_units[vertex]
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units])
+        return np.where(sheet, points, first[:, None]), what
+
+    def _within_radius(
+        self, x: Array, dx: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints
+    ) -> Ints:
+        """Rows (m, 7) of the pairs that may come within the search distance on displacements dx (N, 3)."""
+        points, bounds = points.astype(np.int64), np.empty(len(points))
+        kinds = np.full(len(points), kind)
+        radius = self.search_distance + self.obstacles.radius[obstacle] + self._deviations.max()
+        start = self._obstacle_x[0]
+        _, to_stage, to_end = self._obstacle_x - start
+        farther = np.linalg.norm(to_end, axis=1) > np.linalg.norm(to_stage, axis=1)
+        longer = np.where(farther[:, None], to_end, to_stage)
+        contact_pairs.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
+        return np.column_stack([kinds, obstacle, points, rings])[bounds < radius]
+
+    def _obstacle_pairs(self, x: Array, dx: Array, boxes: Array) -> list[Ints]:
+        """Pairs of sheets and obstacles anywhere on their displacements in the step.
+
+        ``boxes`` are those of the patches of sheets (`SheetSearch.boxes`).
+        """
+        obstacles, sheets = self.obstacles, self._sheet_search
+        patches = np.minimum(boxes[0], boxes[2]), np.maximum(boxes[1], boxes[3])
+        if not len(patches[0]):
+            return []
+        low, high = patches[0].min(axis=0), patches[1].max(axis=0)
+        radius = self.search_distance + self._deviations.max()
+        obstacle_x = self._obstacle_x if self.moving else self._obstacle_x[:1]
+        found = self._container_pairs(x, dx, patches, obstacle_x, radius)
+        if self._obstacle_boxes is None:
+            self._obstacle_boxes = obstacles.bounding_boxes(obstacle_x)
+        margin = (radius + obstacles.radius[:-1])[:, None]
+        lowest, highest = self._obstacle_boxes
+        is_near = ((lowest - margin <= high) & (highest + margin >= low)).all(axis=1)
+        if not is_near.any():
+            return found
+
+        def add_pairs(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
+            others = others[is_near[others[:, 3]]]
+            if not len(others):
+                return
+            swept = obstacle_x[:, others[:, :size]]
+            margin = (radius + obstacles.radius[others[:, 3]])[:, None]
+            boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
+            kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
+            others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
+            near_patches = near_pairs(patches, boxes)
+            if not len(near_patches):
+                return
+            corners = sheet.corners_of(np.unique(near_patches[:, 0]))
+            pairs = near_pairs(swept_boxes(x, dx, corners), boxes)
+            own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
+            points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
+            rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
+            found.append(self._within_radius(x, dx, kind, others[pairs[:, 1], 3], points, rings))
+
+        add_pairs(VERTEX_TRIANGLE, sheets.vertices, obstacles.triangles, 3, sheet_first=True)
+        add_pairs(VERTEX_TRIANGLE, sheets.triangles, obstacles.points, 1, sheet_first=False)
+        add_pairs(EDGE_EDGE, sheets.edges, obstacles.edges, 2, sheet_first=True)
+        return found
+
+    def _container_pairs(
+        self, x: Array, dx: Array, patches: tuple[Array, Array], obstacle_x: Array, radius: float
+    ) -> list[Ints]:
+        """Pairs of vertices and planes, and of vertices in balls and capsules and the axis segments."""
+        found = []
+        for kind, others in ((VERTEX_PLANE, self.obstacles.planes), (VERTEX_INSIDE, self.obstacles.segments)):
+            if not len(others):
+                continue
+            low, high = patches[0].min(axis=0, keepdims=True), patches[1].max(axis=0, keepdims=True)
+            # distances of two points from a plane or segment differ at most by the points' distance
+            for lower, upper in ((low, high), patches):
+                half_diagonal = 0.5 * np.linalg.norm(upper - lower, axis=1)
+                close = self._is_close(
+                    0.5 * (lower + upper), kind, others, obstacle_x, radius + half_diagonal
+                )
+                others = others[close.any(axis=0)]
+                if not len(others):
+                    break
+            else:
+                single = self._sheet_search.vertices.corners_of(np.flatnonzero(close.any(axis=1)))[:, 0]
+                close = np.zeros((len(single), len(others)), dtype=np.bool_)
+                for end in (x, x + dx):  # on straight paths the distance is lowest at an end
+                    close |= self._is_close(end[single], kind, others, obstacle_x, radius)
+                number, plane = np.nonzero(close)
+                points = np.column_stack([single[number], ~others[plane, :3]])
+                zeros = np.zeros(len(points), dtype=np.int64)
+                found.append(np.column_stack([zeros + kind, others[plane, 3], points, zeros]))
+        return found
+
+    def _is_close(
+        self, points: Array, kind: int, others: Ints, obstacle_x: Array, radius: float | Array
+    ) -> NDArray[np.bool_]:
+        """Whether points (n, 3) [m] are within radius [m] of planes or segments (m, 5), (n, m)."""
+        n, m = len(points), len(others)
+        pairs = np.column_stack([np.repeat(np.arange(n), m), np.tile(~others[:, :3], (n, 1))])
+        kinds, out, smallest = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
+        for positions in obstacle_x:
+            contact_pairs.distances(points, positions, kinds, pairs, out)
+            smallest = np.minimum(smallest, out.reshape(n, m))
+        smallest -= self.obstacles.radius[others[:, 3]]
+        return smallest < np.reshape(radius, (-1, 1))
+
+    # -- energy ------------------------------------------------------------------------------------
+
+    def active_pairs(self, x: Array, obstacle_x: Array) -> ActivePairs:
+        """The pairs nearer than the gap for positions x (n_local, 3) [m] and obstacle_x (m, 3) [m]."""
+        if not self.n_elements:
+            return NO_PAIRS
+        return ActivePairs(*self._remembered(np.concatenate([x, obstacle_x])))
+
+    def _find_active(self, points: Array) -> tuple[NDArray[Any], ...]:
+        x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
+        lower_bound = np.empty(self.n_elements)
+        data = *self._pair_data, self.shares, self.n_owned
+        while True:
+            capacity = self._capacity
+            integers = np.empty(capacity, dtype=np.int64), *np.empty((2, capacity))
+            found = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 5))
+            active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, found)
+            if active <= capacity:
+                return lower_bound, *(part[:active] for part in found)
+            self._capacity = active + active // 4
+
+    @property
+    def _geometry(self) -> tuple[Ints, Ints, Array, Array]:
+        """Kinds, points, offsets and gaps of the pairs: arguments of kernels."""
+        return self.kind, self.points, self.offset, self.gap
+
+    @property
+    def _pair_data(self) -> tuple[Any, ...]:
+        """Also their stiffness, and `Barrier.parallel`."""
+        return *self._geometry, self._stiffness, self.barrier.parallel
+
+    def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
+        if not self.n_elements:
+            return _EMPTY
+        active = self.active_pairs(x, frozen.stage)
+        counted = active.owned_weight != 0.0  # only owned pairs, which come first
+        energies = (active.owned_weight * active.energy)[counted]
+        return np.bincount(active.pair[counted], energies, minlength=self.n_owned).astype(np.float64)
+
+    def add_gradient(self, x: Array, frozen: ObstaclePositions, out: Array) -> None:
+        if not self.n_elements:
+            return
+        active, on_obstacles = self.active_pairs(x, frozen.stage).forces, np.zeros_like(frozen.stage)
+        contact_pairs.add_gradient(x, frozen.stage, *self._pair_data, active, out, on_obstacles)
+
+    def active_elements(self, x: Array, frozen: ObstaclePositions) -> NDArray[np.bool_]:
+        out = np.zeros(self.n_elements, dtype=np.bool_)
+        if self.n_elements:
+            out[self.active_pairs(x, frozen.stage).pair] = True
+            if self._springs is not None:
+                out[self._springs.pair] = True
+        return out
+
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: ObstaclePositions,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        predicted: tuple[Array, Array] | None = None,
+    ) -> None:
+        pair, pair_weight, beta, derivatives = self.active_pairs(x, frozen.stage).forces
+        active = pair, weight[pair] * pair_weight, beta, derivatives
+        own = offsets[self.name]
+        contact_pairs.add_hessians(x, frozen.stage, *self._pair_data, active, blend, own, values)
+
+    def largest_stiffness(self, x: Array, frozen: ObstaclePositions) -> float:
+        """Largest b″ [N/m] of an active pair times its weight on this rank."""
+        active = self.active_pairs(x, frozen.stage)
+        return float((active.owned_weight * active.stiffness).max(initial=0.0))
+
+    def force_scale(self, size: float) -> Array:
+        return HALFWAY_CURVATURE * self._stiffness * size
+
+    def stiffness(self, x: Array, frozen: ObstaclePositions) -> Array:
+        active, out = self.active_pairs(x, frozen.stage), np.zeros(self.n_elements)
+        stiffness = np.maximum(active.weight, active.owned_weight) * active.stiffness
+        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self._stiffness[active.pair])
+        return out
+
+    def coordinate_scale(self, size: float) -> Array:
+        return np.maximum(size, self._largest_coordinate)
+
+    # -- limits and corrections of Newton's increments ---------------------------------------------
+
+    def largest_step(self, x: Array, dx: Array, frozen: ObstaclePositions) -> float:
+        if not self.n_elements:
+            return 1.0
+        at_rest = np.zeros_like(frozen.stage)
+        approach = contact_pairs.largest_approach(dx, at_rest)
+        bound = self.active_pairs(x, frozen.stage).lower_bound
+        near = np.flatnonzero(approach > (1.0 - KEPT_FRACTION) * bound)
+        pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
+        return float(contact_pairs.free_fraction(x, frozen.stage, dx, at_rest, *pairs))
+
+    def springs(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Springs:
+        active, capacity = self.active_pairs(x, frozen.stage), self._capacity
+        given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
+        while True:
+            integers = np.empty(capacity, dtype=np.int64)
+            found = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
+            pairs = *self._pair_data, given, self.n_owned
+            n_active, n = contact_pairs.find_springs(x, frozen.stage, dx, *pairs, found)
+            if n <= capacity:
+                break
+            capacity = n
+        pair, beta, normal, scale, length, counted = (part[:n] for part in found)
+        springs = self.points[pair], beta, normal, scale, self.gap[pair], length, counted
+        self._springs = Springs(pair, *springs, np.arange(n) < n_active)
+        return self._springs
+
+    def release_springs(self, length: Array | None) -> None:
+        self._expected[:] = np.nan
+        if length is not None and self._springs is not None:
+            self._expected[self._springs.pair] = self._springs.law(length)[0] / self._springs.scale
+        self._springs = None
+
+    def target_distances(self, x: Array, dx: Array, frozen: ObstaclePositions) -> tuple[NDArray[Any], ...]:
+        n, pairs = self.n_elements, (*self._geometry, TARGET_FRACTION, self._expected)
+        targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
+        contact_pairs.target_distances(x, frozen.stage, dx, *pairs, *targets)
+        return targets
+
+    def add_corrections(
+        self,
+        x: Array,
+        dx: Array,
+        frozen: ObstaclePositions,
+        targets: tuple[NDArray[Any], ...],
+        out: Array,
+        weight: Array,
+    ) -> bool:
+        pairs = *self._geometry, *targets, TARGET_TOLERANCE
+        return bool(contact_pairs.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
+
+    # -- collisions --------------------------------------------------------------------------------
+
+    def is_collision_free(
+        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
+    ) -> bool:
+        if not self.n_elements:
+            return True
+        curved = np.flatnonzero(self._deviations > MAX_DEVIATION * self.barrier.gap)
+        if len(curved) and np.isin(self.obstacle, curved).any():
+            return False
+        motion = _displacements(frozen, interval, dx)
+        return bool(contact_pairs.free_fraction(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
+
+    def distances(self, x: Array, obstacle_x: Array) -> Array:
+        """Distance less offset [m] of all pairs, (E,), with points of obstacles at obstacle_x (m, 3)."""
+        out = np.empty(self.n_elements)
+        contact_pairs.distances(x, obstacle_x, self.kind, self.points, out)
+        return out - self.offset
+
+    def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
+        return self.distances(x, frozen.stage)[: self.n_owned]
+
+    def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
+        """The collision-free fractions (n,) of the first n pairs, with a motion from `_displacements`."""
+        out = np.empty(n)
+        contact_pairs.free_fractions(x, *motion, *self._geometry, KEPT_FRACTION, out)
+        return out
+
+    def collision_free_fractions(
+        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
+    ) -> Array:
+        return self._free_fractions(x, _displacements(frozen, interval, dx), self.n_owned)
+
+    def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
+        motion = _displacements(frozen, TO_STAGE, dx)
+        return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
+
+    def pair(self, element: int) -> Pair:
+        points, n_first = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
+        parts = (tuple(points[:n_first]), tuple(points[n_first:]))
+        number = int(self.obstacle[element])
+        name = self.obstacles.each[number].name if number >= 0 else ""
+        return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
+
+    # -- obstacles that move, and forces on them ---------------------------------------------------
+
+    def _obstacle_gradients(self, x: Array, obstacle_x: Array) -> Iterator[tuple[int, Array]]:
+        """Numbers of obstacles in contact, and for each the forces (n_local, 3) [N] of this rank's pairs on
+        it.
+        """
+        active = self.active_pairs(x, obstacle_x)
+        number = self.obstacle[active.pair]
+        for obstacle in np.unique(number[number >= 0]):
+            rows = np.flatnonzero((number == obstacle) & (active.owned_weight != 0.0))
+            gradient, on_obstacles = np.zeros_like(x), np.zeros_like(obstacle_x)
+            arrays = active.pair, active.owned_weight, active.beta, active.derivatives
+            given = unwritable(*(array[rows] for array in arrays))
+            contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, given, gradient, on_obstacles)
+            yield int(obstacle), gradient
+
+    def obstacle_forces(self, x: Array, frozen: ObstaclePositions, count: int) -> Array:
+        out = np.zeros((count, 6))
+        for obstacle, force in self._obstacle_gradients(x, frozen.stage):
+            out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
+        return out
+
+    pushes = True
+
+    def work(self, x: Array, at: float, start: float, end: float) -> float:
+        to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
+        work = 0.0
+        for obstacle, force in self._obstacle_gradients(x, self.obstacles.positions(at)):
+            (r0, t0), (r1, t1) = to_start[obstacle], to_end[obstacle]
+            work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
+        return work
+
+    def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
+        if not self.moving:
+            return dx
+        motion = _displacements(frozen, TO_STAGE, dx)
+        blocked = self._free_fractions(x, motion, self.n_elements) < 1.0
+        moved = dx.copy()
+        for number, (rotation, translation) in enumerate(frozen.stage_motions):
+            points = self.points[blocked & (self.obstacle == number)]
+            points = np.unique(points[points >= 0])
+            moved[points] = (x @ rotation.T + translation - x)[points]
+        for points in self.points[blocked & (self.obstacle < 0)]:  # a moved sheet moves the next one
+            changed = (moved[points] != dx[points]).any(axis=1)
+            if changed.any():
+                moved[points[~changed]] = moved[points[changed]][0]
+        return moved
+
+    # -- contact forces ----------------------------------------------------------------------------
+
+    def find_contacts(self, x: Array, obstacle_x: Array, n_counted: int) -> tuple[NDArray[Any], ...]:
+        """The pairs with a contact force among the first ``n_counted``.
+
+        Returns β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers of the pairs (m,). For a
+        vertex of a sheet, pairs with the same nearest vertices occur once; all other pairs are returned
+        singly.
+        """
+        active = self.active_pairs(x, obstacle_x)
+        n = len(active.pair) + n_counted
+        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
+        given = active.lower_bound, active.forces, n_counted
+        n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
+        beta, normal, force, pair = (part[:n] for part in found)
+        if (force < 0.0).any():
+            contact_pairs.cancel_negative_forces(self.kind[pair], self.points[pair, 0], normal, force)
+        kept = force > 0.0
+        return beta[kept], normal[kept], force[kept], pair[kept]
+
+    def vertex_of(self, pair: Ints) -> Ints:
+        """The vertex of a sheet in each of pairs (m,), −1 for pairs of edges and of points of obstacles."""
+        has_vertex = (self.kind[pair] != EDGE_EDGE) & (self.points[pair, 0] >= 0)
+        return np.where(has_vertex, self.points[pair, 0], -1)
+
+    def contact_points(self, x: Array, frozen: ObstaclePositions) -> tuple[Ints, Array, Array, Array, Ints]:
+        beta, normal, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        return self.points[pair], beta, normal, force, self.vertex_of(pair)
+
+    def dashpots(self, x: Array, frozen: ObstaclePositions) -> Dashpots:
+        active = self.active_pairs(x, frozen.end)
+        square = active.square
+        rows = np.flatnonzero((active.weight > 0.0) & (square > 0.0) & np.isfinite(active.derivatives[:, 4]))
+        pair, square, beta = active.pair[rows], square[rows], active.beta[rows]
+        normal = active.derivatives[rows, :3] / np.sqrt(square)[:, None]
+        stiffness = active.weight[rows] * active.derivatives[rows, 4] * square
+        points, obstacle = self.points[pair], self.obstacle[pair]
+        moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
+        pushed = np.einsum("ek,ek->e", moved, normal)
+        return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, pushed)
+
+    def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
+        """Sum of the normal forces [N] at each local vertex, (n_local,), of the pairs that this rank counts.
+
+        Only the owner of a vertex knows all pairs between which its force is divided.
+        """
+        out = np.zeros(len(x))
+        beta, _, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        contact_pairs.add_normal_forces(self.points[pair], beta, force, out)
+        return out
+
+    def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
+        active, n = self.active_pairs(x, frozen.stage), self.n_owned
+        bound = active.lower_bound[:n]
+        exact = bound < self.gap[:n]
+        smallest = bound[exact].min(initial=np.inf)
+        rows = np.flatnonzero(~exact & (bound < smallest))
+        if len(rows):
+            distance = np.empty(len(rows))
+            contact_pairs.distances(x, frozen.stage, self.kind[rows], self.points[rows], distance)
+            smallest = min(smallest, (distance - self.offset[rows]).min())
+        work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
+        return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
+
+
+def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
+    """Edges (n, 2) of an obstacle's triangles, lower numbers first, and whether they are sharp: at the
+    boundary, or with an angle above `SHARP_ANGLE`.
+    """
+    triangles = obstacle.triangles.astype(np.int64).reshape(-1, 3)
+    a, b, c = (obstacle.points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    sign = np.where(sides[:, :1] < sides[:, 1:], 1.0, -1.0)
+    edges, number, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(edges), 3))
+    np.add.at(sums, number.ravel(), sign * np.tile(normal, (3, 1)))  # n − n′ of equally oriented triangles
+    difference = np.linalg.norm(sums, axis=1)
+    return edges, (count != 2) | (difference > 2.0 * np.sin(0.5 * SHARP_ANGLE))
+
+
+def _displacements(
+    frozen: ObstaclePositions, interval: StepInterval, dx: Array
+) -> tuple[Array, Array, Array]:
+    """Positions of obstacles' points at the start of an interval of the step, and the displacements of sheets
+    and of obstacles in it.
+    """
+    begin, end = interval
+    if begin >= 1.0:
+        moved = frozen.end - frozen.stage
+        return frozen.stage + (begin - 1.0) * moved, dx, (end - begin) * moved
+    moved = frozen.stage - frozen.start
+    return frozen.start + begin * moved, dx, (end - begin) * moved
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles of the sheets (rank 0)."""
+    triangles = rest.mesh.triangles.astype(np.int64)
+    marks = np.column_stack([surface_shares.rings(triangles), area_factors(triangles, rest.area)])
+    uv = rest.mesh.triangle_uv.reshape(-1, 6)
+    return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
+
+
+def area_factors(triangles: Ints, area: Array) -> Ints:
+    """Factors of k, in units of 1 / `AREA_UNITS`, for pairs of the corners of triangles (F, 3): the area of a
+    vertex over its mean in a regular mesh with as many triangles as the sheet.
+
+    An even pressure so leads to the same distance everywhere, whatever the size of the triangles. With the
+    mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
+    and friction would oscillate.
+    """
+    sheet = np.unique(patches.connected_pieces(triangles), return_inverse=True)[1]
+    mean = np.bincount(sheet, area) / np.bincount(sheet)
+    of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
+    factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)
+    return np.rint(AREA_UNITS * factor).astype(np.int64)
+
+
+def barrier(rest: RestShape) -> Barrier:
+    """The constants of a scene's barrier (rank 0).
+
+    Raises
+    ------
+    InputError
+        If the gap is so large that neighbours in the mesh would repel each other.
+    """
+    scene = rest.scene
+    assert scene.contact is not None
+    length, thickness = edge_lengths(rest.mesh), scene.contact.thickness
+    shortest = float(length.min())
+    gap = scene.contact.gap or min(0.25 * float(length.mean()), 0.5 * shortest)
+    if gap + thickness >= shortest:
+        raise InputError(
+            f"gap + thickness = {gap + thickness:.3g} m is not below the shortest edge, {shortest:.3g} m: "
+            "neighbours in the mesh would touch; give smaller ones, or a mesh without such short edges",
+            file=scene.source,
+            key="contact",
+        )
+    stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
+    stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
+    return Barrier(gap, thickness, stiffness, PARALLEL, float(length.max()) ** 2 / (8.0 * SAG * gap))
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
+    """The term on one rank; `ContactBarrier.set_up` must be called next."""
+    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 4)
+    return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))

@@ -1,0 +1,122 @@
+"""One-sided springs with the barrier's force on distances that are linear in a Newton increment.
+
+A spring has the length δ = δ_0 + Σ_i β_i n · w_i for increments w_i of its four points, and pushes with the
+barrier's force at δ. Points of obstacles, whose numbers are negative, do not move.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vectors import add_outers
+from lyra_petsc.terms.bending.dihedral_angle import scaled
+from lyra_petsc.terms.contact import contact_pairs
+from lyra_petsc.terms.term import Offsets
+
+TANGENT_BELOW = 0.5
+"""Part of the gap, or of the present distance if that is less, below which the law is continued by its
+tangent, so that linear systems are not stiffer than the sheet. The barrier's distances follow afterwards from
+the expected forces (`contact_pairs.target_distances`)."""
+
+
+class Springs(NamedTuple):
+    """Springs of one term.
+
+    Attributes
+    ----------
+    pair : (m,) int64
+        Numbers of the term's elements; one may occur several times.
+    points : (m, 4) int64
+        Local rows, or points of obstacles (negative).
+    beta, normal : (m, 4), (m, 3)
+        β and unit normals n.
+    scale, gap, length : (m,)
+        Weight times the barrier's k [N/m], gap [m] and distance less offset δ_0 [m].
+    counted : (m,)
+        Weight on this rank over the weight.
+    acts : (m,) bool
+        Whether the pair is already part of the term's gradient and Hessian.
+    """
+
+    pair: NDArray[np.int64]
+    points: NDArray[np.int64]
+    beta: Array
+    normal: Array
+    scale: Array
+    gap: Array
+    length: Array
+    counted: Array
+    acts: NDArray[np.bool_]
+
+    def elongations(self, increment: Array) -> Array:
+        """Changes of length (m,) [m] for an increment (n_local, 3) [m]."""
+        out = np.empty(len(self.pair))
+        _elongations(self.points, self.beta, self.normal, increment, out)
+        return out
+
+    @property
+    def _lower_bound(self) -> Array:
+        """Lengths (m,) [m] below which the law is continued by its tangent."""
+        return TANGENT_BELOW * np.minimum(self.gap, self.length)
+
+    def law(self, length: Array) -> tuple[Array, Array]:
+        """Forces (m,) [N] and stiffness (m,) [N/m] at lengths (m,) [m]."""
+        force, stiffness = np.empty((2, len(self.pair)))
+        contact_pairs.spring_forces(length, self.gap, self._lower_bound, force, stiffness)
+        return self.scale * force, self.scale * stiffness
+
+    def secant_stiffness(self, length: Array, force: Array, expected: Array) -> Array:
+        """Slopes (m,) [N/m] of the law from ``force`` (m,) [N] at ``length`` (m,) [m] to the ``expected``
+        force (m,) [N].
+        """
+        out, bound, forces = np.empty(len(self.pair)), self._lower_bound, (force, expected)
+        contact_pairs.secant_stiffness(length, self.gap, bound, *(f / self.scale for f in forces), out)
+        return self.scale * out
+
+    def add_forces(self, size: Array, out: Array) -> None:
+        """Add ``size`` (m,) [N] times the gradients of the lengths to rows of out (n_local, 3)."""
+        _add_forces(self.points, self.beta, self.normal, size, out)
+
+    def add_stiffness(self, stiffness: Array, offsets: Offsets, values: Array) -> None:
+        """Add Hessians of two-sided springs of a ``stiffness`` (m,) [N/m] to block rows (n_blocks, 3, 3).
+
+        ``offsets`` (E, 10) are those of the term's elements.
+        """
+        _add_stiffness(self.pair, self.points, self.beta, self.normal, stiffness, offsets, values)
+
+
+@kernel()
+def _elongations(points, beta, normal, increment, out):  # type: ignore[no-untyped-def]
+    for m in range(len(out)):
+        out[m] = 0.0
+        for i in range(4):
+            if points[m, i] >= 0:
+                for k in range(3):
+                    out[m] += beta[m, i] * normal[m, k] * increment[Index(points[m, i]), k]
+
+
+@kernel()
+def _add_forces(points, beta, normal, size, out):  # type: ignore[no-untyped-def]
+    for m in range(len(size)):
+        for i in range(4):
+            if points[m, i] >= 0:
+                for k in range(3):
+                    out[Index(points[m, i]), k] += size[m] * beta[m, i] * normal[m, k]
+
+
+@kernel()
+def _add_stiffness(pair, points, beta, normal, stiffness, offsets, values):  # type: ignore[no-untyped-def]
+    blocks = values.reshape(-1, 9)
+    for m in range(len(pair)):
+        n = normal[m, 0], normal[m, 1], normal[m, 2]
+        for a in range(4):
+            for b in range(a, 4):
+                factor, block = stiffness[m] * beta[m, a] * beta[m, b], offsets[pair[m], (7 - a) * a // 2 + b]
+                if factor != 0.0 and points[m, a] >= 0 and points[m, b] >= 0 and block >= 0:
+                    add_outers(blocks, block, 0.0, ((scaled(factor, n), n),))

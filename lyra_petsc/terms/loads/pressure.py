@@ -1,0 +1,60 @@
+"""Pressure: force p a n / 3 on each vertex of a triangle, along its current normal.
+
+The current area a and normal n are those at the start of the step, as for wind, so that the Jacobian is
+symmetric.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import select_triangles
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.bending.dihedral_angle import area_normal, scaled
+from lyra_petsc.terms.handles.motion import Window
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import WindowedLoad
+
+
+@kernel()
+def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
+    """Add the force [N] of ``pressure`` (E,) [Pa] to out (n_local, 3)."""
+    for e in range(s.shape[0]):
+        fx, fy, fz = scaled(pressure[e] / 6.0, area_normal(x, s, e))
+        for k in range(3):
+            i = s[e, k]
+            out[i, 0] += fx
+            out[i, 1] += fy
+            out[i, 2] += fz
+
+
+class Pressure(WindowedLoad):
+    """The pressures of all loads: stencil (E, 3), data ``pressure`` (E,) [Pa]."""
+
+    is_follower = True
+
+    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        add_force(x, self.stencil, self.elements.data["pressure"] * self.strength(t0, t1), out)
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles under each pressure load (rank 0)."""
+    stencils, pressures, loads = [], [], []
+    for number, load in enumerate(rest.scene.loads):
+        if load.pressure is not None:
+            chosen = select_triangles(
+                rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
+            )
+            stencils.append(rest.mesh.triangles[chosen])
+            pressures.append(np.full(len(chosen), load.pressure))
+            loads.append(np.full(len(chosen), float(number)))
+    data = {"pressure": np.concatenate(pressures), "load": np.concatenate(loads)}
+    return Elements(np.concatenate(stencils), data)
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Pressure:
+    """The load on one rank."""
+    return Pressure(elements, [Window(load.start, load.until) for load in scene.loads])
