@@ -11,10 +11,11 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vector3 import point
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import hinge
-from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle, angle_gradients, point
+from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle, angle_gradients
 from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic

@@ -3,7 +3,6 @@
 Hinge vertices: edge x0-x1, x2 opposite in triangle (0, 1, 2), x3 opposite in (1, 0, 3). With
 e = x1 − x0, n1 = e × (x2 − x0), n2 = (x3 − x0) × e the angle θ = atan2((n1 × n2)·ê, n1·n2) is
 0 for a flat hinge and positive when the opposite vertices lie on the side the normals point away from.
-Also the operations on vectors, as tuples of three numbers, that the kernels of other terms use.
 Source: Grinspun et al., Discrete Shells, SCA 2003; derivatives as in Tamstorf and Grinspun,
 Discrete bending forces and their Jacobians, Graphical Models 75 (2013), derived independently.
 """
@@ -12,49 +11,8 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-
-
-@kernel(inline="always")
-def point(x, i):  # type: ignore[no-untyped-def]
-    """Row i of x (n, 3)."""
-    i = Index(i)
-    return x[i, 0], x[i, 1], x[i, 2]
-
-
-@kernel(inline="always")
-def cross(a, b):  # type: ignore[no-untyped-def]
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@kernel(inline="always")
-def dot(a, b):  # type: ignore[no-untyped-def]
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@kernel(inline="always")
-def minus(a, b):  # type: ignore[no-untyped-def]
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@kernel(inline="always")
-def scaled(factor, v):  # type: ignore[no-untyped-def]
-    """factor v."""
-    return factor * v[0], factor * v[1], factor * v[2]
-
-
-@kernel(inline="always")
-def combined(p, u, q, w):  # type: ignore[no-untyped-def]
-    """p u + q w."""
-    return p * u[0] + q * w[0], p * u[1] + q * w[1], p * u[2] + q * w[2]
-
-
-@kernel(inline="always")
-def area_normal(x, s, e):  # type: ignore[no-untyped-def]
-    """Normal of triangle e of s (E, 3) at points x (n, 3), with the length of twice its area."""
-    a = point(x, s[e, 0])
-    return cross(minus(point(x, s[e, 1]), a), minus(point(x, s[e, 2]), a))
+from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, scaled
 
 
 @kernel(inline="always")

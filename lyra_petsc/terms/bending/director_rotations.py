@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.bending.dihedral_angle import dot, point, scaled
+from lyra_petsc.kernels.vector3 import dot, point, scaled
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.bending.midedge_shape import edges_and_normal
 

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vector3 import point
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import boundary_edges
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.bending.dihedral_angle import angle, point
+from lyra_petsc.terms.bending.dihedral_angle import angle
 from lyra_petsc.terms.bending.hinge import edge_in_material, mirrored_angles
 from lyra_petsc.terms.bending.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle_gradients, cross, dot, minus
+from lyra_petsc.kernels.vector3 import cross, dot, minus
+from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle_gradients
 
 FADES_BELOW = 0.1
 """Fraction of a triangle's rest area below which the hinges on its edges fade."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.bending.dihedral_angle import angle_parts, point
+from lyra_petsc.kernels.vector3 import point
+from lyra_petsc.terms.bending.dihedral_angle import angle_parts
 from lyra_petsc.terms.bending.hinge_energy import hinge_energy, hinge_gradient, hinge_weight
 from lyra_petsc.terms.bending.hinge_shape import fades
 

@@ -18,8 +18,8 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 from lyra_petsc.kernels.vectors import add_outers, add_six, fetch
-from lyra_petsc.terms.bending.dihedral_angle import cross, dot, minus, point, scaled
 from lyra_petsc.terms.bending.hinge_energy import hinge_hessian
 from lyra_petsc.terms.bending.hinge_forces import limits_of
 from lyra_petsc.terms.bending.hinge_shape import fades, triangles_at

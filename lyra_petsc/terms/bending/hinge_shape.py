@@ -6,8 +6,8 @@ import math
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vector3 import cross, dot, minus, point
 from lyra_petsc.terms.bending import dihedral_angle
-from lyra_petsc.terms.bending.dihedral_angle import cross, dot, minus, point
 
 
 @kernel()

@@ -37,8 +37,8 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vector3 import cross, dot, point, scaled
 from lyra_petsc.kernels.vectors import add_corners, fetch
-from lyra_petsc.terms.bending.dihedral_angle import cross, dot, point, scaled
 from lyra_petsc.terms.bending.hinge_energy import VANISHED, add_square_hessian, fade
 from lyra_petsc.terms.bending.midedge_shape import (
     BATCH,

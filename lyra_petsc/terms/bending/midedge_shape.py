@@ -33,7 +33,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.bending.dihedral_angle import cross, dot, minus, point, scaled
+from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 
 EXTENSION = 0.75 * math.pi
 """Angle from 45° to 180° [rad]."""

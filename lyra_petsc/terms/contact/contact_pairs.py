@@ -46,8 +46,8 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, scaled
 from lyra_petsc.kernels.vectors import add_outers
-from lyra_petsc.terms.bending.dihedral_angle import combined, cross, dot, minus, scaled
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
 """Kinds of pairs. A plane is given by a point p1 and a unit normal p2. A vertex inside (of a ball or capsule)

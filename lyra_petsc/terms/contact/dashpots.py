@@ -11,7 +11,7 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.terms.bending.dihedral_angle import cross, dot, minus, point
+from lyra_petsc.kernels.vector3 import cross, dot, minus, point
 
 LINE = 1e-12
 """Determinant of the inertia of four points over the cube of its trace below which they are on a line."""

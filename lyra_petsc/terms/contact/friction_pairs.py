@@ -35,8 +35,8 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import fetch_ahead
+from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, point
 from lyra_petsc.kernels.vectors import add_outers
-from lyra_petsc.terms.bending.dihedral_angle import combined, cross, dot, minus, point
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 
 SLIP, SLID, BETA, NORMAL, START, CONTACT, FORCE, FACTOR, ROTATION, COLUMNS = (

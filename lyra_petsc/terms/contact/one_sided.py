@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.vector3 import scaled
 from lyra_petsc.kernels.vectors import add_outers
-from lyra_petsc.terms.bending.dihedral_angle import scaled
 from lyra_petsc.terms.contact import contact_pairs
 from lyra_petsc.terms.term import Offsets
 

@@ -19,10 +19,10 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
+from lyra_petsc.kernels.vector3 import area_normal, dot, scaled
 from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.bending.dihedral_angle import area_normal, dot, scaled
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 
