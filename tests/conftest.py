@@ -105,13 +105,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     chosen = [
         item
         for item in items
-        if not (mark := item.get_closest_marker("parallel")) or meant(*mark.args, **mark.kwargs)
+        if not (mark := item.get_closest_marker("parallel")) or runs_here(*mark.args, **mark.kwargs)
     ]
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = chosen
 
 
-def meant(*ranks: int, alone: bool = True) -> bool:
+def runs_here(*ranks: int, alone: bool = True) -> bool:
     """Whether a test with this mark runs on the present number of ranks."""
     return alone if WORLD.size == 1 else WORLD.size in (ranks or (WORLD.size,))
 

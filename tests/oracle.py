@@ -134,8 +134,8 @@ def membrane_blocks(
         shape = np.vstack([-inverse[e].sum(axis=0), inverse[e]])  # ∂F/∂x of each corner
         f = x[points].T @ shape
         g = there[points].T @ shape
-        way = g - before[points].T @ shape
-        green = 0.5 * (g.T @ g - np.eye(2) - way.T @ way)
+        change = g - before[points].T @ shape
+        green = 0.5 * (g.T @ g - np.eye(2) - change.T @ change)
         strain = np.array([green[0, 0], green[1, 1], 2.0 * green[0, 1]])
         extension = np.maximum(strain, 0.0) * [1.0, 1.0, 0.0]
         s = (1.0 - blend) * (c @ strain) + blend * np.maximum(c @ extension, 0.0) * [1.0, 1.0, 0.0]

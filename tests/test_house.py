@@ -29,7 +29,7 @@ LEVELS = [
     {"cli"},
     {"__main__"},
 ]
-RANK = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
+RANK = {package_of: level for level, packages in enumerate(LEVELS) for package_of in packages}
 RANK[""] = len(LEVELS)  # the package itself, which names what it offers
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -45,7 +45,7 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def room(module: str) -> str:
+def package_of(module: str) -> str:
     """The subpackage of a module; empty for the package itself."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else ""
@@ -70,9 +70,9 @@ def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
 def upward(tree: ast.AST, name: str) -> list[str]:
     """Imports of a module that violate the order of the packages."""
     wrong = []
-    mine = room(name)
+    mine = package_of(name)
     for line, other in imported(tree):
-        theirs = room(other)
+        theirs = package_of(other)
         if theirs in ("", mine):
             continue
         if RANK[theirs] >= RANK[mine]:
@@ -83,7 +83,9 @@ def upward(tree: ast.AST, name: str) -> list[str]:
 def test_imports_go_in_one_direction() -> None:
     for path in MODULES:
         name = module_name(path)
-        assert room(name) in RANK or name == PACKAGE.name, f"give the package of {name} its place in LEVELS"
+        assert package_of(name) in RANK or name == PACKAGE.name, (
+            f"give the package of {name} its place in LEVELS"
+        )
         assert upward(parsed(path), name) == [], name
 
 
@@ -105,7 +107,7 @@ def test_an_upward_import_is_found(source: str, name: str, found: list[str]) -> 
 
 def test_only_the_command_line_prints() -> None:
     for path in MODULES:
-        if room(module_name(path)) in ("cli", "__main__"):
+        if package_of(module_name(path)) in ("cli", "__main__"):
             continue
         calls = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
         lines = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]

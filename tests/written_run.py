@@ -113,7 +113,7 @@ def written(
 
 POST = TriangleSurface(np.array([[3.2, 0, 1], [4, 0, 1], [3.2, 1, 1.0]]), np.array([[0, 1, 2]]))
 """An obstacle: half a square beside the ring."""
-MET = {
+OBSTACLES = {
     "ball": {
         "sphere": {"center": [0, 3.6, 0], "radius": 0.3},
         "motion": [{"time": 0}, {"time": 0.5, "translate": [1.5, 0, 0]}],
@@ -122,7 +122,7 @@ MET = {
 }
 
 
-def met(folder: Path, obstacles: dict[str, object] = MET) -> Path:
+def written_with_obstacles(folder: Path, obstacles: dict[str, object] = OBSTACLES) -> Path:
     """The run of the ring in a scene with obstacles, without the mesh files."""
     run = written(folder, states=6)
     write_mesh(run, replace(ring(), obstacles={"post": POST}), MPI.COMM_SELF)

@@ -135,7 +135,7 @@ def start(
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        preexec_fn=heed_signals,
+        preexec_fn=restore_signal_handlers,
     )
 
 
@@ -182,7 +182,7 @@ class Forks:
                     stdin=listener,
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,
-                    preexec_fn=heed_signals,
+                    preexec_fn=restore_signal_handlers,
                 )
             atexit.register(process.kill)
             self._name = name
@@ -200,7 +200,7 @@ class Forks:
             socket.send_fds(connection, [json.dumps(asked).encode()], [to_out, to_err])
             os.close(to_out)
             os.close(to_err)
-            said, ended = heard({out, err}, patience)
+            said, ended = read_pipes({out, err}, patience)
             connection.settimeout(patience if ended else 0.0)
             try:
                 code = json.loads(connection.recv(64))
@@ -209,7 +209,7 @@ class Forks:
         return Left(code, said[out], said[err])
 
 
-def heard(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
+def read_pipes(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
     """Text from pipes until they are closed, and whether this happened in time."""
     pieces = {file: bytearray() for file in files}
     deadline = time.monotonic() + patience
@@ -229,7 +229,7 @@ def heard(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
 FORKS = Forks()
 
 
-def heed_signals() -> None:
+def restore_signal_handlers() -> None:
     """Restore default handlers: under nohup, or in the background, signals are ignored by inheritance."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -184,9 +184,9 @@ def test_a_missing_package_is_one_line(tmp_path: Path, package: str, words: list
     written(tmp_path / "run")
     before = listing(tmp_path)
     left = without([package], words, tmp_path)
-    told = f"{words[0]}: {package} is not installed; get the extra: pip install 'lyra-petsc[{extra}]'"
-    refusal(left, told)
-    assert left.err == f"lyra-petsc: {told}\n"
+    message = f"{words[0]}: {package} is not installed; get the extra: pip install 'lyra-petsc[{extra}]'"
+    refusal(left, message)
+    assert left.err == f"lyra-petsc: {message}\n"
     assert listing(tmp_path) == before
 
 

@@ -147,8 +147,8 @@ def test_a_damaged_state_is_reported_on_all_ranks(comm: MPI.Comm, folder: Path) 
 
 
 def test_the_command(folder: Path) -> None:
-    told = lyra(["check", "run"], folder.parent)
-    assert (told.code, told.out) == (0, TABLE + NO_CONTACT)
+    result = lyra(["check", "run"], folder.parent)
+    assert (result.code, result.out) == (0, TABLE + NO_CONTACT)
     for ranks in (1, 2):
         judged = lyra(["check", "run", "--crossings"], folder.parent, ranks=ranks)
         assert (judged.code, judged.out) == (1, TABLE)

@@ -74,11 +74,11 @@ print(after[0] - before[0], after[1] > before[1])
 """
     path = tmp_path / "program.py"
     path.write_text(program)
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, path], env=environment(), capture_output=True, text=True, timeout=100
     )
     # the kernel that is called is compiled within the other one
-    assert told.stdout.split() == ["1", "True"], told.stderr
+    assert process.stdout.split() == ["1", "True"], process.stderr
 
 
 def test_stages_are_closed_after_exceptions(tmp_path: Path) -> None:
@@ -106,11 +106,11 @@ event = PETSc.Log.Event("Marker")
 print([event.getPerfInfo(stage)["count"] for stage in (0, *(stage.id for stage in STAGES.values()))])
 print(list(STAGES))
 """
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program], env=environment(), capture_output=True, text=True, timeout=60
     )
     # once outside of all stages, once each in those that were innermost
-    assert told.stdout.splitlines() == [
+    assert process.stdout.splitlines() == [
         "[1, 1, 0, 0, 0, 0, 1, 1]",
         "['mesh', 'partition', 'assembly', 'solve', 'balance', 'output', 'a further one']",
-    ], told.stderr
+    ], process.stderr

@@ -82,8 +82,8 @@ def test_remaining_time_is_shown_after_some_steps_without_the_first():
         for now, time in ((60.0, 1.0), (70.0, 2.0), (80.0, 3.0), (90.0, 4.0), (100.0, 5.0)):
             clock.now = now
             progress.update(1, time, 1, 1, 0.0)
-    told = [line.split("  ")[-1] for line in stream.getvalue().splitlines()]
-    assert told == ["energy 0 J"] * 3 + ["1:00 left", "0:50 left"]
+    endings = [line.split("  ")[-1] for line in stream.getvalue().splitlines()]
+    assert endings == ["energy 0 J"] * 3 + ["1:00 left", "0:50 left"]
 
 
 def test_remaining_time_of_a_resumed_run_counts_from_its_start():

@@ -25,13 +25,13 @@ def test_a_failed_run_ends_with_a_message_and_keeps_the_last_state(tmp_path: Pat
     assert "Newton did not converge within its iterations (nonlinear trouble)" in line
     assert "try solver.max_iterations above 1" in line
     lines = left.err.splitlines()
-    told = lines[lines.index(line) + 1 :]
-    assert told[0].startswith("  residual [N] by iteration (linear iterations): ")
-    assert [words.split()[0] for words in told if words.startswith(("  vertex", "  triangle"))] == [
+    details = lines[lines.index(line) + 1 :]
+    assert details[0].startswith("  residual [N] by iteration (linear iterations): ")
+    assert [words.split()[0] for words in details if words.startswith(("  vertex", "  triangle"))] == [
         "vertex",
         "triangle",
     ]
-    assert "  look at out/failure.xdmf (ParaView) and out/failure.txt" in told
+    assert "  look at out/failure.xdmf (ParaView) and out/failure.txt" in details
     summary = read_json(tmp_path / "out/summary.json")
     assert summary["outcome"] == line.removeprefix("lyra-petsc: ")
     failure = summary["failure"]

@@ -182,8 +182,10 @@ def test_the_exit_code_fits_the_message(tmp_path: Path, words: list[str]) -> Non
     assert len(lines) == 1 or words[0] in NEEDS_A_DISPLAY, left.err
     assert lines[-1].startswith("lyra-petsc: "), left.err
     assert "Traceback" not in left.out + left.err
-    told = {"-prefix_pop": "prefixes popped"}.get(words[-1], words[-1].removeprefix(":").removesuffix("/log"))
-    assert told in left.err
+    message = {"-prefix_pop": "prefixes popped"}.get(
+        words[-1], words[-1].removeprefix(":").removesuffix("/log")
+    )
+    assert message in left.err
 
 
 @pytest.mark.parametrize(
@@ -193,5 +195,5 @@ def test_options_files_are_checked_before_petsc_reads_them(tmp_path: Path, line:
     (tmp_path / ".petscrc").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
     left = lyra(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
     assert left.code == 2, left.err
-    (told,) = left.err.splitlines()
-    assert told.startswith(f"lyra-petsc: .petscrc: {line.split()[0]}: ")
+    (message,) = left.err.splitlines()
+    assert message.startswith(f"lyra-petsc: .petscrc: {line.split()[0]}: ")

@@ -238,10 +238,10 @@ def mesh_cases(draw: Draw) -> Case:
     data = {"o": OBJ, "2": msh_2(binary=binary), "4": msh_4(binary=binary)}[
         form[0] if form == "obj" else form[3]
     ]
-    way = draw(st.integers(0, 9))
-    if way == 0:
+    choice = draw(st.integers(0, 9))
+    if choice == 0:
         pass
-    elif way <= 5:
+    elif choice <= 5:
         data = _with_odd_bytes(draw, data) if binary else _with_odd_words(draw, data)
     else:
         data = draw(damaged(data))
@@ -257,9 +257,9 @@ def geo_cases(draw: Draw) -> Case:
         lines = data.split(b"\n")
         lines.insert(draw(st.integers(0, len(lines))), draw(st.sampled_from(STATEMENTS)).encode())
         data = b"\n".join(lines)
-    way = draw(st.integers(0, 3))
-    if way == 0:
+    choice = draw(st.integers(0, 3))
+    if choice == 0:
         data = draw(damaged(data))
-    elif way == 1:
+    elif choice == 1:
         data = _with_odd_words(draw, data)
     return Case("geo", {"scene.yaml": _scene(draw, "mesh.geo"), "mesh.geo": data, "part.geo": b"a = 1;\n"})

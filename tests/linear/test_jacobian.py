@@ -178,13 +178,13 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
         rows, x, n = system.discretisation.rows, system.x, simulation.problem.points.n_owned
         for term in system.active.elastic:
             weight, frozen = 1.0 + np.arange(term.n_elements), system.active.frozen[term]
-            ways: list[tuple[Array, Array] | None] = [None]
+            cases: list[tuple[Array, Array] | None] = [None]
             if isinstance(
                 term, Membrane
             ):  # whose stress may be predicted from another iterate, or be another's
                 y, z = x + 0.01 * np.cos(9.0 * x[:, ::-1]), x + 0.01 * np.sin(7.0 * x)
-                ways += [(y, x), (y, y), (y, z)]
-            for predicted in ways:
+                cases += [(y, x), (y, y), (y, z)]
+            for predicted in cases:
                 rows.add_stiffness(term, x, frozen, blend, weight, values := rows.zeros(), predicted)
                 blocks = weight[:, None, None, None, None] * blocks_of(term, x, frozen, blend, predicted)
                 expected = summed(term.stencil, blocks, len(x))[:n]

@@ -11,7 +11,7 @@ from physics import Simulation, grid
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
-from lyra_petsc.linear import pattern as room
+from lyra_petsc.linear import pattern as block_pattern
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import MixedStencil, OffDiagonal
@@ -38,9 +38,9 @@ def symmetric(blocks: np.ndarray) -> np.ndarray:
     return blocks + blocks.transpose(0, 2, 1, 4, 3)
 
 
-@pytest.mark.parametrize("largest", [room.LARGEST_INT32, 20])
+@pytest.mark.parametrize("largest", [block_pattern.LARGEST_INT32, 20])
 def test_sums_of_element_blocks(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
-    monkeypatch.setattr(room, "LARGEST_INT32", largest)
+    monkeypatch.setattr(block_pattern, "LARGEST_INT32", largest)
     rng = np.random.default_rng(1)
     stencils = {"three": random_stencil(rng, 8, 3), "four": random_stencil(rng, 5, 4)}
     pattern = BlockPattern(stencils, N_OWNED, N_LOCAL)
@@ -131,9 +131,9 @@ def test_pairs_couple_all_points_or_only_both_sides() -> None:
     assert BlockPattern({"across": OffDiagonal(stencil)}, 4, 4).columns.tolist() == pattern.columns.tolist()
 
 
-@pytest.mark.parametrize("largest", [room.LARGEST_INT32, 80])
+@pytest.mark.parametrize("largest", [block_pattern.LARGEST_INT32, 80])
 def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
-    monkeypatch.setattr(room, "LARGEST_INT32", largest)
+    monkeypatch.setattr(block_pattern, "LARGEST_INT32", largest)
     rng = np.random.default_rng(5)
     fixed, more = random_stencil(rng, 8, 3), random_stencil(rng, 5, 2)
     more[0] = N_LOCAL + 1, 2  # with a ghost that is new
@@ -149,7 +149,7 @@ def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, lar
         np.testing.assert_array_equal(made.offsets[name], once.offsets[name])
         assert made.offsets[name].dtype == once.offsets[name].dtype
     made.locate({"more": np.array([[0, N_LOCAL]], dtype=np.int32)})
-    assert made.offsets["more"][0, 1] == room.MISSING
+    assert made.offsets["more"][0, 1] == block_pattern.MISSING
     # and blocks of the small one are found again
     values = np.zeros((made.n_blocks, 3, 3))
     values[place] = before = rng.random((small.n_blocks, 3, 3))
@@ -184,7 +184,7 @@ def test_no_elements_leave_the_diagonal() -> None:
 
 
 def test_patterns_of_keys() -> None:
-    keys = room.union(room.diagonal_keys(2, 4), np.array([3, 1, 7]))
+    keys = block_pattern.union(block_pattern.diagonal_keys(2, 4), np.array([3, 1, 7]))
     pattern = BlockPattern.of_keys(keys, 2, 4)
     assert pattern.indptr.tolist() == [0, 3, 5]
     assert pattern.columns.tolist() == [0, 1, 3, 1, 3]

@@ -151,12 +151,12 @@ def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
     assert os.listdir("mine") == ["notes.txt"]
 
 
-@pytest.mark.parametrize("way", [{}, {"force": True}, {"resume": True}], ids=str)
-def test_a_second_run_into_a_folder_is_refused(comm, here, way):
+@pytest.mark.parametrize("options", [{}, {"force": True}, {"resume": True}], ids=str)
+def test_a_second_run_into_a_folder_is_refused(comm, here, options):
     here("out/checkpoint.h5")
     with RunDirectory(comm, choose_folder(comm, "flag", "out", force=True)):
         with pytest.raises(InputError, match=r"another run is at work|exists; name another") as caught:
-            RunDirectory(comm, choose_folder(comm, "flag", "out", **way))
+            RunDirectory(comm, choose_folder(comm, "flag", "out", **options))
         assert "\n" not in str(caught.value)
     comm.Barrier()
     assert os.listdir("out") == ["checkpoint.h5"]

@@ -18,15 +18,15 @@ pytestmark = pytest.mark.parallel(3)
 h5py = import_h5py()
 
 
-WAYS = {"one machine": "_write_serial", "MPI-IO": "_write_with_mpi_io", "in turn": "_write_serial"}
+METHODS = {"one machine": "_write_serial", "MPI-IO": "_write_with_mpi_io", "in turn": "_write_serial"}
 
 
-@pytest.fixture(params=WAYS)
-def way(request, monkeypatch):
+@pytest.fixture(params=METHODS)
+def method(request, monkeypatch):
     """A method of writing slabs, with the name of its function."""
     monkeypatch.setattr(hdf5, "on_one_machine", lambda comm: request.param == "one machine")
     monkeypatch.setenv(hdf5.TURNS_VARIABLE, "1" if request.param == "in turn" else "0")
-    return WAYS[request.param]
+    return METHODS[request.param]
 
 
 def whole(n):
@@ -45,9 +45,9 @@ def everything(path):
         return found
 
 
-def test_the_method_under_test_is_used(comm, shared_tmp, way, monkeypatch):
+def test_the_method_under_test_is_used(comm, shared_tmp, method, monkeypatch):
     taken = set()
-    for name in WAYS.values():
+    for name in METHODS.values():
         work = getattr(hdf5, name)
 
         def noted(*given, work=work, name=name, **keywords):
@@ -56,7 +56,7 @@ def test_the_method_under_test_is_used(comm, shared_tmp, way, monkeypatch):
 
         monkeypatch.setattr(hdf5, name, noted)
     write_collective([NewFile(shared_tmp / "a.h5", {"x": slab_of(comm, whole(10))}, {})], comm)
-    assert taken == {way}
+    assert taken == {method}
 
 
 def test_ranks_take_turns_where_mpi_io_opens_nothing(comm, shared_tmp, monkeypatch):
@@ -73,7 +73,7 @@ def test_ranks_take_turns_where_mpi_io_opens_nothing(comm, shared_tmp, monkeypat
 
 
 @pytest.mark.parametrize("n", [1, 2, 1001])
-def test_slabs_of_all_ranks_become_one_array(comm, shared_tmp, way, n):
+def test_slabs_of_all_ranks_become_one_array(comm, shared_tmp, method, n):
     x, owner = whole(n), np.arange(n, dtype=np.int32)
     attributes = {"states/000000": {"time": 0.1, "step": 3}, "states/000000/x": {"unit": "m"}}
     path = shared_tmp / "a.h5"
@@ -90,14 +90,14 @@ def test_slabs_of_all_ranks_become_one_array(comm, shared_tmp, way, n):
     assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
 
 
-def test_ranks_without_rows(comm, shared_tmp, way):
+def test_ranks_without_rows(comm, shared_tmp, method):
     x = whole(10)
     mine = x if comm.rank == comm.size - 1 else x[:0]
     write_collective([NewFile(shared_tmp / "a.h5", {"x": mine}, {})], comm)
     np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
 
 
-def test_reading_with_another_partition_of_rows(comm, shared_tmp, way):
+def test_reading_with_another_partition_of_rows(comm, shared_tmp, method):
     x = whole(50)
     write_collective([NewFile(shared_tmp / "a.h5", {"x": x if comm.rank == 0 else x[:0]}, {})], comm)
     mine = np.arange(comm.rank, 50, comm.size)[::-1]
@@ -116,7 +116,7 @@ def still_there(comm, path, x):
     comm.Barrier()
 
 
-def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
+def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, method):
     """A limit on the size of files simulates a full disk."""
     path = shared_tmp / "a.h5"
     write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
@@ -132,10 +132,10 @@ def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
     still_there(comm, path, whole(20_000))
 
 
-def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, way, monkeypatch):
+def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, method, monkeypatch):
     path = shared_tmp / "a.h5"
     write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
-    name = "_write_rows_collective" if way == "_write_with_mpi_io" else "_write_rows"
+    name = "_write_rows_collective" if method == "_write_with_mpi_io" else "_write_rows"
     right = getattr(hdf5, name)
 
     def write_and_fail(*arguments):
@@ -151,6 +151,6 @@ def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, way, m
     still_there(comm, path, whole(4))
 
 
-def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, way):
+def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, method):
     with pytest.raises(OutputError, match="cannot be written"):
         write_collective([NewFile(shared_tmp / "missing" / "a.h5", {"x": slab_of(comm, whole(4))}, {})], comm)

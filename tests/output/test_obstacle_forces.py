@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from physics import grid, obj_file
-from test_resume import journey
+from test_resume import simulate_until
 
 from lyra_petsc.output.read_run import StoredRun
 
@@ -30,7 +30,7 @@ SCENE: dict[str, Any] = {
 
 
 def test_forces_on_obstacles_equal_the_weight_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
-    journey(comm, SCENE, shared_tmp / "run", None)
+    simulate_until(comm, SCENE, shared_tmp / "run", None)
     if comm.rank > 0:
         return
     run = StoredRun(shared_tmp / "run")
@@ -61,7 +61,7 @@ def test_pressure_is_uniform_on_irregular_meshes(comm: MPI.Comm, shared_tmp: Pat
     mesh = {"file": str(shared_tmp / "graded.obj"), "transform": {"translate": [0.0, 0.0, -0.0199 + 0.005]}}
     stiff = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0, "c33": 250.0}}
     scene = SCENE | {"mesh": mesh, "material": stiff | {"bending": 0.1}, "contact": {"gap": 0.007}}
-    journey(comm, scene | {"time": {"end": 1.0, "step": 0.05}}, shared_tmp / "run", None)
+    simulate_until(comm, scene | {"time": {"end": 1.0, "step": 0.05}}, shared_tmp / "run", None)
     if comm.rank == 0:
         pressure = StoredRun(shared_tmp / "run").field("contact_pressure")[-1]
         np.testing.assert_allclose(pressure, WEIGHT, rtol=1e-3)
@@ -70,13 +70,13 @@ def test_pressure_is_uniform_on_irregular_meshes(comm: MPI.Comm, shared_tmp: Pat
 @pytest.mark.parallel(2)
 def test_resume_removes_later_rows(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = SCENE | {"time": {"end": 0.1, "step": 0.01}}
-    journey(comm, scene, shared_tmp / "whole", None)
-    journey(comm, scene, shared_tmp / "parts", 4)
+    simulate_until(comm, scene, shared_tmp / "whole", None)
+    simulate_until(comm, scene, shared_tmp / "parts", 4)
     if comm.rank == 0:
         with open(shared_tmp / "parts" / "obstacles.csv", "a", encoding="utf-8") as table:
             table.write("7,0.035,a far")
     comm.Barrier()
-    journey(comm, scene, shared_tmp / "parts", None, resume=True)
+    simulate_until(comm, scene, shared_tmp / "parts", None, resume=True)
     if comm.rank == 0:
         whole, parts = (StoredRun(shared_tmp / name).obstacles for name in ("whole", "parts"))
         assert list(whole["obstacle"]) == list(parts["obstacle"])

@@ -41,7 +41,7 @@ SCENE: dict[str, Any] = {
     "probes": {"corner": {"nodes": [24, 29]}},
 }
 
-WAYS: dict[str, dict[str, Any]] = {
+KINDS: dict[str, dict[str, Any]] = {
     "beuler": {"end": 0.1, "step": 0.004},
     "semi-implicit": {"end": 0.1, "step": 0.004, "integrator": "semi-implicit"},
     "midpoint": {"end": 0.1, "step": 0.004, "integrator": "midpoint"},
@@ -62,15 +62,15 @@ PLATE: dict[str, Any] = {
 """Scene of a cantilever; its load steps are also extrapolated along tangents."""
 
 
-def scene_with(way: str) -> dict[str, Any]:
-    time = WAYS[way]
-    scene = SCENE | {"time": time} | (PLATE if "directors" in way else {})
+def scene_with(kind: str) -> dict[str, Any]:
+    time = KINDS[kind]
+    scene = SCENE | {"time": time} | (PLATE if "directors" in kind else {})
     if "analysis" in time:
         del scene["wind"]  # which turns with the sheet, and takes ten times as long to balance
     return scene
 
 
-def journey(
+def simulate_until(
     comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
 ) -> tuple[int, float]:
     """Run up to step ``stop`` with a direct solver; returns step number and time."""
@@ -147,18 +147,18 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
                 unit = float(np.abs(values).max())
                 within = 0.0 if column in OF_THE_SOLVER else max(tolerance * unit, 1e-15)
                 np.testing.assert_allclose(columns[column], values, rtol=0, atol=within, err_msg=column)
-    told, others = summary(resumed), summary(straight)
-    for content in (told, others):  # the machine may be busy in one of them
+    resumed_summary, other_summary = summary(resumed), summary(straight)
+    for content in (resumed_summary, other_summary):  # the machine may be busy in one of them
         content["notes"] = [note for note in content["notes"] if "without a processor" not in note]
-    assert told.keys() == others.keys()
-    for key in told.keys() - set(OF_EACH_RUN):
+    assert resumed_summary.keys() == other_summary.keys()
+    for key in resumed_summary.keys() - set(OF_EACH_RUN):
         if key == "energy_balance":  # sums of differences, relative to the scale of the energies
-            mine_of, of_others = flat(told[key] or {}), flat(others[key] or {})
+            mine_of, of_others = flat(resumed_summary[key] or {}), flat(other_summary[key] or {})
             assert mine_of == pytest.approx(of_others, rel=tolerance, abs=max(tolerance, 1e-12)), key
-        elif isinstance(told[key], float):
-            assert told[key] == pytest.approx(others[key], rel=tolerance), key
+        elif isinstance(resumed_summary[key], float):
+            assert resumed_summary[key] == pytest.approx(other_summary[key], rel=tolerance), key
         elif exact or key not in (*OF_THE_SOLVER, "petsc_options"):
-            assert told[key] == others[key], key
+            assert resumed_summary[key] == other_summary[key], key
     states = [(state.number, state.step) for state in stored_states(straight)]
     assert [(state.number, state.step) for state in stored_states(resumed)] == states
     mine, other = StoredRun(resumed), StoredRun(straight)
@@ -171,34 +171,34 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The folder of an uninterrupted run."""
 
     @cache
-    def ran(way: str) -> Path:
+    def ran(kind: str) -> Path:
         folder = tmp_path_factory.mktemp("unbroken") / "straight"
-        journey(MPI.COMM_SELF, scene_with(way), folder, None)
+        simulate_until(MPI.COMM_SELF, scene_with(kind), folder, None)
         return folder
 
     return ran
 
 
 # before there is a history of two steps, and after
-STOPS = [(way, stop) for way in WAYS for stop in ([2] if "static" in way else [1, 9])] + [("bdf2", 2)]
+STOPS = [(kind, stop) for kind in KINDS for stop in ([2] if "static" in kind else [1, 9])] + [("bdf2", 2)]
 
 
-@pytest.mark.parametrize(("way", "stop"), STOPS)
+@pytest.mark.parametrize(("kind", "stop"), STOPS)
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    way: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]
+    kind: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]
 ) -> None:
     """Up to round-off, on the same ranks with a direct solver."""
-    scene = scene_with(way)
-    straight, halted = unbroken(way), tmp_path / "halted"
+    scene = scene_with(kind)
+    straight, halted = unbroken(kind), tmp_path / "halted"
     end = last(straight)
-    assert journey(MPI.COMM_SELF, scene, halted, stop)[0] == stop
-    assert journey(MPI.COMM_SELF, scene, halted, None, resume=True) == end
+    assert simulate_until(MPI.COMM_SELF, scene, halted, stop)[0] == stop
+    assert simulate_until(MPI.COMM_SELF, scene, halted, None, resume=True) == end
     # frames of directors are made anew from the shape, by which round-off may decide on a linear iteration
-    same_files(halted, straight, 1e-11, exact="directors" not in way)
+    same_files(halted, straight, 1e-11, exact="directors" not in kind)
 
 
 @pytest.mark.parametrize(
-    "way",
+    "kind",
     [
         pytest.param("bdf2", marks=pytest.mark.parallel(3, alone=False)),
         pytest.param("alpha2, adaptive", marks=pytest.mark.parallel(2, alone=False)),
@@ -206,22 +206,22 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         pytest.param("static, directors", marks=pytest.mark.parallel(2, alone=False)),
     ],
 )
-def test_resumed_runs_agree_on_other_numbers_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
-    scene = scene_with(way)
-    if "static" not in way:
-        scene["time"] = WAYS[way] | {"end": 0.06}
+def test_resumed_runs_agree_on_other_numbers_of_ranks(comm: MPI.Comm, kind: str, shared_tmp: Path) -> None:
+    scene = scene_with(kind)
+    if "static" not in kind:
+        scene["time"] = KINDS[kind] | {"end": 0.06}
     straight, halted, alone = (shared_tmp / name for name in ("straight", "halted", "alone"))
-    end = journey(comm, scene, straight, None)
-    journey(comm, scene, halted, 2 if "static" in way else 9)
+    end = simulate_until(comm, scene, straight, None)
+    simulate_until(comm, scene, halted, 2 if "static" in kind else 9)
     if comm.rank == 0:
         shutil.copytree(halted, alone)
-    assert journey(comm, scene, halted, None, resume=True) == end
+    assert simulate_until(comm, scene, halted, None, resume=True) == end
     if comm.rank == 0:
         # MUMPS adds up in the order in which messages arrive; where that decides on a linear iteration more,
         # the way differs by the solver's tolerance. Resuming is not the cause: two runs that nobody stops
         # differ as much (alpha2, adaptive, 12 pairs on 3 ranks: 5e-10 to 8e-9, resumed 1e-10 to 8e-9)
-        journey(MPI.COMM_SELF, scene, alone, None, resume=True)
-        if way == "static":
+        simulate_until(MPI.COMM_SELF, scene, alone, None, resume=True)
+        if kind == "static":
             # which of several equilibria of the slack sheet it passes at half the load, and so the work, is
             # decided by round-off, also in runs that nobody stops: only the end is one
             for folder in (halted, alone):
@@ -229,15 +229,15 @@ def test_resumed_runs_agree_on_other_numbers_of_ranks(comm: MPI.Comm, way: str, 
                 np.testing.assert_allclose(*shapes, rtol=0, atol=1e-5)
             return
         same_files(halted, straight, 1e-7, exact=False)
-        same_files(alone, straight, 1e-5 if "adaptive" in way else 1e-7, exact=False)
+        same_files(alone, straight, 1e-5 if "adaptive" in kind else 1e-7, exact=False)
 
 
 def test_resuming_after_every_step_and_twice(tmp_path: Path) -> None:
     scene = SCENE | {"time": {"end": 0.04, "step": 0.004, "integrator": "bdf2"}}
-    journey(MPI.COMM_SELF, scene, tmp_path / "straight", None)
-    journey(MPI.COMM_SELF, scene, tmp_path / "halted", 1)
+    simulate_until(MPI.COMM_SELF, scene, tmp_path / "straight", None)
+    simulate_until(MPI.COMM_SELF, scene, tmp_path / "halted", 1)
     for step in (2, 3, 4, 7, None):
-        journey(MPI.COMM_SELF, scene, tmp_path / "halted", step, resume=True)
+        simulate_until(MPI.COMM_SELF, scene, tmp_path / "halted", step, resume=True)
     same_files(tmp_path / "halted", tmp_path / "straight", 1e-11)
 
 
@@ -249,8 +249,8 @@ def test_displacement_is_relative_to_the_first_state_after_resuming(comm: MPI.Co
         "output": {"every": 0.004, "fields": ["displacement"]},
         "initial": {"noise": 1e-3},
     }
-    journey(comm, scene, shared_tmp / "run", 2)
-    journey(comm, scene | {"initial": {"noise": 2e-3}}, shared_tmp / "run", None, resume=True)
+    simulate_until(comm, scene, shared_tmp / "run", 2)
+    simulate_until(comm, scene | {"initial": {"noise": 2e-3}}, shared_tmp / "run", None, resume=True)
     if comm.rank == 0:
         run = StoredRun(shared_tmp / "run")
         assert len(run) == 6

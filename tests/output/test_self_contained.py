@@ -74,7 +74,7 @@ def _named(name: str) -> Callable[[Path, Path], None]:
     return change
 
 
-WAYS = {
+ATTACKS = {
     "external storage": _external_storage,
     "external link": _external_link,
     "external link above": _external_link_above,
@@ -87,28 +87,28 @@ WAYS = {
 }
 
 
-def attacked(folder: Path, way: str) -> Path:
+def attacked(folder: Path, attack: str) -> Path:
     """A run's folder with a reference to a file outside."""
     run = written(folder / "run")
     with h5py.File(folder / "secret.h5", "w") as file:
         file["secret"] = np.ones((8, 3))
         file["states/000001/position"] = np.ones((8, 3))
-    WAYS[way](run, folder / "secret.h5")
+    ATTACKS[attack](run, folder / "secret.h5")
     return run
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_references_to_states_elsewhere_are_refused(tmp_path: Path, way: str) -> None:
-    folder = attacked(tmp_path, way)
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_references_to_states_elsewhere_are_refused(tmp_path: Path, attack: str) -> None:
+    folder = attacked(tmp_path, attack)
     with pytest.raises(InputError) as caught:
         _ = StoredRun(folder).positions[1]
     assert "a run's folder must hold all of its results" in str(caught.value)
     assert str(folder / "states") in str(caught.value)
 
 
-@pytest.mark.parametrize("way", ["external storage", "external link", "virtual dataset", "symbolic link"])
-def test_studies_and_resumed_runs_refuse_them_too(tmp_path: Path, way: str) -> None:
-    folder = attacked(tmp_path, way)
+@pytest.mark.parametrize("attack", ["external storage", "external link", "virtual dataset", "symbolic link"])
+def test_studies_and_resumed_runs_refuse_them_too(tmp_path: Path, attack: str) -> None:
+    folder = attacked(tmp_path, attack)
     with pytest.raises(InputError, match="all of its results"):
         open_stored(folder / "states-0000.h5").__enter__()
     with pytest.raises(InputError, match="all of its results"):

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.quick
 SCENE = {"mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}}, "time": {"end": 1.0, "step": 0.1}}
 NUMBERS = {"density": 0.2, "membrane": {"c11": 900.0, "c22": 800.0, "c12": 0.0}}
 SHEET = {"young": 1e6, "poisson": 0.3, "thickness": 1e-3}
-CURVES = {way: [[0.1, 10.0]] for way in ("warp", "weft", "shear")}
+CURVES = {direction: [[0.1, 10.0]] for direction in ("warp", "weft", "shear")}
 REPORT = {"B": 0.1, "2HB": 0.05, "G": 0.6, "2HG": 1.5}
 
 

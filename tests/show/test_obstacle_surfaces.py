@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from written_run import met
+from written_run import written_with_obstacles
 
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.schema import Obstacle
@@ -43,7 +43,7 @@ def test_shapes_are_closed_and_face_outwards(shape: dict[str, Any], volume: floa
 
 
 def shown(folder: Path, obstacle: dict[str, Any], middle: list[float], size: float) -> ObstacleSurface:
-    run = StoredRun(met(folder, {"one": obstacle}))
+    run = StoredRun(written_with_obstacles(folder, {"one": obstacle}))
     (surface,) = obstacle_surfaces(run, np.array(middle, dtype=float), size)
     return surface
 

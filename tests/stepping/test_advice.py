@@ -74,9 +74,9 @@ def advised(
 )  # fmt: skip
 def test_advice_after_a_nonlinear_failure(diagnosis: Diagnosis, now: FailedStep, words: str) -> None:
     tolerances = {"force_tolerance": 1e-6, "step_tolerance": 1e-9}
-    told = advised(diagnosis, now=now, solver=tolerances)
+    lines = advised(diagnosis, now=now, solver=tolerances)
     assert failure_kind(diagnosis, STUCK) == "nonlinear trouble"
-    assert words in told[0]
+    assert words in lines[0]
 
 
 def test_causes_that_do_not_apply_are_not_mentioned() -> None:
@@ -136,5 +136,5 @@ def test_advice_after_an_overflow(diagnosis: Diagnosis, words: str) -> None:
 
 
 def test_advice_for_a_static_analysis_without_handles() -> None:
-    told = advised(handles=[], motions={}, time={"analysis": "static"})
-    assert told[0] == "handles (nothing holds the sheet)"
+    lines = advised(handles=[], motions={}, time={"analysis": "static"})
+    assert lines[0] == "handles (nothing holds the sheet)"

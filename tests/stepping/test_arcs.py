@@ -28,23 +28,25 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
     """Zero velocities, and the increment that is tangential to a rotation about the origin."""
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
     system.begin_step(0.0, 1.0)
-    way = np.zeros_like(system.history)
-    way[:n] = angle * np.cross(AXIS, system.x[:n])
+    increment = np.zeros_like(system.history)
+    increment[:n] = angle * np.cross(AXIS, system.x[:n])
     for term in system.active.with_edges:
         places = term.edge_indices
-        own = places < way.size
-        way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.direction @ AXIS))[own]
-    return system.stationary_velocity(), way / system.stage.c
+        own = places < increment.size
+        increment.reshape(-1)[places[own]] = (
+            angle * (term.of_edges.length * (term.frames.direction @ AXIS))[own]
+        )
+    return system.stationary_velocity(), increment / system.stage.c
 
 
 @pytest.mark.parallel(2, 3)
 def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SHEET))
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
-    staying, way = turning(simulation, 0.9 * MAX_TURN)
+    staying, increment = turning(simulation, 0.9 * MAX_TURN)
     arcs = Arcs(system)
-    bent, straight = arcs.curve(staying, way)
-    np.testing.assert_array_equal(straight, way)
+    bent, straight = arcs.curve(staying, increment)
+    np.testing.assert_array_equal(straight, increment)
     start, there = system.x[:n].copy(), system.displacement(staying, bent)
     moved = (there[0] + there[1])[:n]
     turned = start @ rotation(AXIS, 0.9 * MAX_TURN).T
@@ -56,8 +58,9 @@ def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
         return total / comm.allreduce(len(x))
 
     np.testing.assert_allclose(moved - middle(moved), turned - middle(turned), atol=1e-7)
+    straight_end = there[0] + system.displacement(staying, increment)[1]
     energy = [sum(float(t.energies(x, system.active.frozen[t]).sum()) for t in system.active.elastic)
-              for x in (there[0] + there[1], there[0] + system.displacement(staying, way)[1])]  # fmt: skip
+              for x in (there[0] + there[1], straight_end)]  # fmt: skip
     bending, tangent = (comm.allreduce(each) for each in energy)
     assert bending < 1e-9 * tangent
     arcs.destroy()
@@ -71,18 +74,18 @@ def test_arcs_equal_the_increment_to_first_order(comm: MPI.Comm) -> None:
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
     staying, _ = turning(simulation, 0.0)
     arcs, random = Arcs(system), np.random.default_rng(3)
-    way = np.where(system.prescribed.free, random.uniform(-1.0, 1.0, staying.shape), 0.0)
-    way *= 0.01 / (system.stage.c * np.abs(way[:n]).max())
-    apart = []
+    increment = np.where(system.prescribed.free, random.uniform(-1.0, 1.0, staying.shape), 0.0)
+    increment *= 0.01 / (system.stage.c * np.abs(increment[:n]).max())
+    deviations = []
     for size in (0.1, 0.01):
-        bent, _ = arcs.curve(staying, size * way)
-        assert not np.any((bent - size * way)[~system.prescribed.free])
-        apart.append(np.abs(bent - size * way).max())
-    assert 0.0 < apart[1] < 0.02 * apart[0]
-    far, least = arcs.curve(staying, 1e3 * way)[1], 1e-6 * MIN_TURN
-    assert np.abs(far).max() < 0.9 * np.abs(1e3 * way).max()  # cut
-    assert arcs.turns_notably(1e3 * way)
-    assert not arcs.turns_notably(least * way)
+        bent, _ = arcs.curve(staying, size * increment)
+        assert not np.any((bent - size * increment)[~system.prescribed.free])
+        deviations.append(np.abs(bent - size * increment).max())
+    assert 0.0 < deviations[1] < 0.02 * deviations[0]
+    far, least = arcs.curve(staying, 1e3 * increment)[1], 1e-6 * MIN_TURN
+    assert np.abs(far).max() < 0.9 * np.abs(1e3 * increment).max()  # cut
+    assert arcs.turns_notably(1e3 * increment)
+    assert not arcs.turns_notably(least * increment)
     arcs.destroy()
     simulation.destroy()
 

@@ -186,8 +186,8 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
         force = np.zeros((system.points.n_local, 3))
         term_of(simulation).add_gradient(system.x, None, force)
         upper = system.x[: system.points.n_owned, 2] > 0.01
-        (carried,) = system.points.global_sum(float(-force[: system.points.n_owned][upper, 2].sum()))
-        assert carried == pytest.approx(3.0, rel=1e-6)
+        (force_on_upper,) = system.points.global_sum(float(-force[: system.points.n_owned][upper, 2].sum()))
+        assert force_on_upper == pytest.approx(3.0, rel=1e-6)
 
 
 def test_steps_without_change_do_not_search(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,9 +259,9 @@ def test_derivatives_agree_with_finite_differences(comm: MPI.Comm) -> None:
     system.update_pattern()
     rng = np.random.default_rng(2)
     random = rng.standard_normal((layout.n_vertices_global, 3))
-    way = np.zeros((layout.n_local, 3))
-    way[: layout.n_owned] = random[layout.mesh_vertices]
-    layout.update_ghosts(way)
+    direction = np.zeros((layout.n_local, 3))
+    direction[: layout.n_owned] = random[layout.mesh_vertices]
+    layout.update_ghosts(direction)
     x, n, h = system.x.copy(), layout.n_owned, 1e-6
 
     def energy(at: Array) -> float:
@@ -273,14 +273,17 @@ def test_derivatives_agree_with_finite_differences(comm: MPI.Comm) -> None:
         return out[:n]
 
     assert energy(x) > 0.0
-    slope = comm.allreduce(float(np.vdot(gradient(x), way[:n])))
-    assert slope == pytest.approx((energy(x + h * way) - energy(x - h * way)) / (2 * h), rel=1e-6)
+    slope = comm.allreduce(float(np.vdot(gradient(x), direction[:n])))
+    assert slope == pytest.approx((energy(x + h * direction) - energy(x - h * direction)) / (2 * h), rel=1e-6)
     rows = system.discretisation.rows
     values = rows.zeros()
     term.add_hessian(x, None, 0.0, np.ones(term.n_elements), rows.pattern.offsets, values)
-    product = rows.product(values, way)
+    product = rows.product(values, direction)
     largest = comm.allreduce(float(np.abs(product).max(initial=0.0)), MPI.MAX)
     np.testing.assert_allclose(
-        product, (gradient(x + h * way) - gradient(x - h * way)) / (2 * h), rtol=0.0, atol=1e-5 * largest
+        product,
+        (gradient(x + h * direction) - gradient(x - h * direction)) / (2 * h),
+        rtol=0.0,
+        atol=1e-5 * largest,
     )
     simulation.destroy()

@@ -53,15 +53,15 @@ def falling(above: float) -> dict[str, Any]:
 
 @pytest.mark.parallel(alone=False)
 def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
-    ways = []
+    results = []
     for ranks in (MPI.COMM_SELF, comm):
         with Simulation(falling(0.02), ranks) as simulation:
-            ways.append(simulation.run(0.004, 20))
+            results.append(simulation.run(0.004, 20))
             assert simulation.energy("contact") > 0.0
-    heights = ways[0][:, 2]
+    heights = results[0][:, 2]
     assert heights.min() > 0.0
     assert heights[4:].max() - heights[:4].max() < 0.015  # the upper one has come near the lower one
-    np.testing.assert_allclose(ways[1], ways[0], atol=1e-10)
+    np.testing.assert_allclose(results[1], results[0], atol=1e-10)
 
 
 def two_sheets(folder: Path) -> dict[str, Any]:
@@ -110,21 +110,21 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
     content = common | {"time": {"end": 1.0, "step": 0.004}}
     (folder := shared_tmp / str(comm.rank)).mkdir()
     content |= scene(folder)
-    ways: list[list[Array]] = []
+    results: list[list[Array]] = []
     for ranks in (MPI.COMM_SELF, comm):
         for name, value in (direct_solver(ranks) | {"ksp_rtol": "1e-12"}).items():
             PETSc.Options().setValue(name, value)
         simulation = SteppedScene(ranks, scene_of(content))
         size, contacts = simulation.problem.whole.size, 0.0
-        ways.append([])
+        results.append([])
         for step in range(1, STEPS + 1):
             simulation.step()
             contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
             if step in (20, STEPS):
-                ways[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
+                results[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
         assert contacts > 10.0
         simulation.destroy()
-    for alone, together, tolerance in zip(*ways, (1e-8, 1e-6), strict=True):
+    for alone, together, tolerance in zip(*results, (1e-8, 1e-6), strict=True):
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
 
 
@@ -141,17 +141,17 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
         "time": {"end": 1.0, "step": 0.004, "integrator": integrator},
         "solver": {},
     }
-    ways, contacts = [], 0.0
+    results, contacts = [], 0.0
     for ranks in (MPI.COMM_SELF, comm):
         simulation = SteppedScene(ranks, scene_of(content))
         for _ in range(20):
             simulation.step()
             contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
         size = simulation.problem.whole.size
-        ways.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
         simulation.destroy()
     assert contacts > 10.0
-    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-8 * size)
 
 
 @pytest.mark.parallel(2, alone=False)
@@ -167,14 +167,14 @@ def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
         "time": {"end": 1.0, "step": 0.004},
         "solver": {},
     }
-    ways = []
+    results = []
     for ranks in (MPI.COMM_SELF, comm):
         simulation = SteppedScene(ranks, scene_of(content))
         for _ in range(10):
             simulation.step()
-        ways.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
         simulation.destroy()
-    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-9)
 
 
 def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
@@ -193,7 +193,7 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
         "solver": {},
     }
     blocks = {"pc_type": "bjacobi", "pc_bjacobi_local_blocks": "3", "sub_pc_type": "ilu"}
-    ways, contacts = [], 0.0
+    results, contacts = [], 0.0
     for ranks, options in ((MPI.COMM_SELF, {}), (comm, blocks)):
         for name, value in options.items():
             PETSc.Options().setValue(name, value)
@@ -208,10 +208,10 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
             simulation.step()
             contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
         size = simulation.problem.whole.size
-        ways.append(gathered(simulation.problem.points, system.x))
+        results.append(gathered(simulation.problem.points, system.x))
         simulation.destroy()
     assert contacts > 10.0
-    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-8 * size)
 
 
 def test_collisions_are_expected_if_parts_are_near_and_approach_fast(comm: MPI.Comm) -> None:
@@ -256,10 +256,10 @@ def test_only_the_start_of_increments_through_many_parts_is_searched(
         barrier = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
         known, x = simulation.problem.discretisation, simulation.problem.system.x
         numbers = simulation.problem.points.global_number[: len(x)]
-        ways = np.random.default_rng(1).uniform(-0.3, 0.3, (12 * 81, 3))[numbers]
-        known.update_stencils(x, ways)
+        results = np.random.default_rng(1).uniform(-0.3, 0.3, (12 * 81, 3))[numbers]
+        known.update_stencils(x, results)
         assert 0 < barrier.n_elements < 200 * len(x)
-        assert 0.01 < known.searched_fraction(x, ways) < 0.5
+        assert 0.01 < known.searched_fraction(x, results) < 0.5
 
 
 def test_ranks_share_the_pairs_of_a_stack(comm: MPI.Comm) -> None:

@@ -151,8 +151,8 @@ def test_a_handle_that_jumps_is_named(comm: MPI.Comm) -> None:
     with failing(comm, scene) as (_, error, failure):
         assert failure.diagnosis.handle == 1
         assert failure.diagnosis.jump == pytest.approx(3.0)
-        told = " ".join([str(error), *error.details])
-        assert "try more time for motions.jump (handles[1] moves 3 m in this step" in told
+        message = " ".join([str(error), *error.details])
+        assert "try more time for motions.jump (handles[1] moves 3 m in this step" in message
 
 
 def test_a_linear_failure_is_distinguished(comm: MPI.Comm) -> None:

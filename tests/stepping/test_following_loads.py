@@ -30,28 +30,28 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     simulation = SteppedScene(MPI.COMM_SELF, content, Phases())
     system, random = simulation.problem.system, np.random.default_rng(0)
     x = system.x + 0.1 * random.normal(size=system.x.shape)
-    u, way = (0.1 * random.normal(size=x.shape) for _ in range(2))
+    u, direction = (0.1 * random.normal(size=x.shape) for _ in range(2))
     loads = FollowingLoads(system.active.loads, x, force_of, 0.5)
 
     force, change = np.zeros_like(x), np.zeros_like(x)
     loads.add_force(x + u, force)
-    energies = [loads.energy(x + u + sign * way) for sign in (1.0, -1.0)]
-    assert float(np.vdot(force, way)) == pytest.approx(0.5 * (energies[1] - energies[0]), rel=1e-12)
+    energies = [loads.energy(x + u + sign * direction) for sign in (1.0, -1.0)]
+    assert float(np.vdot(force, direction)) == pytest.approx(0.5 * (energies[1] - energies[0]), rel=1e-12)
 
     rows = system.discretisation.rows
     values = rows.zeros()
     loads.add_hessian(2.0, rows.pattern, values)
-    loads.add_force(x + way, change)
-    product = np.einsum("aibj,bj->ai", expanded(rows.pattern, values, len(x)), way)
+    loads.add_force(x + direction, change)
+    product = np.einsum("aibj,bj->ai", expanded(rows.pattern, values, len(x)), direction)
     np.testing.assert_allclose(product, -2.0 * change, rtol=0, atol=1e-12 * np.abs(product).max())
 
     # with a rim that is held the stiffness is symmetric, and that of the force itself
     inside = (np.abs(system.x[:, :1] - 0.5) < 0.4) & (np.abs(system.x[:, 1:2] - 0.35) < 0.3)
-    way *= inside
+    direction *= inside
     there, back, change = (np.zeros_like(x) for _ in range(3))
-    system.active.loads[0].add_force(x + 1e-6 * way, 0.0, 1.0, there)
-    system.active.loads[0].add_force(x - 1e-6 * way, 0.0, 1.0, back)
-    loads.add_force(x + way, change)
+    system.active.loads[0].add_force(x + 1e-6 * direction, 0.0, 1.0, there)
+    system.active.loads[0].add_force(x - 1e-6 * direction, 0.0, 1.0, back)
+    loads.add_force(x + direction, change)
     expected = 0.5 * (there - back) / 2e-6
     np.testing.assert_allclose(change * inside, expected * inside, rtol=0, atol=1e-6 * np.abs(change).max())
     simulation.destroy()
@@ -111,15 +111,15 @@ def test_systems_with_skew_stiffness_are_solved() -> None:
     size = random.uniform(1.0, 2.0, 6)
     force = random.normal(size=(2, 3))
 
-    def of_skew(way: Array) -> Array:
-        return (skew @ way.ravel()).reshape(2, 3)
+    def of_skew(direction: Array) -> Array:
+        return (skew @ direction.ravel()).reshape(2, 3)
 
-    way = newton_displacement(force, lambda force: force / size.reshape(2, 3), of_skew, MPI.COMM_SELF)
-    assert way is not None
+    direction = newton_displacement(force, lambda force: force / size.reshape(2, 3), of_skew, MPI.COMM_SELF)
+    assert direction is not None
     assert (
         newton_displacement(force, lambda force: None, of_skew, MPI.COMM_SELF) is None
     )  # there are no factors
-    np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
+    np.testing.assert_allclose((np.diag(size) - skew) @ direction.ravel(), force.ravel(), atol=1e-2)
 
 
 def curled(comm: MPI.Comm, load: float, step: float) -> tuple[Array, int, str]:

@@ -54,25 +54,25 @@ def on_slope(
     while not simulation.finished:
         simulation.step()
     mass = system.points.global_sum(float(system.mass.sum()))[0]
-    way, speed = (
+    slip, speed = (
         float(system.points.global_sum(float(system.mass @ (values @ DOWN)))[0]) / mass
         for values in (system.x[:n] - start, system.v[:n])
     )
     force = simulation.energy_balance.obstacle_forces(1)[0]
     work = simulation.energy_balance.columns()["friction_work"]
     simulation.destroy()
-    return way, speed, np.asarray(force), mass * G, work
+    return slip, speed, np.asarray(force), mass * G, work
 
 
 def test_a_sheet_slides_by_coulombs_law(comm: MPI.Comm) -> None:
     friction, end = 0.5 * math.tan(SLOPE), 0.4
-    way, speed, force, weight, work = on_slope(comm, friction, end)
+    slip, speed, force, weight, work = on_slope(comm, friction, end)
     pull = G * 0.5 * math.sin(SLOPE)
     assert speed == pytest.approx(pull * end, rel=0.05)  # it settles on the barrier at first
     pressed = weight * math.cos(SLOPE)
     np.testing.assert_allclose(force[:3] @ NORMAL, -pressed, rtol=1e-3)
     np.testing.assert_allclose(force[:3] @ DOWN, friction * pressed, rtol=1e-3)
-    assert work == pytest.approx(friction * pressed * way, rel=0.05)
+    assert work == pytest.approx(friction * pressed * slip, rel=0.05)
 
 
 def test_a_slope_of_triangles_acts_as_a_plane(comm: MPI.Comm, shared_tmp: Path) -> None:
@@ -93,9 +93,9 @@ def test_a_slope_of_triangles_acts_as_a_plane(comm: MPI.Comm, shared_tmp: Path) 
 
 
 def test_a_sheet_sticks_below_the_angle_of_friction(comm: MPI.Comm) -> None:
-    way, speed, force, weight, _ = on_slope(comm, 1.2 * math.tan(SLOPE), 1.0)
+    slip, speed, force, weight, _ = on_slope(comm, 1.2 * math.tan(SLOPE), 1.0)
     assert abs(speed) < 1e-5
-    assert 0.0 < way < 2e-3
+    assert 0.0 < slip < 2e-3
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
 
 
@@ -119,16 +119,16 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
         "solver": {},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, ways = simulation.problem.system, []
+    system, ratios = simulation.problem.system, []
     weight = system.points.global_sum(float(system.mass.sum()))[0]
     for time in (2.8, 3.3):
         while simulation.time < time - 0.005:
             simulation.step()
         middle = system.points.global_sum(*(float(system.mass @ x) for x in system.x[: len(system.mass)].T))
-        ways.append(math.hypot(middle[0], middle[2]) / weight)
+        ratios.append(math.hypot(middle[0], middle[2]) / weight)
     simulation.destroy()
-    assert ways[0] < 0.01
-    assert ways[1] > 0.05
+    assert ratios[0] < 0.01
+    assert ratios[1] > 0.05
 
 
 @pytest.mark.parallel(1)
@@ -153,9 +153,9 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
         start = system.x.copy()
         while not simulation.finished:
             simulation.step()
-        distance, way = (values.mean(axis=0) for values in (system.x, system.x - start))
+        distance, slip = (values.mean(axis=0) for values in (system.x, system.x - start))
         simulation.destroy()
-        return float(distance @ NORMAL) / GAP, float(way @ DOWN)
+        return float(distance @ NORMAL) / GAP, float(slip @ DOWN)
 
     lies, _ = let_go(0.95, 3.0, 3.0, 1.0)
     limit = math.tan(SLOPE)
@@ -224,10 +224,10 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
     start = gathered(simulation.problem.points, simulation.problem.system.x)
     while not simulation.finished:
         simulation.step()
-    way = (gathered(simulation.problem.points, simulation.problem.system.x) - start)[:, 0]
+    slip = (gathered(simulation.problem.points, simulation.problem.system.x) - start)[:, 0]
     rejected = simulation.totals["rejected"]
     simulation.destroy()
-    np.testing.assert_allclose(way, far * (3.0 * end**2 - 2.0 * end**3), rtol=1e-3)
+    np.testing.assert_allclose(slip, far * (3.0 * end**2 - 2.0 * end**3), rtol=1e-3)
     assert rejected <= 8
 
 

@@ -136,11 +136,11 @@ def test_rotations_about_different_axes_are_interpolated_by_the_shortest_rotatio
     turns = [turn(170, [1, 0, 0]), turn(170, [-1, 0.1, 0]), turn(160, [-1, 0.1, 0]), *extra]
     motion = Motion(keyframes(*({"time": i, "rotate": each} for i, each in enumerate(turns))), kind)
     matrices = [motion.transform(t)[0] for t in np.linspace(0, 2, 201)]
-    ways = [np.arccos(np.clip(0.5 * (np.trace(b @ a.T) - 1.0), -1.0, 1.0)) for a, b in pairwise(matrices)]
+    angles = [np.arccos(np.clip(0.5 * (np.trace(b @ a.T) - 1.0), -1.0, 1.0)) for a, b in pairwise(matrices)]
     ends = np.degrees(np.arccos(0.5 * (np.trace(matrices[100] @ matrices[0].T) - 1.0)))
     assert ends < 30.0
-    assert np.degrees(sum(ways[:100])) == pytest.approx(ends, rel=0.05)
-    assert np.degrees(sum(ways[100:])) == pytest.approx(10.0, rel=0.05)
+    assert np.degrees(sum(angles[:100])) == pytest.approx(ends, rel=0.05)
+    assert np.degrees(sum(angles[100:])) == pytest.approx(10.0, rel=0.05)
 
 
 def test_more_than_half_a_turn_between_different_axes_is_refused() -> None:
@@ -379,7 +379,7 @@ LIFT = {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}], "same": [{"t
 
 
 @pytest.mark.parametrize(
-    ("handles", "told"),
+    ("handles", "noted"),
     [
         ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "lift"}], True),
         (
@@ -398,10 +398,10 @@ LIFT = {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}], "same": [{"t
     ],
 )
 def test_handles_that_hold_the_same_vertices_elsewhere_are_noted(
-    handles: list[dict[str, Any]], told: bool
+    handles: list[dict[str, Any]], noted: bool
 ) -> None:
     content = {"mesh": MESH, "handles": handles, "motions": LIFT, "time": {"end": 2.0, "step": 0.1}}
     with Simulation(content, MPI.COMM_SELF) as simulation:
         notes = [note for note in simulation.problem.whole.notes if "different places" in note]
-    assert len(notes) == told
+    assert len(notes) == noted
     assert all("hold 1 vertices (first: 1)" in note and "handles[1], the later" in note for note in notes)

@@ -109,11 +109,11 @@ def test_second_order_during_contact(integrator: str, comm: MPI.Comm) -> None:
     for steps in (80, 160, 320):
         time = {"end": END, "step": END / steps, "integrator": integrator}
         simulation = SteppedScene(comm, scene_of(LYING | {"time": time}))
-        weight, carried = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum())), 0.0
+        weight, support = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum())), 0.0
         while not simulation.finished:
             assert simulation.step().rejected == 0
-            carried -= float(simulation.energy_balance.obstacle_forces(1)[0, 2]) / steps
-        assert carried == pytest.approx(weight, rel=0.2)
+            support -= float(simulation.energy_balance.obstacle_forces(1)[0, 2]) / steps
+        assert support == pytest.approx(weight, rel=0.2)
         system = simulation.problem.system
         shapes.append(gathered(system.points, system.x))
         simulation.destroy()

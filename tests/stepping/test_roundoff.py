@@ -46,12 +46,12 @@ def test_soft_sheets_converge_without_a_note(comm: MPI.Comm) -> None:
 
 def test_a_strongly_pressed_sheet_needs_no_shorter_steps(comm: MPI.Comm) -> None:
     """Contact forces are far above all others, and their round-off above the scene's tolerance."""
-    low, room, gap = -0.0049, 5e-5, 0.005
+    low, height, gap = -0.0049, 5e-5, 0.005
     plates = {
         "low": {"plane": {"point": [0.0, 0.0, low], "normal": [0.0, 0.0, 1.0]}},
         "high": {
             "plane": {"point": [0.0, 0.0, 0.01], "normal": [0.0, 0.0, -1.0]},
-            "motion": [{"time": 0.0}, {"time": 0.3, "translate": [0.0, 0.0, low + room - 0.01]}],
+            "motion": [{"time": 0.0}, {"time": 0.3, "translate": [0.0, 0.0, low + height - 0.01]}],
         },
     }
     scene: dict[str, Any] = {

@@ -175,8 +175,8 @@ def height_under(point: Array, triangles: Array) -> float:
     area, w = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0], point - a
     s = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
     t = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
-    met = (s >= 0.0) & (t >= 0.0) & (s + t <= 1.0)
-    return float((a[:, 2] + s * u[:, 2] + t * v[:, 2])[met].max(initial=-np.inf))
+    inside = (s >= 0.0) & (t >= 0.0) & (s + t <= 1.0)
+    return float((a[:, 2] + s * u[:, 2] + t * v[:, 2])[inside].max(initial=-np.inf))
 
 
 @pytest.mark.parametrize("speed", [10.0, pytest.param(100.0, marks=pytest.mark.parallel(1))])

@@ -429,8 +429,8 @@ def test_corrections_lead_to_the_force_of_the_linear_model(name: str) -> None:
     assert loaded.any()
     # each pair alone, by as much as it lacks, and back if it is loaded and would leave
     x, obstacle_x = pairs.x, pairs.obstacle_x
-    room = pairs.kind != VERTEX_INSIDE
-    for e in np.flatnonzero(room | (target + pairs.offset < 0.0))[::7]:
+    outside = pairs.kind != VERTEX_INSIDE
+    for e in np.flatnonzero(outside | (target + pairs.offset < 0.0))[::7]:
         one, at = slice(e, e + 1), np.unique(pairs.points[e][pairs.points[e] >= 0])
         of = tuple(part[one] for part in (*numbers, target, before, loaded))
         moved = dx.copy()

@@ -135,7 +135,7 @@ def test_bounds_of_earlier_steps_hide_no_pair(which: str, how: str) -> None:
     rng = np.random.default_rng(5)
     triangles, corners = sheet(which)
     flat, bent = (moved(name, corners, triangles, rng) for name in ("flat", how))
-    search, numbers, met = SheetSearch(triangles, corners), np.arange(len(flat)), []
+    search, numbers, counts = SheetSearch(triangles, corners), np.arange(len(flat)), []
     search.set_triangles(flat, numbers, triangles)
     parts = [0.0, 0.02, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0, 0.7, 1.0]
     places = [turned((1.0 - part) * flat + part * bent, 0.2 * n) for n, part in enumerate(parts)]
@@ -144,8 +144,8 @@ def test_bounds_of_earlier_steps_hide_no_pair(which: str, how: str) -> None:
         every, near = brute(x, dx, triangles)
         found = {name(row[0], row[2:6]) for row in search.pairs(x, dx, numbers, RADIUS).tolist()}
         assert near <= found <= every
-        met.append(len(near))
-    assert max(met) > 0
+        counts.append(len(near))
+    assert max(counts) > 0
 
 
 def test_rigid_motion_of_a_bent_sheet_takes_no_new_comparison(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,7 +139,7 @@ def test_derivatives_agree_with_finite_differences(comm: MPI.Comm, on_edges: Non
         layout.update_ghosts(out)
         return out
 
-    x, way = system.x @ turn.T + local(1, 0.02), local(2, 1.0)
+    x, direction = system.x @ turn.T + local(1, 0.02), local(2, 1.0)
 
     def energy(at: Array) -> float:
         return float(comm.allreduce(float(term.energies(at, None).sum())))
@@ -150,23 +150,25 @@ def test_derivatives_agree_with_finite_differences(comm: MPI.Comm, on_edges: Non
         return out[: layout.n_owned]
 
     h = 1e-4
-    slope = comm.allreduce(float(np.vdot(gradient(x), way[: layout.n_owned])))
+    slope = comm.allreduce(float(np.vdot(gradient(x), direction[: layout.n_owned])))
     numeric = (
-        8 * (energy(x + h * way) - energy(x - h * way)) - energy(x + 2 * h * way) + energy(x - 2 * h * way)
+        8 * (energy(x + h * direction) - energy(x - h * direction))
+        - energy(x + 2 * h * direction)
+        + energy(x - 2 * h * direction)
     ) / (12 * h)
     assert slope == pytest.approx(numeric, rel=1e-7)
     rows = system.discretisation.rows
     for blend in (0.0, 1.0):
         values = rows.zeros()
         term.add_hessian(x, None, blend, np.ones(term.n_elements), rows.pattern.offsets, values)
-        product = rows.product(values, way)
+        product = rows.product(values, direction)
         if blend == 0.0:
-            difference = 8 * (gradient(x + h * way) - gradient(x - h * way))
-            difference -= gradient(x + 2 * h * way) - gradient(x - 2 * h * way)
+            difference = 8 * (gradient(x + h * direction) - gradient(x - h * direction))
+            difference -= gradient(x + 2 * h * direction) - gradient(x - 2 * h * direction)
             largest = comm.allreduce(float(np.abs(product).max(initial=0.0)), MPI.MAX)
             np.testing.assert_allclose(product, difference / (12 * h), rtol=0.0, atol=1e-6 * largest)
         else:
-            assert comm.allreduce(float(np.vdot(product, way[: layout.n_owned]))) > 0.0
+            assert comm.allreduce(float(np.vdot(product, direction[: layout.n_owned]))) > 0.0
     vertices = layout.are_vertices(layout.global_number)
     moved = system.x.copy()
     moved[vertices] = moved[vertices] @ turn.T + [1.0, 2.0, 3.0]

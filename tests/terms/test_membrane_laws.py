@@ -158,10 +158,10 @@ def test_curves_are_interpolated_at_their_points() -> None:
 
 
 def test_strains_that_may_be_percent_are_noted() -> None:
-    for strain, told in ((1.0, []), (5.0, ["strains up to 5; if they are percent"])):
+    for strain, expected in ((1.0, []), (5.0, ["strains up to 5; if they are percent"])):
         law = CURVES | {"shear": [[0.1, 2.0], [strain, 20.0]]}
         notes = resolve_material(validated(Material, {"density": 0.2, "law": law}, file=None))[1]
-        assert [words in note for words, note in zip(told, notes, strict=True)] == [True] * len(told)
+        assert [words in note for words, note in zip(expected, notes, strict=True)] == [True] * len(expected)
 
 
 def test_curves_from_files_are_stored_in_the_scene(tmp_path: Path) -> None:

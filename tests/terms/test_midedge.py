@@ -153,11 +153,11 @@ def test_energy_is_continuous_at_all_angles() -> None:
     """It grows up to 180° on either side, to the same value for flat sheets."""
     with Simulation({"mesh": grid(1.0, 1.0, 1, 1), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, x = midedge_of(simulation), simulation.system.x.copy()
-        way = np.zeros_like(x)
-        way.ravel()[term.of_edges.indices] = term.of_edges.length * [1.0, 0.1, 0.2, -0.1, 0.3]
+        direction = np.zeros_like(x)
+        direction.ravel()[term.of_edges.indices] = term.of_edges.length * [1.0, 0.1, 0.2, -0.1, 0.3]
 
         def energy(turn: float) -> float:
-            return float(term.energies(x + turn * way, term.frames).sum())
+            return float(term.energies(x + turn * direction, term.frames).sum())
 
         assert energy(np.pi - 1e-9) == pytest.approx(energy(np.pi + 1e-9), rel=1e-7)
         assert energy(0.25 * np.pi - 1e-9) == pytest.approx(energy(0.25 * np.pi + 1e-9), rel=1e-7)
@@ -234,16 +234,16 @@ def test_directors_follow_triangles_that_turn_far() -> None:
     with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         x, axis = simulation.system.x.copy(), np.array([0.6, 0.8, 0.0])
-        way = np.zeros_like(x)
-        way[:n] = np.cross(1.5 * axis, x[:n])
+        increment = np.zeros_like(x)
+        increment[:n] = np.cross(1.5 * axis, x[:n])
         places, length = term.of_edges.indices, term.of_edges.length
-        way.ravel()[places] = 1.5 * length * (term.frames.direction @ axis)
-        assert len(term.edge_increments(x, 0.5 * way, term.frames)[0]) == 0
-        followed, values = term.edge_increments(x, way, term.frames)
+        increment.ravel()[places] = 1.5 * length * (term.frames.direction @ axis)
+        assert len(term.edge_increments(x, 0.5 * increment, term.frames)[0]) == 0
+        followed, values = term.edge_increments(x, increment, term.frames)
         far = np.isin(places, followed)
-        np.testing.assert_array_equal(far, np.abs(way.ravel()[places]) > length)
+        np.testing.assert_array_equal(far, np.abs(increment.ravel()[places]) > length)
         assert 0 < far.sum() < len(far)
-        y = x + way
+        y = x + increment
         before = term.energies(y, term.frames).sum()
         y.ravel()[followed] = values
         y.ravel()[places[~far]] = directors_along_normals(term, y)[~far]
@@ -261,15 +261,15 @@ def test_directors_follow_to_first_order(tmp_path: Path, monkeypatch: pytest.Mon
         x = simulation.system.x.copy()
         x[:n] = (x[:n] + random.uniform(-0.1, 0.1, (n, 3))) @ rotation([1.0, 2.0, 0.5], 0.4).T
         x.ravel()[term.edge_indices] = directors_along_normals(term, x)
-        way, size, apart = random.uniform(-1.0, 1.0, x.shape), 1.0, []
+        increment, size, apart = random.uniform(-1.0, 1.0, x.shape), 1.0, []
         for _ in range(3):
             size *= 0.01
             monkeypatch.setattr(midedge, "LARGEST_ROTATION", 0.0)  # so that all edges are corrected
             clip = np.clip
             monkeypatch.setattr(np, "clip", lambda values, low, high: values)
-            places, values = term.edge_increments(x, size * way, term.frames)
+            places, values = term.edge_increments(x, size * increment, term.frames)
             monkeypatch.setattr(np, "clip", clip)
-            apart.append(np.abs(values - size * way.ravel()[places]).max())
+            apart.append(np.abs(values - size * increment.ravel()[places]).max())
         assert np.log(np.array(apart[:-1]) / apart[1:]).min() > 1.5 * np.log(100.0)
 
 
@@ -488,8 +488,8 @@ def test_walls_that_meet_bend_as_beams(
             "loads": [{"nodes": end.tolist(), "force": force.tolist()}],
             "time": {"analysis": "static", "step": 1.0},
         }
-        way = (outcome(MPI.COMM_SELF, content)[0] - vertices)[end, axis].mean()
-        errors.append(abs(way / (4e-4 * compliance) - 1.0))
+        deflection = (outcome(MPI.COMM_SELF, content)[0] - vertices)[end, axis].mean()
+        errors.append(abs(deflection / (4e-4 * compliance) - 1.0))
     assert errors[0] < 0.03
     assert errors[1] < 0.35 * errors[0]
 
@@ -937,7 +937,7 @@ def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
         x = simulation.system.x.copy()
         random = np.random.default_rng(3)
         x += random.uniform(-0.2, 0.2, x.shape)
-        way = random.uniform(-1.0, 1.0, x.shape)
+        direction = random.uniform(-1.0, 1.0, x.shape)
         force = np.zeros_like(x)
         load.add_force(x, 0.0, 0.0, force)
 
@@ -945,7 +945,7 @@ def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
             return bending._directors(at, bending.frames)[:, :3]
 
         step = 1e-6
-        rate = (shape(x + step * way) - shape(x - step * way)) / (2.0 * step)
+        rate = (shape(x + step * direction) - shape(x - step * direction)) / (2.0 * step)
         tail, head = bending.of_edges.ends.T
         tangent = unit(x[head] - x[tail])
         turn = np.sum(rate * np.cross(tangent, shape(x)), axis=1)
@@ -955,7 +955,7 @@ def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
         # the counter-clockwise direction is −x here, and positive moments act about its reverse
         along = np.sign(rest[head, 0] - rest[tail, 0])[top]
         expected = 0.7 * np.sum(bending.of_edges.length[top] * along * turn[top])
-        assert np.sum(force * way) == pytest.approx(expected, rel=1e-7)
+        assert np.sum(force * direction) == pytest.approx(expected, rel=1e-7)
 
 
 def test_moments_are_refused_where_edges_carry_none() -> None:

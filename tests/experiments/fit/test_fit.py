@@ -137,11 +137,11 @@ def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
     best, _ = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
     found = conclude(unknowns, best)
-    told = " ".join(found.notes)
-    assert "the data cannot tell a and b apart" in told
+    text = " ".join(found.notes)
+    assert "the data cannot tell a and b apart" in text
     assert found.estimates[2].at_bound
     assert found.estimates[2].value == pytest.approx(2.0)
-    assert "c is at its bound 2" in told
+    assert "c is at its bound 2" in text
 
 
 def test_a_fit_resumes_without_repeating(tmp_path: Path) -> None:
@@ -323,9 +323,9 @@ def test_report(tmp_path: Path) -> None:
     results: Any = Results(comm, tmp_path / "fit", Fit("A strip"), ranks=1, command=["fit"])
     outcome = outcome_of(fit_scene(comm, scene))
     results.run([outcome.case], lambda case: outcome)
-    told = json.loads((tmp_path / "fit" / "fit.json").read_text())["cases"][0]
-    assert told["parameters"][0]["key"] == "material.bending"
-    assert told["measurements"][0]["after"] == pytest.approx(-0.06, abs=2e-4)
+    text = json.loads((tmp_path / "fit" / "fit.json").read_text())["cases"][0]
+    assert text["parameters"][0]["key"] == "material.bending"
+    assert text["measurements"][0]["after"] == pytest.approx(-0.06, abs=2e-4)
     page = (tmp_path / "fit" / "report.md").read_text()
     assert "95 % interval" in page
     assert "before and after the fit" in page

@@ -44,8 +44,8 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
     assert outcome.failures == {}
     assert outcome.passed
     assert outcome.record.balances
-    told = comm.allgather((outcome.verdicts, outcome.record.newton, outcome.seconds))
-    assert all(one == told[0] for one in told)
+    outcomes = comm.allgather((outcome.verdicts, outcome.record.newton, outcome.seconds))
+    assert all(one == outcomes[0] for one in outcomes)
 
 
 @pytest.mark.parallel(2)

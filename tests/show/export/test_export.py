@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from written_run import met, position, written
+from written_run import position, written, written_with_obstacles
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.show import export
@@ -131,7 +131,7 @@ print("lyra_petsc.mesh.obstacles" in sys.modules)
     ball = {"ball": {"sphere": {"center": [0, 0, 0], "radius": 1}}}
     for run, expected in (
         (written(tmp_path / "without"), "False"),
-        (met(tmp_path / "with", obstacles=ball), "True"),
+        (written_with_obstacles(tmp_path / "with", obstacles=ball), "True"),
     ):
         done = subprocess.run([sys.executable, "-c", code, run], capture_output=True, text=True, check=True)
         assert done.stdout.strip() == expected

@@ -5,7 +5,17 @@ import shutil
 
 import numpy as np
 import pytest
-from written_run import POST, REST, TRIANGLES, met, position, scene, stress, velocity, written
+from written_run import (
+    POST,
+    REST,
+    TRIANGLES,
+    position,
+    scene,
+    stress,
+    velocity,
+    written,
+    written_with_obstacles,
+)
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.obj_file import read_obj
@@ -368,7 +378,7 @@ def read_objects(to, folder):
 @pytest.mark.parametrize("to", ["obj", "ply", "npz", "vtkhdf", "gltf", "usd"])
 def test_obstacles_are_separate_objects(tmp_path, to):
     """A ball that moves by 1.5 m along x and a triangle at rest; the cloth is as without them."""
-    export_run(met(tmp_path / "run"), to, tmp_path / "out", times="0,0.5")
+    export_run(written_with_obstacles(tmp_path / "run"), to, tmp_path / "out", times="0,0.5")
     found = read_objects(to, tmp_path / "out")
     assert set(found) == {"ball", "post"}
     x, faces = found["ball"]
@@ -385,7 +395,7 @@ def test_obstacles_are_separate_objects(tmp_path, to):
 def test_names_of_obstacles_in_files_are_unique(tmp_path):
     ball = {"sphere": {"center": [0, 0, 0], "radius": 1}}
     names = ["cloth", "a b", "a_b", "2/1", "ü"]
-    done = export_run(met(tmp_path / "run", dict.fromkeys(names, ball)), "obj", every=99)
+    done = export_run(written_with_obstacles(tmp_path / "run", dict.fromkeys(names, ball)), "obj", every=99)
     lines = (done.folder / done.files[0]).read_text().splitlines()
     objects = [line[2:] for line in lines if line.startswith("o ")]
     assert objects == ["cloth", "cloth_", "a_b", "a_b_", "_2_1", "_"]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from PIL import Image
-from written_run import met, written
 from written_run import ring as ring_mesh
+from written_run import written, written_with_obstacles
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.mesh_file import write_mesh
@@ -243,9 +243,9 @@ def test_ranks_share_the_states_and_draw_the_same(comm, shared_tmp):
         run, at="0,0.1,0.2,0.3,0.4", film=shared_tmp / "f.mp4", out=shared_tmp, size=SIZE, field="speed"
     )
     plan = comm.bcast(make_plan(asked) if comm.rank == 0 else None)
-    told = []
-    paths = draw(comm, plan, lambda done, count: told.append((done, count)))
-    assert told[-1] == (5, 5)
+    progress = []
+    paths = draw(comm, plan, lambda done, count: progress.append((done, count)))
+    assert progress[-1] == (5, 5)
     if comm.rank > 0:
         assert paths == []
         return
@@ -283,7 +283,7 @@ def grey(image: np.ndarray, x: float, y: float) -> bool:
 
 def test_obstacles_are_drawn_at_their_place_at_each_time(tmp_path):
     """A ball that moves by 1.5 m in 0.5 s, and a mesh from the run's folder."""
-    run = met(tmp_path / "run")
+    run = written_with_obstacles(tmp_path / "run")
     start, end = (picture(run, tmp_path, at=at) for at in ("0", "0.5"))
     for image, here, there in ((start, 0.0, 1.5), (end, 1.5, 0.0)):
         assert grey(image, here, 3.6)
@@ -296,9 +296,9 @@ def test_obstacles_are_drawn_at_their_place_at_each_time(tmp_path):
 def test_planes_and_containers_do_not_hide_sheets(tmp_path):
     plane = {"plane": {"point": [0, 0, 2], "normal": [0, 0, -1]}}
     hull = {"box": {"min": [-9, -9, -9], "max": [9, 9, 4]}, "inside": True}
-    plain = picture(met(tmp_path / "plain", obstacles={}), tmp_path)
+    plain = picture(written_with_obstacles(tmp_path / "plain", obstacles={}), tmp_path)
     for number, (kind, least) in enumerate(((plane, 0.3), (hull, 0.05))):
-        image = picture(met(tmp_path / f"{number}", obstacles={"one": kind}), tmp_path)
+        image = picture(written_with_obstacles(tmp_path / f"{number}", obstacles={"one": kind}), tmp_path)
         there = pixel(0.5, 1.5)
         assert image[there][0] > 1.2 * image[there][1:].max()  # red through it
         change = np.abs(image - plain).max(axis=2)
@@ -311,7 +311,7 @@ def test_obstacles_are_in_the_picture(tmp_path):
     images = []
     for number, x in enumerate((4.0, 400.0, None)):
         ball = {"ball": {"sphere": {"center": [x, 1.5, 0], "radius": 0.5}}} if x is not None else {}
-        run = met(tmp_path / f"{number}", obstacles=ball)
+        run = written_with_obstacles(tmp_path / f"{number}", obstacles=ball)
         images.append(picture(run, tmp_path, settings=("render.camera.direction=[0,0,1]",)))
     near, _, none = images
     dark = np.abs(near - none).max(axis=2)
@@ -324,7 +324,7 @@ def test_obstacles_are_in_the_picture(tmp_path):
 
 
 def test_a_run_without_the_mesh_of_an_obstacle_is_refused(tmp_path):
-    run = met(tmp_path / "run")
+    run = written_with_obstacles(tmp_path / "run")
     write_mesh(run, ring_mesh(), MPI.COMM_SELF)
     with pytest.raises(InputError, match="does not hold the mesh of obstacle 'post'"):
         picture(run, tmp_path)

@@ -167,7 +167,7 @@ def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
 # -- advice ------------------------------------------------------------------------------------------
 
 
-def told(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
+def advice_of(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
     """Advice for the finished run with a changed summary or history."""
     from lyra_petsc.output.read_run import StoredRun
 
@@ -202,9 +202,9 @@ WALL = {"mesh": 0.1, "solve": 8.0, "output": 0.5, "other": 0.1}
 def test_advice_for_slow_or_inaccurate_runs(finished: Path, changes: dict[str, Any], words: str) -> None:
     usual = {"ranks": 1, "wall_seconds": WALL}
     quiet = {"newton_iterations": 3.0, "linear_iterations": 30.0, "dissipation": 0.01}
-    assert words not in told(finished, usual, **quiet)
+    assert words not in advice_of(finished, usual, **quiet)
     summary = {**usual, **changes.pop("summary", {})} if "summary" in changes else usual
-    assert words in told(finished, summary, **{**quiet, **changes})
+    assert words in advice_of(finished, summary, **{**quiet, **changes})
 
 
 def test_the_advice_knows_every_linear_solver() -> None:

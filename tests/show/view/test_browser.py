@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from written_run import MET, Writer, met, written
+from written_run import OBSTACLES, Writer, written, written_with_obstacles
 
 pytestmark = pytest.mark.slow
 
@@ -216,7 +216,7 @@ def test_the_page_loads_plays_and_reacts_to_controls(serve, browser, tmp_path):
 def test_obstacles_are_shown_and_move(serve, browser, tmp_path):
     """A ball behind the sheet that moves to the right, a post at rest, and a transparent plane."""
     above = {"plane": {"point": [0, 0, 5], "normal": [0, 0, -1]}}
-    run = met(tmp_path / "run", MET | {"above": above})
+    run = written_with_obstacles(tmp_path / "run", OBSTACLES | {"above": above})
     looks = ("position=[1.5,1.5,12]", "target=[1.5,1.5,0]")
     served = serve(run, *(word for look in looks for word in ("--set", f"render.camera.{look}")))
     seen = Seen(browser, served.url)
@@ -331,13 +331,13 @@ def test_open_pages_report_the_end_of_the_run_and_stay(browser, tmp_path):
 
     writer = Writer(tmp_path / "run")
     writer.write()
-    told = []
-    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    messages = []
+    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
     page.show(tmp_path / "run")
     try:
-        while not told:
+        while not messages:
             time.sleep(0.1)
-        seen = Seen(browser, told[0])
+        seen = Seen(browser, messages[0])
         writer.write()
     finally:
         page.end()

@@ -41,13 +41,13 @@ def until(condition, what):
 
 def address(process):
     """Address of the page, as soon as the run prints it."""
-    told = []
+    messages = []
     for line in process.stderr:
-        told.append(line)
+        messages.append(line)
         found = re.match(r"view: (http://127\.0\.0\.1:\d+/\?token=\S+)$", line)
         if found:
             return found[1]
-    pytest.fail("no page:\n" + "".join(told))
+    pytest.fail("no page:\n" + "".join(messages))
 
 
 @pytest.fixture(autouse=True)
@@ -124,12 +124,12 @@ def test_a_port_in_use_is_refused_before_files_are_written(tmp_path):
 
 
 def test_a_page_that_cannot_be_served_is_reported(tmp_path):
-    told = []
-    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    messages = []
+    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
     page.show(tmp_path / "nowhere")
-    until(lambda: told, "nothing is said")
+    until(lambda: messages, "nothing is said")
     page.end()
-    assert "nowhere: no such folder" in told[0]
+    assert "nowhere: no such folder" in messages[0]
 
 
 def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
@@ -138,16 +138,16 @@ def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
 
     writer = Writer(tmp_path / "run")
     writer.write()
-    told = []
-    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    messages = []
+    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
     page.show(tmp_path / "run")
-    until(lambda: told, "nothing is said")
+    until(lambda: messages, "nothing is said")
     (process,) = pages(tmp_path)
     assert os.getpriority(os.PRIO_PROCESS, process) >= NICENESS
     group = Path(f"/proc/{process}/autogroup")  # where Linux shares the time out among sessions
     if group.exists() and group.read_text().strip():
         assert group.read_text().endswith(f"nice {NICENESS}\n")
-    url = urlsplit(told[0])
+    url = urlsplit(messages[0])
     connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
     headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
     connection.request(
@@ -161,4 +161,4 @@ def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
     connection.close()
     connection.sock = None
     until(lambda: not pages(tmp_path), "the page outlives its run")
-    assert len(told) == 1
+    assert len(messages) == 1
