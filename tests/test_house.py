@@ -29,7 +29,7 @@ LEVELS = [
     {"cli"},
     {"__main__"},
 ]
-RANK = {package_of: level for level, packages in enumerate(LEVELS) for package_of in packages}
+RANK = {package: level for level, packages in enumerate(LEVELS) for package in packages}
 RANK[""] = len(LEVELS)  # the package itself, which names what it offers
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -153,7 +153,7 @@ def linear_algebra(kernel: ast.AST) -> list[int]:
 
 def used_from_elsewhere(path: Path) -> list[str]:
     """Names that the kernels of a module use from packages which the digest of its cache does not cover."""
-    home = f"{PACKAGE.name}.{room(module_name(path))}"
+    home = f"{PACKAGE.name}.{package_of(module_name(path))}"
     names = {
         alias.asname or alias.name: node.module
         for node in ast.walk(parsed(path))

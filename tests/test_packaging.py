@@ -13,8 +13,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def test_every_package_is_in_the_wheel() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    rooms = {
+    packages = {
         ".".join(init.parent.relative_to(ROOT).parts) for init in (ROOT / "lyra_petsc").rglob("__init__.py")
     }
-    assert set(listed) == rooms | {"lyra_petsc.configs", "lyra_petsc.meshes"}
+    assert set(listed) == packages | {"lyra_petsc.configs", "lyra_petsc.meshes"}
     assert len(listed) == len(set(listed))
