@@ -34,7 +34,7 @@ from compile_once import compile_once
 from mpi4py import MPI
 
 WAIT_FOR_OTHERS = 20.0  # s that a failed rank gives the others to finish the test
-LONGEST_TEST = 300.0  # s after which every rank shows where it stands and the job ends
+LONGEST_TEST = 300.0  # s after which every rank prints its stack and the job ends
 
 WORLD = MPI.COMM_WORLD
 FAILURE = pytest.StashKey[str]()
@@ -173,7 +173,7 @@ def collect_garbage() -> None:
 
         if hasattr(PETSc, "garbage_cleanup"):
             PETSc.garbage_cleanup()
-    gc.freeze()  # what outlives its test, above all kernels: each collection would look through all of them
+    gc.freeze()  # objects that outlive tests, mainly kernels: each collection would visit them
     WORLD.Barrier()
 
 

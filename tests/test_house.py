@@ -30,7 +30,7 @@ LEVELS = [
     {"__main__"},
 ]
 RANK = {package: level for level, packages in enumerate(LEVELS) for package in packages}
-RANK[""] = len(LEVELS)  # the package itself, which names what it offers
+RANK[""] = len(LEVELS)  # the package itself, which exports names
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

@@ -55,7 +55,7 @@ def load(*modules: str) -> None:
     for module in modules:
         with contextlib.suppress(ModuleNotFoundError):
             importlib.import_module(module)
-    # a third of a forked process's time went into copies of what the collector looked at as it ended
+    # else a forked process copies the memory that the collector visits at its end: a third of its time
     gc.collect()
     gc.freeze()
 
@@ -82,7 +82,7 @@ def attend(connection: socket.socket, asked: dict[str, Any], out: int, err: int)
     os.close(out)
     os.close(err)
     ended = os.pidfd_open(pid)
-    if ended not in select.select([connection, ended], [], [])[0]:  # nobody waits for it any more
+    if ended not in select.select([connection, ended], [], [])[0]:  # the client has closed the connection
         os.kill(pid, signal.SIGKILL)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     with contextlib.suppress(OSError):
@@ -95,7 +95,7 @@ def serve() -> None:
     listener = socket.socket(fileno=os.dup(0))
     while True:
         connection, _ = listener.accept()
-        with contextlib.suppress(ChildProcessError):  # leave none of those that have ended behind
+        with contextlib.suppress(ChildProcessError):  # collect processes that have ended
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
         message, files, *_ = socket.recv_fds(connection, 2**18, 2)

@@ -39,7 +39,7 @@ LAUNCHER = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
-    # more ranks than cores: one that waits leaves its core to those it waits for
+    # more ranks than cores: a waiting rank yields its core
     "OMPI_MCA_mpi_yield_when_idle": "1",
 }
 

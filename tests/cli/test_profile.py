@@ -109,7 +109,7 @@ print(list(STAGES))
     process = subprocess.run(
         [sys.executable, "-c", program], env=environment(), capture_output=True, text=True, timeout=60
     )
-    # once outside of all stages, once each in those that were innermost
+    # once outside of all stages, once in each innermost stage
     assert process.stdout.splitlines() == [
         "[1, 1, 0, 0, 0, 0, 1, 1]",
         "['mesh', 'partition', 'assembly', 'solve', 'balance', 'output', 'a further one']",

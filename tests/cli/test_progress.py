@@ -138,7 +138,7 @@ def test_lines_of_a_study_name_each_case_and_the_remaining_time():
     lines = stream.getvalue().splitlines()
     assert lines[0] == "1/2 bdf2, Δt 10 ms: finished before"
     assert lines[1] == "2/2 bdf2, Δt 5 ms"
-    # after 60 s of what took no time before: 6 of 30 units, four times as long to go
+    # after 60 s for 6 of 30 units, four times as long remains
     assert lines[2] == " 40%  2/2 bdf2, Δt 5 ms  4:00 left"
     assert len(lines) == 7
     assert lines[-2:] == ["reference: bdf2, Δt 1.25 ms", "note: something"]

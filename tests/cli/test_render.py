@@ -130,7 +130,7 @@ def test_the_script_for_paraview_is_valid_and_names_existing_files(tmp_path, fie
     path = write_script(written(tmp_path / "run with 'quotes'", fields=fields))
     text = path.read_text(encoding="utf-8")
     tree = compile(text, str(path), "exec")
-    simple = MagicMock()  # stands for ParaView's functions
+    simple = MagicMock()  # replaces ParaView's functions
     simple.GenerateSurfaceNormals().PointData = simple.SurfaceNormals().PointData = {"velocity": None}
     monkeypatch.setitem(sys.modules, "paraview", SimpleNamespace(simple=simple))
     exec(tree, {"__file__": str(path)})

@@ -86,7 +86,7 @@ def test_a_second_call_uses_another_folder(tmp_path: Path) -> None:
 
 
 def test_a_failed_verdict_is_exit_code_1(tmp_path: Path) -> None:
-    # steps that stop at a tenth of their first residual are not what the scene's tolerances promise
+    # steps that stop at a tenth of their first residual violate the scene's tolerances
     left = lyra(["stress", "--quick", *TWO, "--out", "out", "-snes_rtol", "0.1"], tmp_path)
     assert left.code == 1, left.err + left.out
     assert "equations: worst in step" in left.out

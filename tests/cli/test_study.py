@@ -175,7 +175,7 @@ def test_a_stopped_study_resumes_without_repeating(tmp_path: Path, number: int, 
     done(["study", "scene.yaml", "--out", "out", "--resume"], tmp_path)
     assert results(tmp_path / "out") == after
     assert len(read_csv(tmp_path / "out" / "study.csv")) == 2
-    # a wider sweep runs what is new
+    # a wider sweep runs new combinations only
     done(["study", "--out", "out", "--resume", "--vary", "dt=0.01,0.02,0.002"], tmp_path)
     wider = results(tmp_path / "out")
     assert {name: wider[name] for name in after} == after

@@ -114,7 +114,7 @@ def main() -> None:
         simulation.step()
         simulation.destroy()
     gc.collect()
-    gc.freeze()  # else each forked process copies what the collector looks at
+    gc.freeze()  # else each forked process copies the memory that the collector visits
     for line in sys.stdin:
         print(json.dumps(run_all(folder, json.loads(line))), flush=True)
     os._exit(0)

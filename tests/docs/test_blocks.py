@@ -78,7 +78,7 @@ def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     folder.mkdir()
     for name in ("docs", "lyra_petsc", "pyproject.toml", "README.md"):
         (folder / name).symlink_to(ROOT / name)
-    for name in ("configs", "meshes"):  # a scene finds its mesh beside where it really is
+    for name in ("configs", "meshes"):  # a scene finds its mesh relative to its resolved path
         shutil.copytree(ROOT / name, folder / name)
     flag = (folder / "meshes" / "flag.geo").read_text(encoding="utf-8")
     (folder / "meshes" / "flag.geo").write_text(coarse(flag), encoding="utf-8")
@@ -151,7 +151,7 @@ def test_named_verbs_and_options_exist(page: Path) -> None:
     for command, words in commands_of(page):
         ours, _ = split(words)
         verb = ours[0] if ours else "VERB"
-        if verb.isupper() or "…" in ours:  # VERB stands for any; … for whatever follows
+        if verb.isupper() or "…" in ours:  # VERB is any command, … any further words
             continue
         assert verb in verbs.commands or verb.startswith("--"), f"{shown(page)}: {command}"
         if verb in verbs.commands:

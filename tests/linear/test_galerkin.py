@@ -60,7 +60,7 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
         between = interpolations(points, problem.surface, 3)
         hierarchy = Hierarchy(points, pattern, between)
         assert len(hierarchy.levels) == 3
-        list(hierarchy.block_rows(np.ones_like(values), ~mask))  # what is left from before must not show
+        list(hierarchy.block_rows(np.ones_like(values), ~mask))  # earlier values must have no effect
         rows = list(zip(hierarchy.levels, hierarchy.block_rows(values, mask), strict=True))
         for one, another, share in zip(rows, rows[1:], between, strict=False):
             (level, (of_fine, free)), (coarser, (of_coarse, coarse_free)) = one, another

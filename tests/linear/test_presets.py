@@ -42,7 +42,7 @@ def test_the_first_solver_suits_the_problem(
     assert chosen[0] == first
     assert len(set(chosen)) == len(chosen) > 1
     assert set(chosen) <= set(PRESETS)
-    # what holds a matrix of any size
+    # solvers without a limit on the size
     assert {"multigrid", "multigrid-w", "gamg", "block-jacobi"} & set(chosen)
 
 

@@ -138,6 +138,6 @@ def test_full_element_matrices_are_added() -> None:
 def test_prefetching_changes_nothing() -> None:
     values = np.arange(18.0).reshape(2, 3, 3)
     before = values.copy()
-    offsets = np.array([[-1, 2, 10**6]], dtype=np.int32)  # another rank's, ours, and nobody's
+    offsets = np.array([[-1, 2, 10**6]], dtype=np.int32)  # of another rank, of this one, and out of range
     fetch_ahead(0, offsets, values, 3)
     np.testing.assert_array_equal(values, before)

@@ -135,7 +135,7 @@ def test_an_enlarged_diagonal_is_that_of_the_enlarged_rows(kind: str, comm: MPI.
         larger.set(enlarged)
         before = values.copy()
         matrix.set(values, 0.3)
-        np.testing.assert_array_equal(values, before)  # what the operator multiplies by stays
+        np.testing.assert_array_equal(values, before)  # the operator's values are unchanged
         assert matrix.mat.equal(larger.mat)
         ours = BlockMatrix(points, pattern)
         ours.set(values, 0.3)
@@ -155,7 +155,7 @@ def test_a_diagonal_matrix_stores_diagonal_blocks_only(kind: str, comm: MPI.Comm
         for _ in range(2):  # through MatSetValues, and straight into the arrays
             part.set(values)
         found = part.mat.getDiagonalBlock().getValuesCSR()[2].reshape(-1, 3, 3)
-        # entries of a row after one another, of a block of ours those of a column
+        # PETSc stores blocks by rows, the program by columns
         np.testing.assert_array_equal(found, values[pattern.indptr[:-1]].transpose(0, 2, 1))
         assert part.mat.getInfo()["nz_used"] == 9 * points.n_global
 

@@ -57,7 +57,7 @@ def test_shipped_meshes(name: str, spans: tuple[float, ...] | None, groups: dict
         assert np.allclose(np.ptp(mesh.rest, axis=0), spans, atol=1e-12)
     a, b = triangle_sides(mesh.rest[mesh.triangles])
     assert np.allclose(np.linalg.norm(np.cross(a, b), axis=1), 2 * rest_areas(mesh))
-    # well shaped: no side longer than four times what an equilateral triangle of its area has
+    # well shaped: no side is longer than four times that of an equilateral triangle of equal area
     longest = np.linalg.norm(np.stack([a, b, b - a]), axis=2).max(axis=0)
     assert (longest**2 < 16 * 4 / np.sqrt(3) * rest_areas(mesh)).all()
 

@@ -227,7 +227,7 @@ def test_trusted_scripts_are_limited_by_the_sandbox_only(tmp_path: Path) -> None
         mesh_of(script)
     sheet = geo.mesh_geo(script, 0.3, trusted=True) if "seccomp" not in supported_layers() else None
     if sheet is None:
-        with suppress(InputError):  # gmsh complains of what it cannot write
+        with suppress(InputError):  # gmsh reports files that it cannot write
             geo.mesh_geo(script, 0.3, trusted=True)
         assert [path.name for path in tmp_path.iterdir()] == ["script.geo"]
     script.write_text(f'{SQUARE}a = GetEnv("HOME");\n')

@@ -218,12 +218,12 @@ def test_resumed_runs_agree_on_other_numbers_of_ranks(comm: MPI.Comm, kind: str,
     assert simulate_until(comm, scene, halted, None, resume=True) == end
     if comm.rank == 0:
         # MUMPS adds up in the order in which messages arrive; where that decides on a linear iteration more,
-        # the way differs by the solver's tolerance. Resuming is not the cause: two runs that nobody stops
+        # results differ by the solver's tolerance. Resuming is not the cause: two uninterrupted runs
         # differ as much (alpha2, adaptive, 12 pairs on 3 ranks: 5e-10 to 8e-9, resumed 1e-10 to 8e-9)
         simulate_until(MPI.COMM_SELF, scene, alone, None, resume=True)
         if kind == "static":
             # which of several equilibria of the slack sheet it passes at half the load, and so the work, is
-            # decided by round-off, also in runs that nobody stops: only the end is one
+            # decided by round-off, also in uninterrupted runs: only the ends agree
             for folder in (halted, alone):
                 shapes = StoredRun(folder).positions[-1], StoredRun(straight).positions[-1]
                 np.testing.assert_allclose(*shapes, rtol=0, atol=1e-5)

@@ -219,7 +219,7 @@ def test_mesh_given_on_the_command_line(
     both = ["mesh.grid=", "mesh.file=mine.obj"]
     assert load_scene(small, both).mesh[0].file == here / "mine.obj"
     assert load_scene(small, ["mesh={file: mine.obj}"]).mesh[0].file == here / "mine.obj"
-    # beside the scene, where it is not in the working directory
+    # in the scene's folder, if it is not in the working directory
     assert load_scene(small, ["mesh={file: meshes/a.obj}"]).mesh[0].file == tmp_path / "meshes" / "a.obj"
     with pytest.raises(InputError, match="no such file"):
         load_scene(small, ["mesh={file: nowhere.obj}"])

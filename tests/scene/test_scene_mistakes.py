@@ -145,7 +145,7 @@ CASES = [
     ("handles: [{box: [[0, 0, 0], [-1, 1, 1]]}]", "handles[0].box", "lower corner first"),
     ("handles: [{box: [0, 1]}]", "handles[0].box", "three numbers"),
     ("initial: {seed: -1}", "initial.seed", ">= 0"),
-    # what belongs together
+    # keys that depend on each other
     ("material:", "material", "missing"),
     ("mesh: []", "mesh", "at least one"),
     ("mesh: {name: a}", "mesh", "exactly one of file, grid"),

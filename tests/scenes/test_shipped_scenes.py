@@ -148,7 +148,7 @@ def test_the_buckled_strip_hangs_between_its_clamps() -> None:
         middle, (left, right) = mean_of(simulation, "middle"), simulation.energy_balance.handle_forces(2)
     np.testing.assert_allclose(middle[:2], [0.25, 0.05], atol=1e-3)
     assert -0.4 < middle[2] < -0.3
-    assert left[0] > 10.0 > -10.0 > right[0]  # what presses
+    assert left[0] > 10.0 > -10.0 > right[0]  # signs of the forces of the clamps
     np.testing.assert_allclose((left + right)[2], 3.925 * 0.1 * 9.81, rtol=0.02)
 
 

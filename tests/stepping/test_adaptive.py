@@ -101,7 +101,7 @@ def test_a_large_error_shortens_the_step_and_a_small_one_lengthens_it() -> None:
 def test_no_tiny_step_remains_before_an_output_time() -> None:
     control = ToleranceControl(0.01, 0.1, 1.0, 0.05, [], 1e-6)
     assert control.next_end(0.035) == pytest.approx(0.0425)
-    # a step cut short does not shorten those after it
+    # a shortened step does not shorten later ones
     assert control.accept(0.0075, 0.9, 2)
     assert control.factor * control.step == pytest.approx(0.0075 * 0.85 / 0.9**0.5)
     assert control.accept(0.0001, 1e-6, 2)

@@ -51,7 +51,7 @@ def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
     moved = (there[0] + there[1])[:n]
     turned = start @ rotation(AXIS, 0.9 * MAX_TURN).T
 
-    # nothing holds it: the middle goes on, beside its circle
+    # nothing holds it: its centre may move
     def middle(x: np.ndarray) -> np.ndarray:
         total = np.zeros(3)
         comm.Allreduce(x.sum(axis=0), total)
@@ -94,7 +94,7 @@ def test_arcs_equal_the_increment_to_first_order(comm: MPI.Comm) -> None:
 @pytest.mark.parametrize(
     ("shell", "most"),
     [
-        # without tangents 54, with one correction of a step 58, along straight ways 66; the other 42, 53
+        # without tangents 54, with one correction of a step 58, without arcs 66; the other 42, 53
         (lambda bench: slit_annulus_scene(bench, 12), 50),  # 46
         (lambda bench: open_cylinder_scene(bench, 16, "alternating"), 40),  # 36
     ],

@@ -88,7 +88,7 @@ def test_moving_obstacles_do_work(comm: MPI.Comm) -> None:
         assert budget.potential == pytest.approx(0.2 * 9.81 * 0.01, rel=0.2)
         lost.append(budget.external_work - (budget.total - before) - budget.dissipation)
         simulation.destroy()
-    # what backward Euler loses while the sheet swings on the barrier
+    # dissipation of backward Euler while the sheet swings on the barrier
     assert 0.0 < 2.0 * lost[1] < lost[0]
 
 
@@ -228,7 +228,7 @@ def test_an_obstacle_that_turns_past_the_sheet_is_stopped(comm: MPI.Comm) -> Non
     simulation = SteppedScene(comm, scene_of(scene))
     take_all_steps(simulation)
     assert simulation.totals["rejected"] > 0
-    # the blade has hit what was in its way
+    # the blade has hit the sheet
     assert simulation.budget.kinetic > 0.01
     simulation.destroy()
 

@@ -85,7 +85,7 @@ def test_the_monitor_shows_contact_and_friction(comm: MPI.Comm, capfd: pytest.Ca
         iterations.append(simulation.step().newton_iterations)
         columns = simulation.energy_balance.columns()
         touching.append((columns["contacts"], columns["smallest_gap"]))
-        # the monitor's are those of the barrier
+        # the monitor shows forces of the barrier only
         damped = comm.allreduce(float(simulation.problem.system.contact_impulses.force[:, 2].sum()))
         weights.append(simulation.energy_balance.obstacle_forces(1)[0, 2] - damped)
     PETSc.Sys.syncFlush(comm)

@@ -102,7 +102,7 @@ def test_nearer_than_thickness(comm: MPI.Comm) -> None:
         assert isinstance(contact, ContactBarrier)
         energies = contact.energies(system.x, system.active.frozen[contact])
         total = comm.allreduce(float(energies.sum()))
-    # of what 16 vertices inside would have, at the first state, of which no step has been taken
+    # 16 vertices inside the gap, in the first state, before any step
     stiffness, left, gap = contact.barrier.stiffness, 0.001, 0.02
     assert total == pytest.approx(16 * stiffness * (gap - left) ** 3 / left)
     text = refusal(comm, scene | {"contact": {"gap": 0.02, "thickness": 0.004}})

@@ -63,7 +63,7 @@ def test_cyclic_bending_has_the_hysteresis_of_kes() -> None:
         assert PATH[up] == PATH[down]
         assert m[up] - m[down] == pytest.approx(2.0 * MOMENT, rel=0.01)
     assert (m[4] - m[5]) / 100.0 == pytest.approx(B, rel=0.03)  # coarse
-    # ∮ m dκ from 50 to 50; what sticks gives way by 4 1/m at each turn
+    # ∮ m dκ from 50 to 50; at each reversal 4 1/m are elastic
     assert heats[13] - heats[1] == pytest.approx(2.0 * MOMENT * (500.0 - 4.0), rel=0.01)
 
 
@@ -81,7 +81,7 @@ def test_a_fold_remains() -> None:
     with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
         x = trial.run().x
         budget = trial.simulation.energy_balance.budget
-    # B κ = M_f at 20 1/m: what was bent more stays at that
+    # B κ = M_f at 20 1/m: larger curvatures return to this one
     assert x[:, 2].max() > 0.01
     assert budget.dissipation > 0.0
     assert budget.bending <= 0.55 * MOMENT * 20.0 * 0.06 * 0.01 + MOMENT * 0.06 * 0.01

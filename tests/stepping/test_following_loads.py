@@ -147,7 +147,7 @@ def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
     """Beyond half a circle; at free edges the stiffness of the pressure is not symmetric."""
     tip, newton, notes = curled(comm, 30.0, 0.125)
     np.testing.assert_allclose(tip, pressed_tip(30.0), atol=6e-3)
-    assert newton <= 90  # 353 where a solve takes what is skew as it was
+    assert newton <= 90  # 353 with the skew part constant in a solve
     assert "stable" not in notes
 
 

@@ -67,7 +67,7 @@ def test_the_shift_grows_until_factors_exist_and_decreases_again() -> None:
     assert tries > 0
     assert MIN_SHIFT < growing.value <= MAX_SHIFT
     np.testing.assert_allclose(KERSHAW @ y.getArray(), b.getArray(), atol=1e-4)
-    # what did not fail asks for no more
+    # without a failure the shift does not grow
     assert not growing.increase()
     before = growing.value
     growing.decrease()

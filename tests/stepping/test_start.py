@@ -46,7 +46,7 @@ def test_noise_is_normal_to_the_sheet_with_the_given_size() -> None:
         Simulation({"mesh": content["mesh"]}, MPI.COMM_SELF) as flat,
     ):
         shift = noisy.x - flat.x
-    np.testing.assert_allclose(shift[:, [0, 2]], 0.0, atol=1e-15)  # the sheet stands in the xz plane
+    np.testing.assert_allclose(shift[:, [0, 2]], 0.0, atol=1e-15)  # the sheet is in the xz plane
     assert np.std(shift[:, 1]) == pytest.approx(1e-3, rel=0.1)
     assert abs(np.mean(shift[:, 1])) < 2e-4
 

@@ -110,7 +110,7 @@ def test_ranks_agree_on_the_equilibrium(comm: MPI.Comm) -> None:
 
 
 def test_work_of_moved_handles_is_the_energy_stored(comm: MPI.Comm) -> None:
-    # from balance to balance in small increments: what is put in is what is there
+    # small increments between equilibria: the work equals the energy
     time = {"step": 0.02}
     stretch = {"in": [{"time": 0}, {"time": 1, "translate": [0.1, 0, 0]}]}
     handles = [{"nodes": [0, 7, 14, 21, 28, 35]}, {"nodes": [6, 13, 20, 27, 34, 41], "motion": "in"}]

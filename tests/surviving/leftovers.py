@@ -39,7 +39,7 @@ def announced(out: Path) -> list[float]:
     with meshio.xdmf.TimeSeriesReader(out / "states.xdmf") as reader:
         reader.read_points_cells()
         read = [reader.read_data(k)[0] for k in range(reader.num_steps)]
-        assert read[: len(times)] == times  # a run that goes on may have announced more
+        assert read[: len(times)] == times  # a running simulation may have listed more
     assert times == sorted(set(times))
     return times
 

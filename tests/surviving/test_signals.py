@@ -50,7 +50,7 @@ def test_signals_during_the_start(tmp_path: Path, seconds: float, number: signal
     process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path)
     time.sleep(seconds)
     deadline = time.monotonic() + 20
-    # what happens before Python has read our first line is not ours to say
+    # the program cannot handle signals before its first line
     while not any("lyra_petsc" in line for line in maps(process.pid)) and time.monotonic() < deadline:
         time.sleep(0.005)
     process.send_signal(number)

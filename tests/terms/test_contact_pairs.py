@@ -388,7 +388,7 @@ def test_springs_have_the_force_of_the_barrier_and_its_tangent_below() -> None:
     _, slope, second = contact_pairs.barrier(least, GAP)
     np.testing.assert_allclose(force[straight], second * (least - delta[straight]) - slope)
     assert not force[delta >= GAP].any()
-    # chords lead from any of these distances to where the force is what is expected
+    # chords lead from any of these distances to that of the expected force
     for expected in (0.0, 0.1 * GAP, 2.0 * GAP, 40.0 * GAP):
         slopes, there, of = np.empty((3, len(delta)))
         contact_pairs.secant_stiffness(delta, gap, below, force, np.full(len(delta), expected), slopes)

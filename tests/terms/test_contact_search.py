@@ -73,7 +73,7 @@ def moved(name: str, corners: Array, triangles: Ints, rng: np.random.Generator) 
         out = np.column_stack([1.1 * x + 0.4 * y, 0.8 * y, 0.3 * np.sin(0.5 * x)])
     else:
         out = np.column_stack([x, y, 0.0 * x]) + rng.normal(size=(len(x), 3))
-    # vertices apart, as those of a slit or of layers
+    # separate vertices, as of a slit or of layers
     return out + np.array([0.0, 0.0, 1e-3]) * np.arange(len(out))[:, None] / len(out)
 
 

@@ -149,7 +149,7 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None
     size = np.linalg.norm(slip, axis=1)
     assert np.abs(np.einsum("ek,ek->e", slip, pairs.normal)).max() < 1e-15
     np.testing.assert_allclose(size[slides], limit[slides] / stiffness[slides], rtol=1e-12)
-    # what was put in is stored or heat
+    # the work is stored or becomes heat
     np.testing.assert_allclose(0.5 * stiffness * size**2 + heat, before, rtol=1e-12)
     heights = np.einsum("eik,ek->ei", x[pairs.stencil], pairs.normal)
     start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])

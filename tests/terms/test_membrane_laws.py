@@ -129,7 +129,7 @@ def test_a_compressed_strip_does_not_soften(keys: dict[str, Any], degrees: float
 
 
 def test_st_venant_kirchhoff_softens() -> None:
-    # what the test above is to see
+    # the softening that the test above excludes
     law = Law(shell_of({"cloth": "gray-interlock"}))
     forces = [x * law.stress(np.array([0.5 * (x * x - 1.0), 0.0, 0.0]))[0] for x in (0.6, 0.577, 0.5)]
     assert forces[1] < forces[0]
@@ -153,7 +153,7 @@ def test_curves_are_interpolated_at_their_points() -> None:
         e = 0.5 * ((1.0 + x) ** 2 - 1.0)
         assert (1.0 + x) * law.stress(np.array([e, 0.0, 0.0]))[0] == pytest.approx(force, rel=1e-12)
     for x, force in CURVES["shear"]:
-        # across, where no stretch is below what keeps it from collapsing
+        # across, without stretches near collapse
         assert law.stress(np.array([0.0, 0.3, -x]))[2] == pytest.approx(-force, rel=1e-12)
 
 

@@ -52,7 +52,7 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
         k11, k22, k12 = curvature
         x[:, 2] = 0.5 * k11 * u**2 + 0.5 * k22 * w**2 + k12 * u * w
         rest = bending.elements.data["rest_angle"]
-        # angles of a surface with small slopes s are those of its slopes but for s³
+        # angles of a surface with small slopes s agree with its slopes up to s³
         np.testing.assert_allclose(bending.angles(x), rest, atol=1e-3 * np.abs(rest).max())
         flat = float(bending.energies(simulation.system.x).sum())
         assert flat > 0.0
@@ -62,7 +62,7 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
 def test_positive_curvature_raises_the_sheet_towards_its_normal() -> None:
     material = CLOTH | {"bending": 1e-3, "rest_curvature": [0.1, 0.1, 0.0]}
     with Simulation({"mesh": grid(1, 1, 2, 2), "material": material}, MPI.COMM_SELF) as simulation:
-        # the grid's normals are +z; raising the corners above the middle is what κ > 0 asks for
+        # the grid's normals are +z; with κ > 0 the corners rise above the middle
         assert np.all(bending_of(simulation).elements.data["rest_angle"] <= 1e-15)
         bowl, dome = simulation.system.x.copy(), simulation.system.x.copy()
         squared = (bowl[:, 0] - 0.5) ** 2 + (bowl[:, 1] - 0.5) ** 2

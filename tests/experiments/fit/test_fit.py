@@ -75,7 +75,7 @@ def test_a_fit_finds_the_stiffness(kind: str, tmp_path: Path) -> None:
     assert estimate.value == pytest.approx(TRUE, rel=2e-3)
     low, high = estimate.interval
     assert low < TRUE < high
-    # the interval is what the gradient says
+    # the interval follows from the gradient
     name = "overhang" if kind == "overhang" else "probe"
     quantity = {k: v for k, v in measurement.items() if k in (name, "axes")} if kind != "points" else "tip"
     slope = lyra_petsc.gradient(STRIP, quantity, ["material.bending"]).derivatives["material.bending"]

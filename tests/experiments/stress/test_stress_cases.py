@@ -216,7 +216,7 @@ def test_a_step_of_the_chain_projects_free_motion_onto_rigid_links() -> None:
     np.testing.assert_allclose(np.linalg.norm(links, axis=1), 1.0, rtol=1e-13)
     np.testing.assert_allclose(x[[0, -1]], before[[0, -1]])
     np.testing.assert_allclose(v, (x - before) / 0.05)
-    # what pulls each inner joint away from where it would go acts along its two links
+    # the change from free motion at each inner joint is along its two links
     pull = (x - free_x)[1:-1].ravel()
     lines = np.zeros((pull.size, len(links)))
     for k, link in enumerate(links):

@@ -185,7 +185,7 @@ def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None
 
 def test_richardson_limits_the_order_and_refuses_divergence() -> None:
     fast = richardson(1.0, 16.0, 2.0, 2)
-    assert fast.error == pytest.approx(16.0 / 4.0 / 3.0)  # what the coarser pair says
+    assert fast.error == pytest.approx(16.0 / 4.0 / 3.0)  # the estimate of the coarser pair
     slow = richardson(1.0, 2.0, 2.0, 2)
     assert slow.error == pytest.approx(1.0)
     away = richardson(2.0, 1.0, 2.0, 2)

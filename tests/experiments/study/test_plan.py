@@ -160,7 +160,7 @@ def test_the_finer_run_is_finer_in_the_varied_keys(tmp_path: Path) -> None:
     assert [level.name for level in chain.levels] == [
         "reference-bdf2-dt0.0025", "reference-bdf2-dt0.005", "reference-bdf2-dt0.01"
     ]  # fmt: skip
-    # 30 ms would not divide the 20 ms between samples: the quarter of it is rounded to what does
+    # 30 ms would not divide the 20 ms between samples: its quarter is rounded to a divisor
     assert "time.step=0.005" in make_chains(plan, [], 0.03, "bdf2")[0].levels[0].overrides
 
 

@@ -83,7 +83,7 @@ def test_a_case_passes(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatc
     case = CASES.load(name)
     for constant, fewer in FEWER.get(name, {}).items():
         monkeypatch.setattr(sys.modules[case.measure.__module__], constant, fewer)
-    # on several ranks, those resolutions that show that they give the same
+    # on several ranks, the resolutions that suffice to compare them
     outcome = run_case(comm, case, quick=comm.size > 1 or name in LONG, warm=False)
     words = "; ".join(f"{quantity}: {verdict.message}" for quantity, verdict in outcome.verdicts.items())
     assert outcome.passed, words

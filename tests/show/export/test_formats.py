@@ -250,7 +250,7 @@ def test_npz(tmp_path, vt):
 def test_vtkhdf(tmp_path):
     reader = pytest.importorskip("vtkhdf_reader")
     done = export_run(written(tmp_path / "run", states=4), "vtkhdf", tmp_path / "out", every=2)
-    shutil.rmtree(tmp_path / "run")  # it stands alone
+    shutil.rmtree(tmp_path / "run")  # the export is self-contained
     for i, (time, points, triangles, arrays) in zip(
         (0, 2), reader.read(done.folder / "run.vtkhdf"), strict=True
     ):

@@ -289,7 +289,7 @@ def test_obstacles_are_drawn_at_their_place_at_each_time(tmp_path):
         assert grey(image, here, 3.6)
         assert grey(image, here + 0.2, 3.6)
         assert not grey(image, there, 3.6)
-        assert grey(image, 3.5, 0.2)  # the mesh, half a square, stands still
+        assert grey(image, 3.5, 0.2)  # the mesh, half a square, is at rest
         assert not grey(image, 3.9, 0.9)
 
 

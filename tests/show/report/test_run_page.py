@@ -123,7 +123,7 @@ def test_a_stopped_run_says_how_to_continue(tmp_path: Path) -> None:
     write_scene(tmp_path, SCENE.replace("end: 0.05, step: 0.01", "end: 1000, step: 0.01"))
     process = start(["run", "scene.yaml", "--out", "long"], tmp_path)
     wait_until((tmp_path / "long" / "states.xdmf").exists)
-    running = page_of(tmp_path / "long")  # also while it goes on
+    running = page_of(tmp_path / "long")  # also of an unfinished run
     process.send_signal(signal.SIGTERM)
     assert finish(process).code == 143
     assert "The run goes on" in running

@@ -228,7 +228,7 @@ def test_obstacles_are_shown_and_move(serve, browser, tmp_path):
         found = (np.ptp(top, axis=2) < 22) & (top.max(axis=2) < 175)
         return float(np.flatnonzero(found.any(axis=0)).mean()) / top.shape[1] if found.any() else 0.0
 
-    seen.until(lambda: 0.49 < ball() < 0.6)  # the newest state, as the run goes on
+    seen.until(lambda: 0.49 < ball() < 0.6)  # the newest state of the unfinished run
     assert seen.picture()[2, 2].max() < 225  # the background through the plane
     seen.element("first").click()
     seen.until(lambda: 0.2 < ball() < 0.4)

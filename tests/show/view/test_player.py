@@ -80,7 +80,7 @@ def test_new_states_are_followed_if_the_newest_is_shown(tmp_path, clock):
     writer.write()
     writer.write()
     player = Player(StoredRun(tmp_path))
-    assert player.due() == 1  # it is not finished: the newest is what one comes for
+    assert player.due() == 1  # the newest state of an unfinished run
     assert not player.follow()
     writer.write()
     assert player.follow()
