@@ -51,7 +51,7 @@ def test_the_shift_grows_until_factors_exist_and_decreases_again() -> None:
     ksp, preconditioner = solver("ilu")
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
-    growing = DiagonalShift(ksp, acts=True)
+    growing = DiagonalShift(ksp, enabled=True)
     assert growing.value == MIN_SHIFT
     tries = 0
     while True:
@@ -77,7 +77,7 @@ def test_the_shift_grows_until_factors_exist_and_decreases_again() -> None:
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
 def test_other_preconditioners_have_no_shift(kind: str, acts: bool) -> None:
     ksp, _ = solver(kind)
-    idle = DiagonalShift(ksp, acts=acts)
+    idle = DiagonalShift(ksp, enabled=acts)
     assert idle.value == 0.0
     assert not idle.increase()
 

@@ -42,18 +42,18 @@ class DiagonalShift:
     Parameters
     ----------
     ksp : PETSc.KSP
-    acts : bool
+    enabled : bool
         Whether the preconditioner is built from a matrix of its own.
     """
 
-    def __init__(self, ksp: PETSc.KSP, *, acts: bool) -> None:
-        self._ksp, self._acts = ksp, acts
+    def __init__(self, ksp: PETSc.KSP, *, enabled: bool) -> None:
+        self._ksp, self._enabled = ksp, enabled
         self._value = MIN_SHIFT
 
     @property
     def value(self) -> float:
         """Fraction by which diagonal blocks are to be larger; 0 where nothing is factored incompletely."""
-        return self._value if self._acts and is_incomplete(self._ksp.getPC()) else 0.0
+        return self._value if self._enabled and is_incomplete(self._ksp.getPC()) else 0.0
 
     def saved_state(self) -> dict[str, float]:
         """Entries of a checkpoint, for `restore`."""
@@ -94,7 +94,7 @@ class Reuse:
 
     Parameters
     ----------
-    acts : bool
+    enabled : bool
         Whether to reuse at all; else every solve sets up its own.
 
     Attributes
@@ -103,8 +103,8 @@ class Reuse:
         Whether the last solve used the preconditioner of an earlier step.
     """
 
-    def __init__(self, *, acts: bool) -> None:
-        self._acts = acts
+    def __init__(self, *, enabled: bool) -> None:
+        self._enabled = enabled
         self._for: tuple[float, object] | None = None
         self.reused = False
         self.discard()
@@ -118,7 +118,7 @@ class Reuse:
         reach, mask = system.stage.c, system.prescribed.mask
         if self._for is None or self._for[1] is not mask or not _similar(reach, self._for[0]):
             self.discard()
-        self.reused = self._acts and self._solves > 0
+        self.reused = self._enabled and self._solves > 0
         if not self.reused:
             self._for = reach, mask
         return self.reused
@@ -179,7 +179,7 @@ class LinearSystem:
         # multigrid set up for earlier positions takes many more iterations
         asked = is_set("snes_lag_preconditioner")
         new = iterates or self.factors or direct or self._one_matrix or self.cycles or asked
-        self.reuse = Reuse(acts=not new)
+        self.reuse = Reuse(enabled=not new)
         self._interpolations: list[InterpolationRows] | None = None
         self._multigrid: Multigrid | None = None
         self._ksp: PETSc.KSP | None = None
@@ -237,7 +237,7 @@ class LinearSystem:
     def attach(self, ksp: PETSc.KSP) -> None:
         """Attach to a KSP whose options are set."""
         self._ksp = ksp
-        self.shift = DiagonalShift(ksp, acts=self._shifts and self.preconditioner is not self.operator)
+        self.shift = DiagonalShift(ksp, enabled=self._shifts and self.preconditioner is not self.operator)
         if self._multigrid is not None:
             self._multigrid.attach(ksp)
 
