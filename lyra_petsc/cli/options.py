@@ -58,7 +58,7 @@ settings = click.option(
 trust_mesh = click.option(
     "--trust-mesh",
     is_flag=True,
-    help="Give gmsh mesh scripts (.geo) whatever they say; only what you trust.",
+    help="Pass mesh scripts (.geo) to gmsh unchecked, if you trust them.",
 )
 results = click.argument("run", type=click.Path(path_type=Path))
 out = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")

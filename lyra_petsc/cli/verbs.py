@@ -64,9 +64,9 @@ def verbs(ctx: click.Context) -> None:
 @settings
 @out
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
-@click.option("--resume", is_flag=True, help="Go on from the newest checkpoint.")
+@click.option("--resume", is_flag=True, help="Continue from the newest checkpoint.")
 @trust_mesh
-@click.option("--live", is_flag=True, help="Show it in the browser while it goes on.")
+@click.option("--live", is_flag=True, help="Show the run in the browser while it is running.")
 @server_options
 def run(
     comm: Any, /, live: bool, host: str | None, port: int | None, no_browser: bool, **options: Any
@@ -88,7 +88,7 @@ def run(
 def check(
     comm: Any, path: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool, crossings: bool
 ) -> int:
-    """Check SCENE and print what a run would do; runs nothing. Of RUN, count what crosses in its states."""
+    """Check SCENE and print what a run would do; or count crossing triangles in the states of RUN."""
     from lyra_petsc.parallel import on_root
 
     if crossings and path is None:
@@ -135,13 +135,13 @@ def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
     help="What varies: dt, mesh, integrator, tolerance, ksp_rtol (any PETSc option), any key of the scene; "
     "may be repeated, all combinations are run.",
 )
-@click.option("--reference", metavar="auto|exact:NAME|run:DIR", help="What errors are measured against.")
+@click.option("--reference", metavar="auto|exact:NAME|run:DIR", help="The reference for errors.")
 @click.option("--quantities", metavar="NAME,NAME,…", help="position, energy, probes, or a probe's name.")
 @click.option("--repeats", type=int, metavar="N", help="How often each combination is timed (3).")
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
 @out
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
-@click.option("--resume", is_flag=True, help="Go on without repeating finished combinations.")
+@click.option("--resume", is_flag=True, help="Continue without repeating finished combinations.")
 @click.option("--job", type=click.Path(path_type=Path), hidden=True)
 def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     """Error against run time: run, time and compare combinations of settings of SCENE."""
@@ -208,10 +208,10 @@ def fabric(comm: Any, /, **asked: Any) -> int:
 @trust_mesh
 @out
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
-@click.option("--resume", is_flag=True, help="Go on without repeating evaluations.")
+@click.option("--resume", is_flag=True, help="Continue without repeating evaluations.")
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks.")
 def fit(comm: Any, /, **asked: Any) -> int:
-    """Find numbers of SCENE from measurements, as its block fit says, with 95 % intervals."""
+    """Find parameters of SCENE from measurements, given by its block fit, with 95 % intervals."""
     from lyra_petsc.cli.fit import fit as fit_numbers
 
     return fit_numbers(comm, **asked)
@@ -219,7 +219,7 @@ def fit(comm: Any, /, **asked: Any) -> int:
 
 @verb("lyra-petsc info")
 def info(comm: Any) -> None:
-    """Print versions and what does not fit together."""
+    """Print versions, and parts that do not fit together."""
     from lyra_petsc.cli.info import info as describe
 
     text = describe(comm)

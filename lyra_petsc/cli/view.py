@@ -91,13 +91,13 @@ class Served:
 @verb("lyra-petsc view runs/flag")
 @results
 @click.option("--field", metavar="NAME", help="Colour by speed, strain, displacement or a written field.")
-@click.option("--range", metavar="LOW,HIGH", help="Of the colours: values, or percentiles as 2%,98%.")
+@click.option("--range", metavar="LOW,HIGH", help="Range of the colours: values, or percentiles as 2%,98%.")
 @click.option(
     "--set", "settings", multiple=True, metavar="render.KEY=VALUE", help="Change the camera; may be repeated."
 )
 @server_options
 def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser: bool, **look: Any) -> None:
-    """Play RUN, a folder of results, in the browser; follow it if it goes on."""
+    """Play RUN, a folder of results, in the browser, also while it is running."""
     problem: LyraError | None = None
     if comm.rank == 0:
         try:

@@ -31,50 +31,49 @@ OPTIONS = {
     "ts_time_step": "The same: its name from PETSc 3.25 on.",
     "ts_max_time": "End [s] instead of `time.end`.",
     "ts_max_steps": "Steps after which the run ends.",
-    "ts_adapt_dt_min": "Smallest Δt [s], of steps of automatic length and of repeated ones.",
-    "ts_adapt_dt_max": "Largest Δt [s] of steps of automatic length; static: largest increment.",
+    "ts_adapt_dt_min": "Smallest Δt [s] of adaptive and of repeated steps.",
+    "ts_adapt_dt_max": "Largest Δt [s] of adaptive steps; static: largest increment of the load factor.",
     "ts_alpha_radius": "Spectral radius of `alpha2` instead of `time.spectral_radius`.",
     "ts_type": "Integrator instead of `time.integrator`: `beuler`, `theta`, `bdf`, `alpha2`.",
     "ts_theta_theta": "With `-ts_type theta`: 0.5 is `midpoint`, 1 is `beuler`.",
     "ts_bdf_order": "With `-ts_type bdf`: 2.",
     "ts_adapt_type": "`none`: fixed steps; `basic`: steps by `time.tolerance` (1e-3).",
     "ts_theta_endpoint": "Refused: it has no meaning for the stage equations.",
-    "tao_type": "Of the search of `fit`: `brgn`, or `blmvm` and other methods by gradients.",
-    "tao_brgn_regularizer_weight": "With `brgn`: 0 unless the data leave a combination of numbers open.",
+    "tao_type": "Method of `fit`: `brgn` (default), or a gradient method such as `blmvm`.",
+    "tao_brgn_regularizer_weight": "With `brgn`: 0 if the data determine all parameters.",
     "vec_type": "Type of every vector.",
     "ts_init_time": "Refused: a run begins at 0.",
-    "snes_type": "`newtonls`, or `ksponly`: one linear solve a step.",
+    "snes_type": "`newtonls`, or `ksponly`: one linear solve per step.",
     "snes_max_it": "Newton iterations of a step instead of `solver.max_iterations`.",
-    "snes_rtol": "Relative residual at which a step stops, where given, before `solver` says so.",
-    "snes_atol": "Residual [N] at which a step stops, likewise; it fails above `solver.force_tolerance`.",
-    "snes_stol": "Relative increment at which a step stops, likewise.",
+    "snes_rtol": "Relative residual at which iterations stop before `solver` is satisfied; off by default.",
+    "snes_atol": "Residual [N] at which iterations stop; steps above `solver.force_tolerance` fail.",
+    "snes_stol": "Relative increment at which iterations stop, likewise.",
     "snes_convergence_test": "Refused: `solver` has the tolerances.",
-    "ksp_rtol": "Relative tolerance of linear solves; without it 1e-2, and down to 1e-6 where Newton is "
-    "slow; `semi-implicit`: 1e-6.",
+    "ksp_rtol": "Relative tolerance of linear solves; by default 1e-2, and down to 1e-6 if Newton's method "
+    "converges slowly; `semi-implicit`: 1e-6.",
     "ksp_max_it": "Iterations of a linear solve (5000).",
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
-    "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
-    "pc_python_type": "Class of `-pc_type python`; without it the program's own multigrid.",
-    "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on three are visited twice in a cycle "
-    "(1: the next coarser than the mesh; without it none).",
-    "pc_mg_vertex_sweeps": "Sweeps of multigrid (`-pc_type python`, `mg`) over the mesh's vertices before "
-    "and after the coarser levels, where edges carry unknowns (1 to 3, the stiffer bending is beside "
-    "inertia).",
-    "pc_mg_levels": "Most levels of multigrid (`-pc_type python`, `mg`), on coarse meshes of the program's.",
+    "pc_type": "Preconditioner, instead of the named linear solvers below; no other one replaces it.",
+    "pc_python_type": "Class of `-pc_type python`; by default the program's multigrid.",
+    "pc_mg_w_from": "First of three levels of multigrid that are visited twice in a cycle (1: the next "
+    "coarser than the mesh; default: none).",
+    "pc_mg_vertex_sweeps": "Sweeps of multigrid over the vertices before and after the coarser levels, if "
+    "edges have unknowns (by default 1 to 3, increasing with the ratio of bending stiffness to inertia).",
+    "pc_mg_levels": "Maximum number of levels of multigrid.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
-    "mat_type": "Type of the operator and of what the preconditioner is built from: `aij`, `baij`, `sbaij`. "
-    "By default the operator is block rows of the program's (`python`), the other as the preconditioner "
-    "needs.",
-    "loads_ksp_rtol": "Part of a force that may be left where equilibria solve with the skew stiffness of "
-    "pressures (1e-3), by the KSP with the prefix `-loads_`.",
+    "mat_type": "Type of the operator and of the preconditioner's matrix: `aij`, `baij`, `sbaij`. By default "
+    "the operator multiplies by the program's block rows (`python`), and the preconditioner determines the "
+    "type of its matrix.",
+    "loads_ksp_rtol": "Relative tolerance (1e-3) of the KSP with the prefix `-loads_`, which solves with the "
+    "skew stiffness of pressures in equilibria.",
     "mg_coarse_mat_type": "Type of the matrix of multigrid's coarsest level (`aij`).",
-    "snes_lag_preconditioner": "How many linear systems a preconditioner serves, where a step of "
-    "`semi-implicit` would decide by its iterations.",
+    "snes_lag_preconditioner": "Number of linear systems for which a preconditioner is used; by default "
+    "`semi-implicit` decides by the number of iterations.",
     "contact_monitor": "Print contacts, smallest gap, stiffest contact, step limit and friction at each "
     "Newton iterate.",
-    "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; without "
-    "any of these `average`; with `contact` bisection of space.",
+    "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, …, if PETSc has it, else "
+    "`average`; with `contact` by default bisection of space.",
 }
 """Descriptions of the options that the program reads, sets or refuses."""
 
@@ -228,15 +227,15 @@ def petsc_page() -> str:
         "# PETSc options",
         MADE,
         "Every option of PETSc's TS, SNES, KSP, PC, Mat and Vec has its usual name, without a prefix: "
-        "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones win in: the program's defaults, the scene's "
-        "`petsc:` block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc run SCENE -help` lists "
-        "all that PETSc has. Options that nothing used are named in a warning at the end.",
-        "The program itself has to do with these:",
+        "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones override earlier ones in: the program's "
+        "defaults, the scene's `petsc:` block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc "
+        "run SCENE -help` lists all options of PETSc. A warning at the end names unused options.",
+        "The program itself reads, sets or refuses these:",
         "\n".join(rows),
         "## Named linear solvers",
-        "Without `-pc_type` the program chooses among these, by size and by how many iterations are expected "
-        f"and seen; factorisations up to {DIRECT_UNTIL} vertices. When one breaks down, the next takes over "
-        "([how](../newton.md)).",
+        "Without `-pc_type` the program chooses one of these by the size of the mesh and the expected and "
+        f"observed numbers of iterations; factorisations up to {DIRECT_UNTIL} vertices. If one breaks "
+        "down, the next one replaces it ([details](../newton.md)).",
         "\n".join(presets),
     ]
     return "\n\n".join(parts) + "\n"
