@@ -35,7 +35,13 @@ from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times, refuse_contact
 from lyra_petsc.stepping.statics.equilibrium import Equilibrium
 from lyra_petsc.stepping.statics.stability import Stability
-from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.step_control import (
+    HALVINGS,
+    NEAR_MINIMUM,
+    LoadControl,
+    StepControl,
+    ToleranceControl,
+)
 from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
 
@@ -382,11 +388,13 @@ class SteppedScene:
         error = self.local_error.estimate(v_before, dt) / size
         share = (self.scene.time.tolerance or 0.0) * dt / control.end
         minimum = self._minimum_dt_in_contact()
-        accepted = control.accept(dt, error / share, self.problem.system.integrator.order, minimum)
+        system = self.problem.system
+        order, touches = system.integrator.order, system.has_active_pairs
+        accepted = control.accept(dt, error / share, order, minimum, touches=touches)
         if accepted:
             self.local_error.record_step(v_before, dt)
             self.estimated_error += error
-            if error > share:
+            if error > share and dt <= NEAR_MINIMUM * max(minimum, control.smallest):
                 where = "of those that follow impacts " if minimum > control.smallest else ""
                 self._note_once(
                     "error",

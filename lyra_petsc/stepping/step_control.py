@@ -22,6 +22,12 @@ SAFETY = 0.85
 SHRINK, GROW = 0.2, 2.0
 """Bounds of the ratio of successive Δt in adaptive steps; BDF2 is stable up to 2.4."""
 
+NEAR_MINIMUM = 1.05
+"""Δt over the smallest one up to which steps in contact are accepted whatever their error."""
+
+IN_VAIN = 2.0
+"""Error over the allowed one up to which a repeated step in contact is accepted if that has not fallen."""
+
 
 class StepControl:
     """Plans the end of each step from a nominal Δt, which is halved after a failure.
@@ -152,22 +158,36 @@ class ToleranceControl(StepControl):
     ) -> None:
         super().__init__(step, end, every, events, smallest)
         self.factor = min(1.0, first / step)
+        self._refused: float | None = None  # the error over the allowed one in the last attempt at this step
 
     def _partial_step(self, dt: float, remaining: float) -> float:
         # two equal steps rather than a full one and a tiny one
         return 0.5 * remaining if remaining < 2.0 * dt else dt
 
-    def accept(self, dt: float, ratio: float, order: int, minimum: float = 0.0) -> bool:
+    def accept(
+        self, dt: float, ratio: float, order: int, minimum: float = 0.0, *, touches: bool = False
+    ) -> bool:
         """Whether to accept a step of dt [s], ``ratio`` its error over the allowed one; plans the next.
 
         A step that cannot be shortened, or not below ``minimum`` [s], is accepted whatever its error.
+
+        While something ``touches``, the minimum follows the velocities, so that a step planned to be as short
+        may be a little longer. Impulses change velocities by amounts that do not depend on Δt; ``ratio`` then
+        is not lessened by a shorter step, and one repetition is enough. The error often grows faster there
+        than with Δt to the power ``order`` + 1, so after a repeated step the next is not longer: else every
+        other attempt would fail. (Hairer, Nørsett & Wanner, Solving ODEs I, sec. II.4.)
         """
         minimum = max(minimum, self.smallest)
         planned = self.factor * self.step
         allowed = math.inf if ratio == 0.0 else dt * SAFETY * ratio ** (-1.0 / order)
-        accepted = ratio <= 1.0 or dt <= minimum * (1.0 + SLACK)
+        accepted = ratio <= 1.0 or dt <= minimum * (NEAR_MINIMUM if touches else 1.0 + SLACK)
+        growth = GROW
+        if touches and self._refused is not None:
+            accepted = accepted or self._refused <= ratio <= IN_VAIN
+            growth = 1.0
+        self._refused = None if accepted else ratio
         # a step that was cut to end at an output time does not shorten the planned one
-        maximum = max(GROW * dt, planned) if accepted else 0.9 * dt
+        maximum = max(growth * dt, planned) if accepted else 0.9 * dt
         self.factor = max(min(max(allowed, SHRINK * dt), maximum, self.step), minimum) / self.step
         return accepted
 

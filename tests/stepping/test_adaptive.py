@@ -106,3 +106,28 @@ def test_no_tiny_step_remains_before_an_output_time() -> None:
     assert control.factor * control.step == pytest.approx(0.0075 * 0.85 / 0.9**0.5)
     assert control.accept(0.0001, 1e-6, 2)
     assert control.factor * control.step >= 0.0067
+
+
+def test_steps_in_contact_may_be_a_little_longer_than_the_shortest() -> None:
+    """The shortest one follows the velocities, and has changed since the step was planned."""
+    control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
+    assert control.accept(0.01, 5.0, 1, 0.0099, touches=True)
+    assert not control.accept(0.01, 5.0, 1, 0.0099)
+
+
+def test_steps_in_contact_are_not_shortened_in_vain() -> None:
+    control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
+    for touches, ratio, accepted in ((True, 1.5, True), (False, 1.5, False), (True, 2.5, False)):
+        assert not control.accept(0.01, 1.4, 2, touches=touches)
+        assert control.accept(0.007, ratio, 2, touches=touches) is accepted
+        assert control.accept(0.005, 0.5, 2, touches=touches)  # the next step is judged for itself
+
+
+def test_after_a_repeated_step_in_contact_the_next_is_not_longer() -> None:
+    for touches in (False, True):
+        control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
+        assert not control.accept(0.01, 3.0, 2, touches=touches)
+        assert control.accept(0.005, 0.01, 2, touches=touches)
+        assert control.next_end(0.0) == pytest.approx(0.005 if touches else 0.01)
+        assert control.accept(0.005, 0.01, 2, touches=touches)
+        assert control.next_end(0.0) == pytest.approx(0.01)

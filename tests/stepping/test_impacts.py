@@ -90,6 +90,27 @@ def test_impacts_do_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> Non
 
 
 @pytest.mark.parallel(1)
+def test_automatic_steps_at_their_minimum_are_not_repeated() -> None:
+    """The shortest step follows the largest velocity, which differs from that when the step was planned."""
+    turned = {"rotate": {"axis": [0, 1, 0], "degrees": 20}, "translate": [-0.15, -0.15, 0.108]}
+    content = {
+        "mesh": grid(0.3, 0.3, 8, 8, "alternating") | {"transform": turned},
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "initial": {"velocity": [0.0, 0.0, -1.4]},
+        "contact": {"gap": 0.003, "friction": 0.4},
+        "obstacles": {"floor": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}}},
+        "time": {"end": 0.8, "step": "auto", "tolerance": 1e-2, "integrator": "beuler"},
+    }
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(content))
+    while simulation.time < 0.008:
+        simulation.step()
+    steps, repeated = simulation.step_number, simulation.totals["rejected"]
+    simulation.destroy()
+    assert steps > 100
+    assert repeated < 0.2 * steps
+
+
+@pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
 def test_contacts_reached_after_the_stage_are_noticed_in_the_same_step(integrator: str) -> None:
     """In an adaptive step from outside the gap deep into it, not only in the next step."""
