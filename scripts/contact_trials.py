@@ -135,7 +135,7 @@ class Multipliers(ContactBarrier):
         distance, at, weight, _, beta, _, derivatives = super()._find_active(points)
         # pairs of vertices are kept; of other pairs each has its own multiplier
         vertices, pairs = ~self._alone[at], np.flatnonzero(self._alone & (distance < self.gap))
-        others = np.empty((len(pairs), 4)), np.zeros((len(pairs), 5)), np.empty(len(pairs))
+        others = np.empty((len(pairs), 4)), np.ones((len(pairs), 6)), np.empty(len(pairs))
         x, obstacle_x = np.split(points, [len(points) - self.obstacles.n_points])
         nearest(x, obstacle_x, self.kind, self.points, pairs, self.barrier.parallel, *others)
         at = np.concatenate([at[vertices], pairs])
@@ -189,7 +189,7 @@ elements = barrier.elements
 
 def make(given: Any, scene: Scene, mass: Array) -> Multipliers:
     """Create the term, for the registry."""
-    uv, marks = given.data["uv"].reshape(-1, 3, 2), given.data["marks"].reshape(-1, 4).astype(np.int64)
+    uv, marks = given.data["uv"].reshape(-1, 3, 2), given.data["marks"].reshape(-1, 5).astype(np.int64)
     return Multipliers(given.stencil.astype(np.int32), uv, marks)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -75,6 +75,32 @@ def obj_file(
     rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
     return {"file": str(path)}
+
+
+def mirrored(
+    path: Path, planes: str, n: int, height: Callable[[Array], Array], width: float = 1.0
+) -> tuple[dict[str, Any], Array]:
+    """A surface of this height [m] over x, y in [0, 1] times a width [m], with its images in the planes x = 0
+    and y = 0; its mesh block and vertices.
+    """
+    side = np.linspace(0.0, 1.0, n + 1)
+    flat = np.array([(x, y) for y in side for x in side])
+    first = [j * (n + 1) + i for j in range(n) for i in range(n)]
+    faces = np.array([t for a in first for t in ((a, a + 1, a + n + 2), (a, a + n + 2, a + n + 1))])
+    for axis in range(2):
+        if "xy"[axis] in planes:
+            image = flat * np.where(np.arange(2) == axis, -1.0, 1.0)
+            faces = np.concatenate([faces, faces[:, ::-1] + len(flat)])
+            flat, same = np.unique(np.round(np.concatenate([flat, image]), 12), axis=0, return_inverse=True)
+            faces = same.ravel()[faces]
+    vertices = np.column_stack([width * flat, height(flat)])
+    return obj_file(path, vertices, faces), vertices
+
+
+def symmetry_planes(axes: str) -> list[dict[str, Any]]:
+    """Handles for the planes x = 0 and y = 0 of a `mirrored` surface."""
+    boxes = {"x": [[0, -2, -1], [0, 2, 1]], "y": [[-2, 0, -1], [2, 0, 1]]}
+    return [{"box": boxes[axis], "symmetry": axis} for axis in axes]
 
 
 def equilateral(path: Path, radius: float = 1.0) -> dict[str, Any]:

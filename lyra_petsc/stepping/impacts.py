@@ -117,7 +117,9 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
     """Damp the rates at which distances in contact change; collective.
 
     A pair with the rate r gets the impulse −w r of a dashpot in Δt, which keeps second order, with
-    w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m). The mass m of `_inverse_masses` is such that no impulse is too large.
+    w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m). The mass m of `_inverse_masses` is such that no impulse is too large;
+    the masses of vertices are divided in proportion to b″, so that a pair that hardly touches takes no mass
+    from others, and two halves of a pair are damped as the whole.
     """
     layout, n, dt, damping = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
     all_pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
@@ -130,7 +132,7 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
         dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
     sheets = _corrects_sheets(system)
     both = list(zip(all_pairs, owned, strict=True))
-    inverse = _inverse_masses(system, [(*pairs[:2], own) for pairs, own in both])
+    inverse = _inverse_masses(system, [(*pairs[:2], pairs.stiffness, own) for pairs, own in both])
     work, impulse, pushes = 0.0, np.zeros_like(system.x), []
     for pairs, own in both:
         push = np.empty(len(own))
@@ -160,7 +162,7 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _corrects_sheets(system)
     corrections = term.friction_corrections(stage, x, system.v, frozen, before.damping, dt, sheets=sheets)
-    points, beta, direction, gradient, missing, obstacle, moved = corrections
+    points, beta, weight, direction, gradient, missing, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.exact_work:
         pairs, moments = term.moments(stage, frozen)
@@ -168,9 +170,9 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
         return before
     impulse = np.zeros_like(x)
     size = np.linalg.norm(gradient, axis=2)
-    inverse = _inverse_masses(system, [(points, size, missing != 0.0)])
+    inverse = _inverse_masses(system, [(points, size, weight, missing != 0.0)])
     speed = np.einsum("eik,eik->e", system.v[points], gradient) - np.einsum("ek,ek->e", moved, direction) / dt
-    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
+    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0) / weight
     stopping = np.divide(np.maximum(speed, 0.0), dt * largest, out=np.zeros_like(speed), where=largest > 0.0)
     push = -np.clip(missing, -stopping, stopping)
     force, impulses = push[:, None] * direction, (dt * push)[:, None, None] * gradient
@@ -194,19 +196,19 @@ def _corrects_sheets(system: StageEquations) -> bool:
 
 
 def _inverse_masses(
-    system: StageEquations, all_pairs: Iterable[tuple[Ints, Array, NDArray[np.bool_]]]
+    system: StageEquations, all_pairs: Iterable[tuple[Ints, Array, Array, NDArray[np.bool_]]]
 ) -> Array:
-    """1/m (n_local, 3) [1/kg] of the share of a vertex's mass that one pair may stop; collective.
+    """1/m (n_local, 3) [1/kg] of the share of a vertex's mass that a pair of weight 1 may stop; collective.
 
-    It is 0 for prescribed unknowns. ``all_pairs`` are points, β and masks of the pairs of this rank. With m_e
-    the least over the vertices i of a pair of mass over Σ_e |β_ei| Σ_j |β_ej|, summed over all pairs e, the
-    sum Σ_e w_e a_e a_eᵀ with w_e ≤ m_e does not exceed the mass matrix. All impulses together then reverse no
-    motion, however many pairs a vertex has.
+    It is 0 for prescribed unknowns. ``all_pairs`` are points, β, weights c and masks of the pairs of this
+    rank. With m_e = c_e times the least over the vertices i of a pair of mass over Σ_e c_e |β_ei| Σ_j |β_ej|,
+    summed over all pairs e, the sum Σ_e w_e a_e a_eᵀ with w_e ≤ m_e does not exceed the mass matrix. All
+    impulses together then reverse no motion, however many pairs a vertex has.
     """
     n, mass = system.points.n_owned, system.mass[:, None]
     shared, inverse = np.zeros((2, *system.x.shape))
-    for points, beta, own in all_pairs:
-        dashpots.share(points, beta, own, shared)
+    for points, beta, weight, own in all_pairs:
+        dashpots.share(points, beta, weight, own, shared)
     system.points.add_to_owners(shared)
     free = system.prescribed.free & (mass > 0.0)
     np.divide(shared[:n, :1], mass, out=inverse[:n], where=free)

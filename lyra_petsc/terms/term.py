@@ -201,7 +201,7 @@ class Dashpots(NamedTuple):
     points, beta, normal : (m, 4), (m, 4), (m, 3)
         As from `Elastic.contact_points`.
     stiffness : (m,)
-        Second derivative b″ of the energy with respect to the distance [N/m].
+        Second derivative b″ of the energy with respect to the distance [N/m], > 0.
     vertex, obstacle : (m,)
         Vertex of a sheet that is in contact, −1 for other kinds of pairs; number of the obstacle, −1 between
         sheets.
@@ -228,6 +228,8 @@ class FrictionCorrections(NamedTuple):
     ----------
     points, beta : (m, 4)
         As from `Elastic.contact_points`.
+    weight : (m,)
+        Normal forces [N] in the step's equations, > 0, in proportion to which masses are divided.
     direction : (m, 3)
         Unit vectors of the relative motion, tangential to the contact.
     gradient : (m, 4, 3)
@@ -243,6 +245,7 @@ class FrictionCorrections(NamedTuple):
 
     points: Ints
     beta: Array
+    weight: Array
     direction: Array
     gradient: Array
     force: Array

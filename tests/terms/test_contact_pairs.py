@@ -128,7 +128,7 @@ def found_active(*given: Any, counted: int, capacity: int | None = None) -> dict
     capacity = n if capacity is None else capacity
     least, found = np.empty(n), {"at": np.empty(capacity, dtype=np.int64), "weight": np.empty(capacity)}
     found |= {"counted": np.empty(capacity), "beta": np.empty((capacity, 4)), "energy": np.empty(capacity)}
-    found["derivatives"] = np.empty((capacity, 5))
+    found["derivatives"] = np.empty((capacity, 6))
     active = contact_pairs.find_active(*given, counted, least, tuple(found.values()))
     return dict(zip(found, unwritable(*(part[:active] for part in found.values())), strict=True))
 
@@ -499,14 +499,22 @@ def two_layers(noise: float) -> Pairs:
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 0.05])
 @pytest.mark.parametrize("parallel", [NOWHERE, 1e-3, 0.3])
+@pytest.mark.parametrize("alike", [True, False])
 def test_pairs_with_the_same_nearest_vertices_are_counted_once_with_a_weight(
-    noise: float, parallel: float
+    noise: float, parallel: float, alike: bool
 ) -> None:
+    """Also if edges have different gaps and stiffnesses."""
     pairs, gap = two_layers(noise), 0.8
     n = len(pairs)
+    edges = np.flatnonzero(pairs.kind == EDGE_EDGE)
+    gaps, stiffness = np.full(n, gap), np.full(n, STIFFNESS)
+    if not alike:
+        gaps[edges[::2]], stiffness[edges[::3]] = 0.7 * gap, 0.5 * STIFFNESS
 
-    def summed(of: Pairs, counted: int, shares: Array) -> tuple[dict[str, NDArray[Any]], list[Any]]:
-        barriers = np.full(len(of), gap), np.full(len(of), STIFFNESS)
+    def summed(
+        of: Pairs, counted: int, shares: Array, rows: slice = slice(None)
+    ) -> tuple[dict[str, NDArray[Any]], list[Any]]:
+        barriers = gaps[rows], stiffness[rows]
         constants = of.kind, of.points, of.offset, *barriers, parallel
         found = found_active(of.x, of.obstacle_x, *constants, shares, counted=counted)
         active = tuple(found[name] for name in ACTIVE_COLUMNS)
@@ -518,14 +526,17 @@ def test_pairs_with_the_same_nearest_vertices_are_counted_once_with_a_weight(
 
     none = np.zeros((n, 6))
     merged, total = summed(pairs, n // 2, none)
-    singles = [summed(pairs.part(slice(e, e + 1)), int(e < n // 2), none[:1]) for e in range(n)]
+    each = [slice(e, e + 1) for e in range(n)]
+    singles = [summed(pairs.part(row), int(row.start < n // 2), none[:1], row) for row in each]
     assert total[0] == pytest.approx(sum(of[0] for _, of in singles), rel=1e-12)
     for which in (1, 2):
         expected = np.sum([of[which] for _, of in singles], axis=0)
         np.testing.assert_allclose(total[which], expected, atol=1e-11 * np.abs(expected).max())
     for name in ("weight", "counted"):
-        assert merged[name].sum() == sum(found[name].sum() for found, _ in singles)
-    if noise < 0.01:
+        shares = stiffness[merged["at"]] * merged[name]
+        expected = sum(stiffness[e] * found[name].sum() for e, (found, _) in enumerate(singles))
+        assert shares.sum() == pytest.approx(expected)
+    if noise < 0.01 and alike:
         assert len(merged["at"]) < (0.7 if parallel == NOWHERE else 0.95) * merged["weight"].sum()
 
 

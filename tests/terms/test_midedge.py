@@ -20,10 +20,12 @@ from physics import (
     end_on_one_rank,
     gathered,
     grid,
+    mirrored,
     obj_file,
     reference,
     rotation,
     scene_of,
+    symmetry_planes,
 )
 
 from lyra_petsc.errors import InputError
@@ -795,21 +797,10 @@ def test_one_sheet_bends_by_one_model() -> None:
 # -- symmetry planes -----------------------------------------------------------------------------------
 
 
-def mirrored(path: Path, planes: str, n: int = 3) -> tuple[dict[str, Any], Array]:
-    """A shallow vault over x, y in [0, 1], with its images in the planes x = 0 and y = 0; its vertices."""
-    side = np.linspace(0.0, 1.0, n + 1)
-    flat = np.array([(x, y) for y in side for x in side])
-    first = [j * (n + 1) + i for j in range(n) for i in range(n)]
-    faces = np.array([t for a in first for t in ((a, a + 1, a + n + 2), (a, a + n + 2, a + n + 1))])
-    for axis in range(2):
-        if "xy"[axis] in planes:
-            image = flat * np.where(np.arange(2) == axis, -1.0, 1.0)
-            faces = np.concatenate([faces, faces[:, ::-1] + len(flat)])
-            flat, same = np.unique(np.round(np.concatenate([flat, image]), 12), axis=0, return_inverse=True)
-            faces = same.ravel()[faces]
-    height = 0.4 * (1.0 - flat[:, 0] ** 2) + 0.2 * (1.0 - flat[:, 1] ** 2)
-    vertices = np.column_stack([flat, height])
-    return obj_file(path, vertices, faces), vertices
+def vault_height(flat: Array) -> Array:
+    """Of a shallow vault."""
+    height: Array = 0.4 * (1.0 - flat[:, 0] ** 2) + 0.2 * (1.0 - flat[:, 1] ** 2)
+    return height
 
 
 def vault(mesh: dict[str, Any], handles: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
@@ -817,11 +808,6 @@ def vault(mesh: dict[str, Any], handles: list[dict[str, Any]], **more: Any) -> d
     static = {"time": {"analysis": "static", "step": 0.5}, "gravity": [0, 0, -9.81]}
     rim = {"box": [[0.999, -2, -1], [2, 2, 1]]}
     return {"mesh": mesh, "material": material, "handles": [rim, *handles], "solver": TIGHT} | static | more
-
-
-def planes(axes: str) -> list[dict[str, Any]]:
-    boxes = {"x": [[0, -2, -1], [0, 2, 1]], "y": [[-2, 0, -1], [2, 0, 1]]}
-    return [{"box": boxes[axis], "symmetry": axis} for axis in axes]
 
 
 @pytest.mark.parallel
@@ -833,11 +819,17 @@ def test_a_part_with_symmetry_planes_moves_as_the_whole(
     more: dict[str, Any] = {"time": {"end": 0.05, "step": 0.01, "integrator": "alpha2"}} if motion else {}
     other = [{"box": [[-2, -2, -1], [-0.999, 2, 1]]}]
     meshes = {name: (shared_tmp / f"part-{name}.obj", "xy".replace(name, "")) for name in ("xy", "x", "")}
-    made = {name: mirrored(path, images) for name, (path, images) in meshes.items()} if comm.rank == 0 else {}
+    made = (
+        {name: mirrored(path, images, 3, vault_height) for name, (path, images) in meshes.items()}
+        if comm.rank == 0
+        else {}
+    )
     made = comm.bcast(made)
     results = {}
     for name, (mesh, start) in made.items():
-        x, energies = outcome(comm, vault(mesh, planes(name) + ([] if "x" in name else other), **more))
+        x, energies = outcome(
+            comm, vault(mesh, symmetry_planes(name) + ([] if "x" in name else other), **more)
+        )
         part = np.flatnonzero((start[:, :2] >= 0.0).all(axis=1))
         part = part[np.lexsort(start[part, :2].T)]
         results[name] = x[part], energies * 2.0 ** len(name), np.abs(x - start).max()
@@ -849,10 +841,10 @@ def test_a_part_with_symmetry_planes_moves_as_the_whole(
 
 
 def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> None:
-    mesh, _ = mirrored(tmp_path / "vault.obj", "")
+    mesh, _ = mirrored(tmp_path / "vault.obj", "", 3, vault_height)
     for handle, material, words in (
         ({"box": [[-1, -1, -1], [0.5, 2, 1]], "symmetry": "x"}, {}, "beside the plane x = "),
-        (planes("x")[0], {"bending_model": "hinge"}, "is not kept by hinges"),
+        (symmetry_planes("x")[0], {"bending_model": "hinge"}, "is not kept by hinges"),
     ):
         content = vault(mesh, [handle])
         content["material"] = content["material"] | material

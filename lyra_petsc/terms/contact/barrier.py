@@ -24,7 +24,9 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near_pairs, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
+from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.contact import contact_pairs, surface_shares
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.contact.contact_search import SheetSearch, Simplices
@@ -155,8 +157,8 @@ class ActivePairs(NamedTuple):
 
     @property
     def stiffness(self) -> Array:
-        """b″ [N/m], (m,)."""
-        return self.derivatives[:, 4] * self.square
+        """b″ times the mollifier [N/m], (m,)."""
+        return self.derivatives[:, 5] * self.derivatives[:, 4] * self.square
 
     @property
     def forces(self) -> tuple[Ints, Array, Array, Array]:
@@ -165,7 +167,7 @@ class ActivePairs(NamedTuple):
 
 
 _EMPTY = np.empty(0)
-_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 5))
+_EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 6))
 NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
 
 
@@ -316,8 +318,9 @@ class ContactBarrier(Elastic):
         Triangles of this rank, in local rows.
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
-    marks : (F, 4)
-        Code of the triangles' surroundings (`surface_shares.rings`) and `area_factors` of their corners.
+    marks : (F, 5)
+        Code of the triangles' surroundings (`surface_shares.rings`), and of their corners the `area_factors`
+        and a code of their symmetry planes (`_plane_codes`).
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
@@ -333,6 +336,7 @@ class ContactBarrier(Elastic):
         self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
         self._searched: Ints | None = None  # triangles that the search has
         self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
+        self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
         self._remembered = Remembered(self._find_active)
 
     def set_up(
@@ -359,7 +363,7 @@ class ContactBarrier(Elastic):
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
-        self._stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
+        self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
         self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
@@ -412,7 +416,10 @@ class ContactBarrier(Elastic):
         if triangles is not self._searched:
             self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
             self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
-            self._vertex_units[triangles[:, :3]] = triangles[:, 4:]
+            self._vertex_units[triangles[:, :3]] = triangles[:, 4:7]
+            self._on_planes = np.zeros((len(x), 3), dtype=np.bool_)
+            codes = triangles[:, 7, None] >> np.arange(9)
+            self._on_planes[triangles[:, :3]] = (codes & 1).astype(np.bool_).reshape(-1, 3, 3)
             self._searched = triangles
         limit = np.inf
         if dx.any() and not self.static:
@@ -438,8 +445,19 @@ class ContactBarrier(Elastic):
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
         vertex = np.where((kind != EDGE_EDGE) & sheet[:, 0], points[:, 0], -1)
         units = self._vertex_units[vertex]
+        if self._on_planes.any():
+            edges = np.flatnonzero(kind == EDGE_EDGE)
+            units[edges] >>= self._symmetry_planes(x, points[edges])
         what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units])
         return np.where(sheet, points, first[:, None]), what
+
+    def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
+        """Number of symmetry planes in which all vertices of pairs of edges ``points`` (m, 4) lie, (m,)."""
+        at, sheet = np.maximum(points, 0), points >= 0
+        on_planes, place = self._on_planes[at] | ~sheet[:, :, None], x[np.where(sheet, at, at[:, :1])]
+        # no edge between two planes is shorter than the gap
+        in_one = np.ptp(place, axis=1) < 0.5 * self.barrier.gap
+        return (on_planes.all(axis=1) & in_one).sum(axis=1)
 
     def _within_radius(
         self, x: Array, dx: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints
@@ -557,7 +575,7 @@ class ContactBarrier(Elastic):
         while True:
             capacity = self._capacity
             integers = np.empty(capacity, dtype=np.int64), *np.empty((2, capacity))
-            found = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 5))
+            found = *integers, np.empty((capacity, 4)), np.empty(capacity), np.empty((capacity, 6))
             active = contact_pairs.find_active(x, obstacle_x, *data, lower_bound, found)
             if active <= capacity:
                 return lower_bound, *(part[:active] for part in found)
@@ -571,7 +589,7 @@ class ContactBarrier(Elastic):
     @property
     def _pair_data(self) -> tuple[Any, ...]:
         """Also their stiffness, and `Barrier.parallel`."""
-        return *self._geometry, self._stiffness, self.barrier.parallel
+        return *self._geometry, self.pair_stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: ObstaclePositions) -> Array:
         if not self.n_elements:
@@ -616,12 +634,12 @@ class ContactBarrier(Elastic):
         return float((active.owned_weight * active.stiffness).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        return HALFWAY_CURVATURE * self._stiffness * size
+        return HALFWAY_CURVATURE * self.pair_stiffness * size
 
     def stiffness(self, x: Array, frozen: ObstaclePositions) -> Array:
         active, out = self.active_pairs(x, frozen.stage), np.zeros(self.n_elements)
         stiffness = np.maximum(active.weight, active.owned_weight) * active.stiffness
-        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self._stiffness[active.pair])
+        out[active.pair] = np.maximum(stiffness, HALFWAY_CURVATURE * self.pair_stiffness[active.pair])
         return out
 
     def coordinate_scale(self, size: float) -> Array:
@@ -803,10 +821,10 @@ class ContactBarrier(Elastic):
     def dashpots(self, x: Array, frozen: ObstaclePositions) -> Dashpots:
         active = self.active_pairs(x, frozen.end)
         square = active.square
-        rows = np.flatnonzero((active.weight > 0.0) & (square > 0.0) & np.isfinite(active.derivatives[:, 4]))
-        pair, square, beta = active.pair[rows], square[rows], active.beta[rows]
-        normal = active.derivatives[rows, :3] / np.sqrt(square)[:, None]
-        stiffness = active.weight[rows] * active.derivatives[rows, 4] * square
+        stiffness = active.weight * active.stiffness
+        rows = np.flatnonzero((stiffness > 0.0) & (square > 0.0) & np.isfinite(stiffness))
+        pair, stiffness, beta = active.pair[rows], stiffness[rows], active.beta[rows]
+        normal = active.derivatives[rows, :3] / np.sqrt(square[rows])[:, None]
         points, obstacle = self.points[pair], self.obstacle[pair]
         moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
         pushed = np.einsum("ek,ek->e", moved, normal)
@@ -870,7 +888,8 @@ def _displacements(
 def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets (rank 0)."""
     triangles = rest.mesh.triangles.astype(np.int64)
-    marks = np.column_stack([surface_shares.rings(triangles), area_factors(triangles, rest.area)])
+    rings, areas = surface_shares.rings(triangles), area_factors(triangles, rest.area)
+    marks = np.column_stack([rings, areas, _plane_codes(rest)])
     uv = rest.mesh.triangle_uv.reshape(-1, 6)
     return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
 
@@ -888,6 +907,20 @@ def area_factors(triangles: Ints, area: Array) -> Ints:
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
     factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)
     return np.rint(AREA_UNITS * factor).astype(np.int64)
+
+
+def _plane_codes(rest: RestShape) -> Ints:
+    """For each triangle (F,) the bits 3 i + k: whether corner i lies in a symmetry plane normal to axis k.
+
+    Edges in a symmetry plane belong to both halves of the sheet, and so their energy counts by half.
+    """
+    on_planes = np.zeros((rest.mesh.n_vertices, 3), dtype=np.int64)
+    for number, handle in enumerate(rest.scene.handles):
+        if handle.symmetry is not None:
+            held = select_vertices(rest.mesh, handle, key=f"handles[{number}]", file=rest.scene.source)
+            on_planes[held, AXES.index(handle.symmetry)] = 1
+    codes: Ints = on_planes[rest.mesh.triangles].reshape(-1, 9) @ (1 << np.arange(9))
+    return codes
 
 
 def barrier(rest: RestShape) -> Barrier:
@@ -917,5 +950,5 @@ def barrier(rest: RestShape) -> Barrier:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must be called next."""
-    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 4)
+    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 5)
     return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))

@@ -447,6 +447,7 @@ def _write_row(  # type: ignore[no-untyped-def]
         for k in range(3):
             derivatives[n, k] = b0 * p[0, k] + b1 * p[1, k] + b2 * p[2, k] + b3 * p[3, k]
         derivatives[n, 3], derivatives[n, 4] = stiffness * slope / d, stiffness * second / (d * d)
+        derivatives[n, 5] = mollifier
     return n + 1
 
 
@@ -480,7 +481,7 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
     gap : (E,)
         Distance less offset [m] below which pairs repel each other.
     stiffness : (E,)
-        The barrier's k [N/m]; the same for all pairs of one vertex, and for all other pairs.
+        The barrier's k [N/m]; the same for all pairs of one vertex of a sheet and triangles.
     shares : (E, 6)
         For a triangle in front of a vertex of a sheet: weights of its sides (0 1), (1 2), (2 0) and of its
         corners. Pairs of one vertex that follow each other are treated together.
@@ -488,10 +489,10 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
         Number of the first pairs, which this rank counts.
     bound : (E,)
         Output: lower bound of the distance less offset [m]; exact where it is below the gap.
-    found : tuple of (capacity,), (capacity,), (capacity,), (capacity, 4), (capacity,), (capacity, 5)
+    found : tuple of (capacity,), (capacity,), (capacity,), (capacity, 4), (capacity,), (capacity, 6)
         Output: numbers of pairs (one may occur several times), weight, weight on this rank, β, energy [J] for
         a weight of 1, and derivatives: g [m], b′ / d [N/m] and b″ / d² [N/m³] without mollifier, d = |g| or
-        −|g|.
+        −|g|, and the mollifier.
 
     Returns
     -------
@@ -502,7 +503,8 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
     p, q, slope = np.empty((4, 3)), np.empty((4, 3)), np.zeros(12)
     n: Any = np.int64(0)  # the literal 0 has a type of its own, for which callees would be compiled again
     head, link = np.full(len(x), -1), np.full(0, -1)  # linked lists of rows, by a vertex
-    keys = np.empty((0, 3), dtype=np.int64)  # nearest vertex and ends of the edge, or twice a second vertex
+    # nearest vertex, ends of the edge or twice a second vertex, and the first pair with these
+    keys = np.empty((0, 4), dtype=np.int64)
     point_keys, point_pairs = np.empty(MAX_POINTS, np.int64), np.empty(MAX_POINTS, np.int64)
     nearest = point_keys, point_pairs, np.empty(MAX_POINTS), np.empty(MAX_POINTS), np.empty((MAX_POINTS, 3))
     n_points, vertex = n, -1
@@ -539,16 +541,22 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
                 lo, hi = hi, lo
             row = Index(max(v, hi) if v < 0 else v)
             other = head[row]
-            while other >= 0 and (keys[other, 0] != v or keys[other, 1] != lo or keys[other, 2] != hi):
+            while other >= 0 and not (
+                keys[other, 0] == v
+                and keys[other, 1] == lo
+                and keys[other, 2] == hi
+                and gap[keys[other, 3]] == gap[e]
+            ):
                 other = link[other]
             if other >= 0:
                 if other < len(pairs):
-                    weights[other] += 1.0
-                    owned_weights[other] += owned_weight
+                    share = stiffness[e] / stiffness[keys[other, 3]]
+                    weights[other] += share
+                    owned_weights[other] += share * owned_weight
                 continue
             if n >= len(keys):
                 keys, link = _enlarged(keys, link, n)
-            keys[n, 0], keys[n, 1], keys[n, 2] = v, lo, hi
+            keys[n, 0], keys[n, 1], keys[n, 2], keys[n, 3] = v, lo, hi, e
             link[n], head[row] = head[row], n
         d = -d if behind else d
         n = _write_row(
@@ -561,9 +569,10 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
 @kernel()
 def _enlarged(keys, link, n):  # type: ignore[no-untyped-def]
     """Copies with new_keys than n + 1 rows."""
-    new_keys, new_link = np.empty((2 * n + 64, 3), dtype=np.int64), np.full(2 * n + 64, -1)
+    new_keys, new_link = np.empty((2 * n + 64, 4), dtype=np.int64), np.full(2 * n + 64, -1)
     for row in range(len(link)):  # assignments of whole arrays take seconds to compile
-        new_keys[row, 0], new_keys[row, 1], new_keys[row, 2] = keys[row, 0], keys[row, 1], keys[row, 2]
+        for k in range(4):
+            new_keys[row, k] = keys[row, k]
         new_link[row] = link[row]
     return new_keys, new_link
 

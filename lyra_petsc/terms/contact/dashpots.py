@@ -1,6 +1,7 @@
 """Kernels for impulses between nearest points: mass shares, dashpots, and couples that conserve moments.
 
-Pairs are those from `term.Elastic.dashpots`; only those of this rank, ``mine``, are used.
+Pairs are those from `term.Elastic.dashpots`; only those of this rank, ``mine``, are used. The masses of
+vertices are divided between them in proportion to ``weight`` (m,).
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ def find_own(points, beta, vertex, number, n, mine):  # type: ignore[no-untyped-
 
 
 @kernel()
-def share(points, beta, mine, out):  # type: ignore[no-untyped-def]
-    """Add |β_ei| Σ_j |β_ej| of the pairs e to the first column of out (n_local, 3)."""
+def share(points, beta, weight, mine, out):  # type: ignore[no-untyped-def]
+    """Add weight_e |β_ei| Σ_j |β_ej| of the pairs e to the first column of out (n_local, 3)."""
     for e in range(len(points)):
         if mine[e]:
             total = 0.0
@@ -43,16 +44,17 @@ def share(points, beta, mine, out):  # type: ignore[no-untyped-def]
                 total += abs(beta[e, j]) if points[e, j] >= 0 else 0.0
             for i in range(4):
                 if points[e, i] >= 0:
-                    out[Index(points[e, i]), 0] += abs(beta[e, i]) * total
+                    out[Index(points[e, i]), 0] += weight[e] * abs(beta[e, i]) * total
 
 
 @kernel()
 def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping, push, out):  # type: ignore[no-untyped-def]
     """Add the impulses [N s] of dashpots in dt [s] to out (n_local, 3), and write the impulse of each to push
-    (m,).
+    (m,). The weights are the stiffnesses.
 
     v (n_local, 3) [m/s] are velocities, ``inverse`` (n_local, 3) [1/kg] is 1/m for the part of the mass that
-    a pair may move, ``damping`` the ratio to critical damping, ``pushed`` (m,) [m] the approach of obstacles.
+    a pair of weight 1 may move, ``damping`` the ratio to critical damping, ``pushed`` (m,) [m] the approach
+    of obstacles.
     """
     for e in range(len(points)):
         push[e] = 0.0
@@ -66,8 +68,8 @@ def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping,
                     inverse_mass = max(inverse_mass, inverse[row, k])
                     rate += beta[e, i] * v[row, k] * normal[e, k]
         if inverse_mass > 0.0:
-            q = 2.0 * damping * dt * math.sqrt(stiffness[e] * inverse_mass)
-            push[e] = math.expm1(-q) / inverse_mass * rate
+            q = 2.0 * damping * dt * math.sqrt(inverse_mass)
+            push[e] = math.expm1(-q) * stiffness[e] / inverse_mass * rate
             for i in range(4):
                 if points[e, i] >= 0:
                     for k in range(3):

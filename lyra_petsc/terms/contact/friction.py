@@ -28,7 +28,7 @@ from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms.contact import friction_pairs
 from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE
-from lyra_petsc.terms.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID
+from lyra_petsc.terms.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, UpcomingStep
 
@@ -67,10 +67,11 @@ class Pairs(NamedTuple):
     key : (E, 10)
         Numbers of four vertices, kind, obstacle, and numbers of the obstacle's points (0 for vertices): these
         identify a pair.
-    data : (E, 34)
+    data : (E, 35)
         The key without the vertices; elastic slip [m]; 1 if the pair slid in the last step; β (0 for points
         of obstacles), unit normal, Σ β_i x_i + Σ d_i (n · x_i) [m], contact point of an obstacle [m], normal
-        force [N], factor of friction (`FACTOR`), and d_i of all but the first vertex [m/m].
+        force [N], factor of friction (`FACTOR`), k of the barrier [N/m], and d_i of all but the first vertex
+        [m/m].
     stencil : (E, 4)
         Numbers of all vertices of the triangle, or of both edges.
     """
@@ -143,7 +144,6 @@ class CoulombFriction(Elastic):
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._sheet_friction]
         self._coefficients = np.array(each)
         self._obstacle_loads = np.zeros((len(contact.obstacles.each), 6))  # in the last step
-        self._contact_stiffness = HALFWAY_CURVATURE * contact.barrier.stiffness
 
     def set_elements(self, elements: Elements) -> None:
         super().set_elements(elements)
@@ -162,7 +162,8 @@ class CoulombFriction(Elastic):
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(data[:, SLID] > 0.5, kinetic, static) * self._force
             max_elastic_slip = MAX_ELASTIC_SLIP * self._contact.barrier.gap
-            stiffness = np.where(self._obstacle < 0, SHEET_SOFTNESS, 1.0) * self._contact_stiffness
+            softness = np.where(self._obstacle < 0, SHEET_SOFTNESS, 1.0)
+            stiffness = softness * HALFWAY_CURVATURE * data[:, STIFFNESS]
             self._stiffness = np.maximum(stiffness, self._limit / max_elastic_slip)
             self._weakens = weakens = kinetic < static
             self._stiffness[weakens] = static[weakens] * self._force[weakens] / max_elastic_slip
@@ -195,11 +196,12 @@ class CoulombFriction(Elastic):
         order = _order(key)
         key, previous, data = key[order], np.empty(len(pair), dtype=np.int64), np.empty((len(pair), COLUMNS))
         friction_pairs.match_pairs(key, old.key, old.data, previous)
-        contacts = pair[order], beta[order], normal[order], force[order]
+        pair = pair[order]
+        contacts = pair, beta[order], normal[order], force[order], contact.pair_stiffness[pair]
         friction_pairs.fill_columns(
             x, contact.stencil, contact.points, key, contacts, previous, old.data, data
         )
-        self._pairs, self.stale = Pairs(key, data, contact.number[pair[order]]), True
+        self._pairs, self.stale = Pairs(key, data, contact.number[pair]), True
 
     def initialise_pairs(self, x: Array, frozen: ObstacleMotion) -> None:
         self._update_pairs(x, frozen.end_points, self._pairs)
@@ -396,8 +398,8 @@ class CoulombFriction(Elastic):
         elastic_force = self._stiffness[sticking] * np.linalg.norm(slip[sticking], axis=1)
         available = (1.0 + OVERSHOOT) * self._limit[sticking] - elastic_force
         rows = np.concatenate([sliding, sticking])
-        arrays = self.stencil, self._beta, self._obstacle, self._gradients
-        points, beta, obstacle, gradients = (array[rows] for array in arrays)
+        arrays = self.stencil, self._beta, self._force, self._obstacle, self._gradients
+        points, beta, weight, obstacle, gradients = (array[rows] for array in arrays)
         moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
         tangential = np.einsum("ecik,eik->ec", gradients, v[points]) - self._tangential(moved / dt, rows)
         tangential[: len(sliding)] = self._tangential(slip[sliding], sliding)
@@ -406,7 +408,7 @@ class CoulombFriction(Elastic):
         direction = np.einsum("ec,eck->ek", unit, self._tangents[rows])
         gradient = np.einsum("ec,ecim->eim", unit, gradients)
         change = np.concatenate([missing, available])
-        return FrictionCorrections(points, beta, direction, gradient, change, obstacle, moved)
+        return FrictionCorrections(points, beta, weight, direction, gradient, change, obstacle, moved)
 
     def moments(self, x: Array, frozen: ObstacleMotion) -> tuple[Ints, Array]:
         rows = np.flatnonzero(self._obstacle[: self.n_owned] < 0)

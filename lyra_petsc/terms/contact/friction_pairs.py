@@ -39,18 +39,8 @@ from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, point
 from lyra_petsc.kernels.vectors import add_outers
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 
-SLIP, SLID, BETA, NORMAL, START, CONTACT, FORCE, FACTOR, ROTATION, COLUMNS = (
-    6,
-    9,
-    10,
-    14,
-    17,
-    20,
-    23,
-    24,
-    25,
-    34,
-)
+SLIP, SLID, BETA, NORMAL, START, CONTACT, FORCE, FACTOR, STIFFNESS = 6, 9, 10, 14, 17, 20, 23, 24, 25
+ROTATION, COLUMNS = 26, 35
 """First columns of the entries in a row of `friction.Pairs.data`, and the number of columns."""
 
 LEVER = 0.25
@@ -340,12 +330,13 @@ def write_keys(points, number, kind, obstacle, beta, at, out):  # type: ignore[n
 
 @kernel()
 def fill_columns(x, stencil, points, keys, contacts, previous, old, data):  # type: ignore[no-untyped-def]
-    """Write the data of pairs with keys (E, 10) at positions x to data (E, 34).
+    """Write the data of pairs with keys (E, 10) at positions x to data (E, 35).
 
-    ``contacts`` are their numbers among ``stencil`` and ``points``, β, unit normals and normal forces.
-    ``previous`` (E,) is the row of the same contact in ``old`` (M, 34), or −1.
+    ``contacts`` are their numbers among ``stencil`` and ``points``, β, unit normals, normal forces and k of
+    the barrier.
+    ``previous`` (E,) is the row of the same contact in ``old`` (M, 35), or −1.
     """
-    pairs, beta, normal, force = contacts
+    pairs, beta, normal, force, stiffness = contacts
     p, rotation = np.empty((4, 3)), np.empty((4, 3))
     for m in range(len(pairs)):
         e, side, normal_slip = pairs[m], 0.0, 0.0
@@ -383,11 +374,12 @@ def fill_columns(x, stencil, points, keys, contacts, previous, old, data):  # ty
         for k in range(3):
             data[m, SLIP + k] -= normal_slip * normal[m, k]
         data[m, SLID], data[m, FORCE] = old[previous[m], SLID] if previous[m] >= 0 else 0.0, force[m]
+        data[m, STIFFNESS] = stiffness[m]
 
 
 @kernel()
 def unpack(data, beta, tangents, gradients, constant, slip, contact):  # type: ignore[no-untyped-def]
-    """Unpack data (E, 34): β (E, 4), t (E, 2, 3), w (E, 2, 4, 3), constant (E, 2), ξ (E, 3) and the contact
+    """Unpack data (E, 35): β (E, 4), t (E, 2, 3), w (E, 2, 4, 3), constant (E, 2), ξ (E, 3) and the contact
     points of obstacles (E, 3).
     """
     for e in range(len(data)):
@@ -461,7 +453,7 @@ def match_pairs(keys, old, data, rows):  # type: ignore[no-untyped-def]
     """Find the row of old (M, 10) that each of keys (N, 10) continues, −1 for none; both are in ascending
     order.
 
-    Of several equally similar pairs the one with the longest elastic slip in data (M, 34) is chosen; of
+    Of several equally similar pairs the one with the longest elastic slip in data (M, 35) is chosen; of
     sliding pairs, which have equal elastic slip, the one with the largest normal force.
     """
     size = 1
