@@ -800,8 +800,8 @@ class Contact(Block):
     Attributes
     ----------
     gap : float [m] or None
-        Distance of surfaces below which contact forces act; by default the smaller of a quarter of the mean
-        edge and half of the shortest edge.
+        Distance of surfaces below which contact forces act; by default the least of a quarter of the mean
+        edge, half of the shortest edge, and 0.7 times the smallest height of a triangle.
     thickness : float [m]
         Distance of mid-surfaces at which surfaces touch.
     self : bool

@@ -37,6 +37,23 @@ def refusal(comm: MPI.Comm, scene: dict[str, Any]) -> str:
     return text
 
 
+@pytest.mark.parallel(1)
+def test_a_sheet_of_obtuse_triangles_does_not_repel_itself(tmp_path: Path) -> None:
+    """Their heights are 0.16 of the shortest edge; a gap given that is larger is told."""
+    vertices = [(i + 0.5 * (j % 2), 0.08 * j, 0.0) for j in range(3) for i in range(4)]
+    faces = [corners for a in (0, 1, 2) for corners in ((a, a + 1, a + 4), (a + 1, a + 5, a + 4))]
+    faces += [corners for a in (4, 5, 6) for corners in ((a, a + 1, a + 5), (a, a + 5, a + 4))]
+    mesh = obj_file(tmp_path / "obtuse.obj", vertices, faces)
+    for contact, gap in (({}, 0.7 * 0.08), ({"gap": 0.1}, 0.1)):
+        with Simulation({"mesh": mesh, "contact": contact}) as simulation:
+            term = simulation.problem.terms["contact"]
+            assert isinstance(term, ContactBarrier)
+            assert term.barrier.gap == pytest.approx(gap)
+            repels = gap > 0.08
+            assert (simulation.energy("contact") > 0.0) == repels
+            assert any("even at rest" in note for note in simulation.problem.whole.notes) == repels
+
+
 OVERLAPS: dict[str, tuple[dict[str, Any], str]] = {
     "sphere": (
         {"sphere": {"center": [0.4, 0.3, 0.05], "radius": 0.06}},

@@ -25,6 +25,7 @@ from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near_pairs, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.contact import contact_pairs, surface_shares
@@ -935,7 +936,8 @@ def barrier(rest: RestShape) -> Barrier:
     assert scene.contact is not None
     length, thickness = edge_lengths(rest.mesh), scene.contact.thickness
     shortest = float(length.min())
-    gap = scene.contact.gap or min(0.25 * float(length.mean()), 0.5 * shortest)
+    height = _least_height(rest, length) if scene.contact.self else np.inf
+    gap = scene.contact.gap or min(0.25 * float(length.mean()), 0.5 * shortest, 0.7 * height)
     if gap + thickness >= shortest:
         raise InputError(
             f"gap + thickness = {gap + thickness:.3g} m is not below the shortest edge, {shortest:.3g} m: "
@@ -943,9 +945,28 @@ def barrier(rest: RestShape) -> Barrier:
             file=scene.source,
             key="contact",
         )
+    if gap + thickness >= height:
+        rest.notes.append(
+            f"contact: gap + thickness = {gap + thickness:.3g} m is not below the smallest height of a "
+            f"triangle, {height:.3g} m: vertices repel the triangle behind their opposite edge even at rest; "
+            "give smaller ones, or a mesh with rounder triangles"
+        )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
     stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
     return Barrier(gap, thickness, stiffness, PARALLEL, float(length.max()) ** 2 / (8.0 * SAG * gap))
+
+
+def _least_height(rest: RestShape, length: Array) -> float:
+    """Least distance [m] of a vertex from the triangles behind the opposite side of one of its own, in the
+    flat rest shape; infinite if there are none. ``length`` (F, 3) [m] are the sides.
+    """
+    table = edge_table(rest.mesh.triangles.astype(np.int64))
+    at_side = np.empty(length.size, dtype=np.int64)
+    at_side[table.sides] = np.repeat(table.sizes, table.sizes)
+    square, height = length**2, 2.0 * rest.area[:, None] / length
+    others = np.abs(np.roll(square, 1, axis=1) - np.roll(square, -1, axis=1))
+    inner = (at_side.reshape(-1, 3) > 1) & (others <= square)  # the foot of the height is on the side
+    return float(height[inner].min(initial=np.inf))
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
