@@ -169,6 +169,32 @@ def test_sliding_off_an_obstacle_is_reported(tmp_path: Path) -> None:
     simulation.destroy()
 
 
+def test_without_friction_a_cloth_is_pulled_off_a_table(comm: MPI.Comm) -> None:
+    """It snaps over the edge, while forces grow and the energy falls, and hangs from its handle."""
+    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.0, {"step": 0.25})
+    scene["handles"] = [{"group": "right", "motion": "pull"}]
+    scene["motions"] = {"pull": [{"time": 0.0}, {"time": 1.0, "translate": [0.4, 0.0, 0.0]}]}
+    simulation, newton = SteppedScene(comm, scene_of(scene)), 0
+    while not simulation.finished:
+        newton += simulation.step().newton_iterations
+    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    simulation.destroy()
+    assert newton < 900
+    assert x[:, 0].min() > 0.9
+    assert x[:, 2].min() == pytest.approx(0.02 - 1.2, abs=0.1)
+
+
+@pytest.mark.parallel(1)
+def test_newton_increments_in_contact_are_limited(comm: MPI.Comm) -> None:
+    """A cloth of small triangles is laid on a table in few iterations: full increments lead it far off."""
+    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.3, {})
+    scene["mesh"]["grid"] |= {"nx": 24, "ny": 24}
+    simulation = SteppedScene(comm, scene_of(scene))
+    newton = simulation.step().newton_iterations
+    simulation.destroy()
+    assert newton < 100
+
+
 def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
     """A ball rises and turns in each load step against a sheet with held ends.
 

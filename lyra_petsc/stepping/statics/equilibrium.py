@@ -8,6 +8,10 @@ the shape (pressure, wind) are updated before every solve, under-relaxed; pressu
 with their own stiffness. Friction takes the normal forces of the solve before, and solves are repeated until
 these are close to the normal forces in the equilibrium.
 
+A snap takes many solves in which the out-of-balance force grows, while the potential energy falls. If a solve
+in contact runs out of iterations, the next one starts from its iterate of least energy. With friction neither
+counts: solves whose friction lags behind normal forces may let sheets slide off.
+
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
 
@@ -39,7 +43,10 @@ MAX_SOLVES = 100
 
 PATIENCE, PROGRESS = 15, 0.9
 """A load step is given up after so many proximal steps without progress, that is without a force below this
-fraction of the least one so far."""
+fraction of the least one so far, and without friction also without a fall of the potential energy."""
+
+MIN_FALL = 0.01
+"""Fall of the potential energy below its least value that counts as progress, over its range so far."""
 
 MAX_FAILURES = 8
 """Number of proximal steps after which a load step is given up if none has converged."""
@@ -205,10 +212,11 @@ class Equilibrium:
         system.applied.factor = factor
         newton = linear = solves = restarted_at = resumed = 0
         moving_energy, last, solved_once, leaping = 0.0, np.inf, False, not system.active.viscous
-        ceiling, contact = np.inf, system.discretisation.limits_motion
+        ceiling, contact, held = np.inf, system.discretisation.limits_motion, self._is_held()
         contacts = system.active.contact_state()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
         history: list[Iteration] = []
+        potentials: list[float] = []
         relaxation = Relaxation(system.points.comm)
         self._friction.begin_step()
         attempt = Attempt(False, 0, 0, 0.0)
@@ -218,6 +226,8 @@ class Equilibrium:
                 self._predict_by_tangent(before, factor)
                 moving_energy, frozen = system.moving_energy_before, system.active.frozen
             history.append(_history_entry(force, attempt if solves else None))
+            if solves and held and not system.has_friction_pairs:
+                potentials.append(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             if balanced and self._friction.is_settled():
                 self._friction.record_success(factor - before)
@@ -225,9 +235,10 @@ class Equilibrium:
                 self._in_vain, self._last_pseudo_dt, self._last_factor = 0, self._integrator.pseudo_dt, factor
                 linear += self._compute_tangent(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
-            last_progress = restarted_at + _last_progress([each.residual for each in history[restarted_at:]])
+            balancing = restarted_at + _last_progress([each.residual for each in history[restarted_at:]])
+            last_progress = max(balancing, _last_fall(potentials))
             message = self._failure_message(solves, last_progress, x, solved_once=solved_once)
-            diverging = force > WORSE * history[last_progress].residual
+            diverging = force > WORSE * history[balancing].residual
             if (
                 not message
                 and solved_once
@@ -276,14 +287,16 @@ class Equilibrium:
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
-                ceiling = self._integrator.pseudo_dt if contact else ceiling
+                if contact:
+                    ceiling = self._integrator.pseudo_dt
+                    self._resume_from_lowest(attempt)
                 self._integrator.pseudo_dt *= SHRINK
                 leaping = False
         slides = self._friction.record_failure(factor - before) if message and solved_once else ""
         if slides:
             message = f"{message}; {slides}"
         self._last_pseudo_dt = 0.0
-        self._in_vain += solves - last_progress if solved_once else 0
+        self._in_vain += solves - balancing if solved_once else 0
         stuck = attempt.failed_solve or self._failed_solve(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
@@ -361,6 +374,21 @@ class Equilibrium:
             system.applied.override = now + self._pressures.skew_force(loads, displacement)
         return iterations
 
+    def _is_held(self) -> bool:
+        """Whether handles hold vertices, and loads have a potential: it is then bounded below; collective."""
+        system = self._system
+        springs = any(not term.slips for term in system.active.constraints)
+        holds = springs or len(system.prescribed.indices) > 0
+        return not self._follows and any(system.points.global_max(float(holds)))
+
+    def _potential_energy(self, start: Array) -> float:
+        """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
+        system, frozen = self._system, self._system.active.frozen
+        terms = [term for term in system.active.elastic if not term.slips]
+        energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
+        energy -= float(np.vdot(system.applied.force, system.x[: len(start)] - start))
+        return float(system.points.global_sum(energy)[0])
+
     def _proximal_step(self, before: float, factor: float, limit: int | None) -> Attempt:
         """One proximal step; ``limit`` bounds Newton iterations, and then also displacements; collective."""
         snes, convergence = self._stepper.snes, self._stepper.convergence
@@ -375,12 +403,12 @@ class Equilibrium:
     def _resume_from_lowest(self, attempt: Attempt) -> bool:
         """Set the state to the iterate of least energy of a solve that ran out of iterations; collective.
 
-        Returns whether it did: the energy must have fallen. Not with contact, whose stencils may differ
-        there, nor with loads that follow the shape.
+        Returns whether it did: the energy must have fallen. Not with loads that follow the shape, nor with
+        friction, whose forces do not follow the normal forces in a solve: sheets might slide off.
         """
         system = self._system
         ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
-        if not ran_out or self._follows or system.discretisation.limits_motion:
+        if not ran_out or self._follows or system.has_friction_pairs:
             return False
         lowest = self._stepper.lowest_energy_positions()
         if lowest is None:
@@ -569,6 +597,16 @@ def _last_progress(forces: list[float]) -> int:
     for number, force in enumerate(forces):
         if force < PROGRESS * smallest:
             last, smallest = number, force
+    return last
+
+
+def _last_fall(energies: list[float]) -> int:
+    """Number of the last solve whose energy was notably less than after all before; 0 if there is none."""
+    last, least, highest = 0, np.inf, -np.inf
+    for number, energy in enumerate(energies, start=1):
+        highest = max(highest, energy)
+        if energy < least - MIN_FALL * (highest - least):
+            last, least = number, energy
     return last
 
 
