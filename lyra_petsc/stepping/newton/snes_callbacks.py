@@ -33,9 +33,9 @@ SMALL_GAP = 0.005
 With larger gaps it saved a tenth of the iterations and took twice the time."""
 
 MAX_INCREMENT = 1.0
-"""Largest displacement of a vertex, over the mean edge length, in a Newton iteration of an equilibrium with
-contact. Full steps of indefinite Hessians lead sheets that slide or fall far off, from where Newton's method
-takes many iterations back."""
+"""Largest displacement of a vertex, over the mean edge length, in a Newton iteration of an equilibrium while
+parts are near each other. Full steps of indefinite Hessians lead sheets that slide or fall far off, from where
+Newton's method takes many iterations back."""
 
 MAX_REMAINING = 0.5
 """A correction of a step is taken if it leaves less than this fraction of the residual."""
@@ -367,9 +367,9 @@ class Newton:
         return shortened or separated is not None or fraction < 1.0
 
     def _limit_displacement(self, y: PETSc.Vec) -> bool:
-        """Shorten a step y to `MAX_INCREMENT` in equilibria with contact; whether y changed."""
+        """Shorten a step y to `MAX_INCREMENT` in equilibria in contact; whether y changed."""
         system = self._system
-        if system.integrator.dynamic or not system.discretisation.limits_motion:
+        if system.integrator.dynamic or not system.discretisation.has_near_elements:
             return False
         vertices = self._array(y)[: system.points.n_vertices]
         (largest,) = system.points.global_max(float(np.abs(vertices).max(initial=0.0)))
