@@ -34,8 +34,8 @@ With larger gaps it saved a tenth of the iterations and took twice the time."""
 
 MAX_INCREMENT = 1.0
 """Largest displacement of a vertex, over the mean edge length, in a Newton iteration of an equilibrium while
-parts are near each other. Full steps of indefinite Hessians lead sheets that slide or fall far off, from where
-Newton's method takes many iterations back."""
+parts are near each other. Full steps of indefinite Hessians lead sheets that slide or fall far off, and
+Newton's method takes many iterations to return."""
 
 MAX_REMAINING = 0.5
 """A correction of a step is taken if it leaves less than this fraction of the residual."""
