@@ -169,8 +169,13 @@ def test_sliding_off_an_obstacle_is_reported(tmp_path: Path) -> None:
     simulation.destroy()
 
 
+@pytest.mark.parallel(1)
 def test_without_friction_a_cloth_is_pulled_off_a_table(comm: MPI.Comm) -> None:
-    """It snaps over the edge, while forces grow and the energy falls, and hangs from its handle."""
+    """It snaps over the edge, while forces grow and the energy falls, and hangs from its handle.
+
+    On one rank, as the number of iterations in a snap changes with rounding: on two ranks two runs took less
+    than 900 and 1,011.
+    """
     scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.0, {"step": 0.25})
     scene["handles"] = [{"group": "right", "motion": "pull"}]
     scene["motions"] = {"pull": [{"time": 0.0}, {"time": 1.0, "translate": [0.4, 0.0, 0.0]}]}
