@@ -134,10 +134,7 @@ def kernels(tree: ast.AST) -> list[ast.FunctionDef]:
         node
         for node in ast.walk(tree)
         if isinstance(node, ast.FunctionDef)
-        and any(
-            ast.unparse(one).partition("(")[0] in ("cached", "kernel", "leaf", "njit")
-            for one in node.decorator_list
-        )
+        and any(ast.unparse(one).partition("(")[0] in COMPILERS for one in node.decorator_list)
     ]
 
 
