@@ -7,8 +7,8 @@ Backward Euler satisfies an energy identity; with the masses M, the elastic ener
 
 The left side consists of energies and the right side of forces, so that forces which are not the gradient
 of their energy violate it, as does a step that was not solved. The integral is exact for the membrane (its
-energy is a quartic along a line). For hinges it is refined until it converges; where hinges jump, as their
-model does beyond 180°, it is replaced by the difference of their energies.
+energy is a quartic along a line). For hinges and contact its panels are halved where it has not converged;
+where hinges jump, as their model does beyond 180°, it is replaced by the difference of their energies.
 
 Every step leaves a residual r on the free coordinates. The solver promises ‖r‖ ≤ force tolerance × largest
 force, or the round-off floor; this is judged separately. Given r, the energy identity may be violated by
@@ -48,9 +48,9 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
 
-MAX_PANELS, CONTACT_PANELS = 16, (64, 1024)
-"""Most panels of the integral for hinges; fewest and most for contact, which has at least one per half gap.
-With fewer panels two values may agree by chance where a pair changes from one feature to another."""
+CONTACT_PANELS, HALVED_PANELS, MAX_PANELS = 16, 128, 1024
+"""Fewest panels of the integral for contact, which has at least one for each half gap, as a barrier is as
+wide as its gap; most panels that are halved where it has not converged; most at the start."""
 
 TURN_SAMPLES, LARGEST_TURN = 9, 1.0
 """Samples of a step, and the change of angle [rad] between two samples beyond which a hinge may have jumped.
@@ -94,47 +94,48 @@ def force_work(
     tolerance : float
         Error of the integral [J] that is accepted.
     """
+    from scipy.integrate import quad_vec
+
     membrane: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
     contact = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
     hinges = {term: frozen for term, frozen in terms.items() if term not in membrane and term not in contact}
 
-    def refined(part: Terms, panels: int, max_panels: int) -> float | None:
-        """The integral for some terms, starting with this many panels; None if it does not converge."""
-        before, fine = math.nan, panels >= max_panels
-        while not fine:
-            now = _integral(comm, part, n, x0, dx, panels, 5)
-            if abs(now - before) <= max(tolerance, EPSILON * abs(now)):
-                return now
-            before, fine, panels = now, panels >= max_panels, 2 * panels
-        return None
+    def power(part: Terms, s: float) -> float:
+        return float(comm.allreduce(float(np.vdot(gradient(part, x0 + s * dx)[:n], dx[:n]))))
 
-    value, by_energies = _integral(comm, membrane, n, x0, dx, 1, 2), False
+    def refined(part: Terms, panels: int) -> float | None:
+        """The integral for some terms, with panels halved where needed; None if it does not converge."""
+        if panels > MAX_PANELS:
+            return None
+        value, _, info = quad_vec(
+            lambda s: power(part, s),
+            0.0,
+            1.0,
+            points=np.linspace(0.0, 1.0, panels + 1)[1:-1],
+            quadrature="gk15",
+            epsabs=tolerance,
+            epsrel=EPSILON,
+            limit=panels + HALVED_PANELS,
+            full_output=True,
+        )
+        return float(value) if info.success else None
+
+    nodes, weights = np.polynomial.legendre.leggauss(2)  # type: ignore[no-untyped-call]
+    powers = [power(membrane, 0.5 * (1.0 + node)) for node in nodes]
+    value, by_energies = 0.5 * float(np.dot(weights, powers)), False
     turn = math.inf if start_frames else _largest_turn(hinges, x0, dx)
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
-    # a barrier is as wide as its gap; second derivatives jump where the nearest feature changes
     largest_dx, skin = largest(comm, dx[:n]), min((term.skin for term in contact), default=0.0)
-    panels, max_contact = CONTACT_PANELS
-    panels = max(panels, math.ceil(largest_dx / skin)) if skin > 0.0 else panels
-    for part, refine, first, last in ((hinges, smooth, 1, MAX_PANELS), (contact, True, panels, max_contact)):
+    panels = max(CONTACT_PANELS, math.ceil(largest_dx / skin) if skin > 0.0 else 0)
+    for part, refine, first in ((hinges, smooth, 1), (contact, True, panels)):
         if part:
-            integral = refined(part, first, last) if refine else None
+            integral = refined(part, first) if refine else None
             if integral is None:
                 at_start = {term: start_frames.get(term, frozen) for term, frozen in part.items()}
                 change = energy(part, x0 + dx) - energy(at_start, x0)
                 integral, by_energies = float(comm.allreduce(change)), True
             value += integral
     return value, by_energies
-
-
-def _integral(comm: MPI.Comm, terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
-    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J] by Gauss's rule on equal panels; collective."""
-    nodes, weights = np.polynomial.legendre.leggauss(points)  # type: ignore[no-untyped-call]
-    value = 0.0
-    for panel in range(panels if terms else 0):
-        for node, weight in zip(nodes, weights, strict=True):
-            s = (panel + 0.5 * (1.0 + node)) / panels
-            value += 0.5 * weight * float(np.vdot(gradient(terms, x0 + s * dx)[:n], dx[:n]))
-    return float(comm.allreduce(value / panels))
 
 
 def _largest_turn(terms: Terms, x0: Array, dx: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.experiments.stress.cases import selected
-from lyra_petsc.experiments.stress.step_balance import RunRecord
+from lyra_petsc.experiments.stress.step_balance import RunRecord, force_work
 from lyra_petsc.experiments.stress.stress_runner import StressOutcome, run_case
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
@@ -91,6 +92,32 @@ def test_a_balance_does_not_miss_a_narrow_barrier(comm: MPI.Comm) -> None:
     outcome = run_case(comm, replace(case, steps=9), Setting(hanging_sheet(10), False, Scope.QUICK))
     assert any(balance.jumped for balance in outcome.record.balances)
     assert outcome.failures == {}
+
+
+class Stops:
+    """Springs that act beyond points (m,) on the x axis: their second derivatives jump, as where the nearest
+    feature of a pair in contact changes."""
+
+    registration, skin = SimpleNamespace(neighbours=True), 0.01
+
+    def __init__(self, at: Array) -> None:
+        self.at = at
+
+    def energies(self, x: Array, frozen: None) -> Array:
+        return 0.5 * np.maximum(x[:, :1] - self.at, 0.0).ravel() ** 2
+
+    def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
+        out[:, 0] += np.maximum(x[:, :1] - self.at, 0.0).sum(axis=1)
+
+
+def test_the_work_of_forces_with_kinks_is_integrated_to_its_tolerance() -> None:
+    """Two numbers of equal panels may agree by chance."""
+    x0, dx, tolerance = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), 1e-8
+    for seed in range(60):
+        stops = Stops(np.random.default_rng(seed).random(5))
+        terms: dict[Any, Any] = {stops: None}
+        work, _ = force_work(MPI.COMM_SELF, 1, terms, {}, x0, dx, tolerance)
+        assert abs(work - stops.energies(x0 + dx, None).sum()) < tolerance
 
 
 @pytest.mark.parallel(2)
