@@ -553,7 +553,15 @@ class StageEquations:
     def largest_step(self, v: Array, increment: Array) -> float:
         """Largest fraction of an increment (n_owned, 3) [m/s] from v that all terms allow; collective."""
         turn = 0.0 if self.integrator.dynamic else self.largest_turn(increment * self.stage.c)
-        maximum, done = (MAX_TURN / turn if turn > MAX_TURN else 1.0), 0.0
+        return self._free_fraction(v, increment, MAX_TURN / turn if turn > MAX_TURN else 1.0)
+
+    def moves_freely(self, v: Array, increment: Array) -> bool:
+        """Whether no collision limits an increment (n_owned, 3) [m/s] from v; collective."""
+        return not self.active.limiting or self._free_fraction(v, increment, 1.0) == 1.0
+
+    def _free_fraction(self, v: Array, increment: Array, maximum: float) -> float:
+        """Largest fraction, at most ``maximum``, of an increment from v without a collision; collective."""
+        done = 0.0
         for _ in range(MAX_SEARCHES):
             start, rest = v, increment
             if done > 0.0 or maximum < 1.0:

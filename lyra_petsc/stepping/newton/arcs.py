@@ -54,14 +54,12 @@ class Arcs:
     Parameters
     ----------
     system : StageEquations
-        System of a scene with directors on edges and without changing stencils.
+        System of a scene with directors on edges.
     """
 
     def __init__(self, system: StageEquations) -> None:
-        self._system, layout = system, system.points
+        self._system = system
         self._term = next(term for term in system.active.elastic if isinstance(term, Membrane))
-        name, stencil = self._term.name, self._term.stencil
-        self._pattern = BlockPattern({name: stencil}, layout.n_owned, layout.n_local)
         data = self._term.elements.data
         one, two = data["inverse"][:, 0], data["inverse"][:, 1]
         self._area, self._slopes = data["area"], np.stack([-one - two, one, two], axis=1)
@@ -132,7 +130,9 @@ class Arcs:
 
     def _factor(self) -> None:
         self.destroy()
-        layout, rows, mask = self._system.points, BlockRows(self._pattern), self._system.prescribed.mask
+        layout, mask, name = self._system.points, self._system.prescribed.mask, self._term.name
+        pattern = BlockPattern({name: self._term.stencil}, layout.n_owned, layout.n_local)
+        rows = BlockRows(pattern)
         self._held = mask.copy()
         size = np.einsum("eck,eck->e", self._slopes, self._slopes)
         (largest,) = layout.global_max(float((self._area * size).max(initial=0.0)))
@@ -141,9 +141,9 @@ class Arcs:
         rows.set_diagonal(diagonal, values)
         couplings = np.einsum("eak,ebk->eab", self._slopes, self._slopes)
         blocks = couplings[:, :, :, None, None] * np.eye(3)
-        add_elements(self._area, blocks, self._pattern.offsets[self._term.name], values)
+        add_elements(self._area, blocks, pattern.offsets[name], values)
         rows.constrain(values, mask, rows.constrained_entries(mask))
-        self._matrix = AssembledMatrix(layout, self._pattern, "aij", prefix=PREFIX)
+        self._matrix = AssembledMatrix(layout, pattern, "aij", prefix=PREFIX)
         self._matrix.set(values)
         self._ksp = self._matrix.cholesky()
         self._ksp.setUp()

@@ -2,7 +2,8 @@
 
 The velocities of the last step are right for smooth motions, as users of second-order integrators expect. In
 stiff sheets that crumple they stretch the sheet by far more than the step will. The guess with the lower
-objective is then taken. An equilibrium starts from the extrapolation of earlier ones.
+objective is then taken. An equilibrium starts from the extrapolation of earlier ones, unless parts are near
+each other.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     """
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
-        out[:], predicted = 0.0, None
-        if isinstance(integrator, Static) and not system.discretisation.limits_motion:
-            predicted = integrator.predicted
-            if predicted is not None:
-                out[:] = predicted / integrator.pseudo_dt
-                system.linearise_at_state()
-        system.prescribe(out)
-        return predicted is not None
+        out[:] = system.start_velocity()
+        predicted = integrator.predicted if isinstance(integrator, Static) else None
+        if predicted is None or system.discretisation.has_near_elements:
+            return False
+        guess = predicted * system.stage.sigma
+        system.prescribe(guess)
+        if not system.moves_freely(out, guess - out):
+            return False
+        out[:] = guess
+        system.linearise_at_state()
+        return True
     moving = system.v[:n].copy()
     system.prescribe(moving)
     if integrator.order > 1 and not system.discretisation.limits_motion:

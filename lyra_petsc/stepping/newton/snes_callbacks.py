@@ -113,10 +113,9 @@ class Newton:
         self._last_iterate: PETSc.Vec | None = None
         self._last_c = 0.0
         self._convex_at_start = False
-        static = not (system.integrator.dynamic or system.discretisation.limits_motion)
-        self._corrects = static and linear.factors and bool(system.active.with_edges)
+        self._bends = not system.integrator.dynamic and linear.factors and bool(system.active.with_edges)
         self._arcs: Arcs | None = None
-        if self._corrects:
+        if self._bends:
             from lyra_petsc.stepping.newton.arcs import Arcs, can_factor  # needed in equilibria only
 
             self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
@@ -137,6 +136,11 @@ class Newton:
         self.convergence.begin_solve()
         self.globalisation.begin_solve()
         self.forcing.begin_solve(near=self._system.discretisation.has_near_elements, collides=collides)
+
+    @property
+    def _corrects(self) -> bool:
+        """Whether steps follow arcs and are corrected: in equilibria of shells, while no parts are near."""
+        return self._bends and not self._system.discretisation.has_near_elements
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
@@ -191,13 +195,13 @@ class Newton:
         if self._contact is not None and not failed:
             changed |= self._apply_contact_model(x, residual, y)
         full = self.globalisation.takes_full_steps
-        curved = self._arcs is not None and full and self._apply_arcs(x, residual, y)
+        curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
         if self._system.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
         if self._system.limits_steps and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
-        if self._corrects and full:
+        if full and self._corrects:
             exact = self._linear.uses_operator and self._blend.value == 0.0
             changed |= self._apply_corrections(x, y, exact=exact)
         if self._last_iterate is not None:
@@ -255,8 +259,10 @@ class Newton:
             self.extra_iterations += self._ksp.getIterationNumber()
             if exact:
                 _apply_broyden(correction, steps)
-            before = size
-            size, force = self._residual(v - self._array(y) - self._array(correction))
+            before, increment = size, -self._array(y) - self._array(correction)
+            if not self._system.moves_freely(v, increment):
+                break
+            size, force = self._residual(v + increment)
             if not size < MAX_REMAINING * before:
                 break
             corrected = True
@@ -286,17 +292,19 @@ class Newton:
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
-        lowest = np.inf
+        lowest, start = np.inf, self._system.start_velocity()
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
             self._system.prescribe(end)
+            if not self._system.moves_freely(start, end - start):
+                continue
             energy = self._system.objective(end)[0] if others else 0.0
             if energy < lowest:
                 lowest, guess[:] = energy, end
 
     def tangent(self, force: Array) -> tuple[Array | None, int]:
         """See `Stepper.tangent`."""
-        if self._arcs is None or self._last_c == 0.0:
+        if self._arcs is None or not self._corrects or self._last_c == 0.0:
             return None, 0
         b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
         b.setArray(force.ravel())
@@ -307,7 +315,10 @@ class Newton:
         return displacement, int(self._ksp.getIterationNumber())
 
     def _apply_arcs(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Replace a step y that is taken in full by one along arcs if it descends; whether y changed."""
+        """Replace a step y that is taken in full by one along arcs if it descends and hits nothing.
+
+        Returns whether y changed.
+        """
         assert self._arcs is not None
         v = self._array(x)
         if not self._arcs.turns_notably(-self._array(y)):
@@ -315,7 +326,7 @@ class Newton:
         before = y.copy()
         curved, increment = self._arcs.curve(v, -self._array(y))
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0)
+        descends = bool(residual.dot(y) > 0.0) and self._system.moves_freely(v, curved)
         if descends:
             self._system.linearise_to(v + increment)
             self.step_fraction = 1.0

@@ -226,7 +226,7 @@ class Equilibrium:
                 self._predict_by_tangent(before, factor)
                 moving_energy, frozen = system.moving_energy_before, system.active.frozen
             history.append(_history_entry(force, attempt if solves else None))
-            if solves and held and not system.has_friction_pairs:
+            if solves and contact and held and not system.has_friction_pairs:
                 potentials.append(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             if balanced and self._friction.is_settled():
@@ -330,8 +330,8 @@ class Equilibrium:
         moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
         (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
         rate = self._load_rate
-        if largest > 0.0 and system.discretisation.limits_motion:
-            self._tangent = None  # with contact the first guess is another
+        if system.discretisation.has_near_elements:
+            self._tangent = None  # the first guess is another
             return 0
         if largest > 0.0:
             x, part = system.x.copy(), HANDLE_STEP * self._spacing / largest
