@@ -11,7 +11,7 @@ has all blocks. Code that keeps arrays of n_local rows or of n_blocks blocks mus
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,23 +32,29 @@ SORT_COLUMNS = 6
 FRACTIONS = *(0.25**k for k in range(12)), 0.0
 """Fractions of a displacement that are tried in turn, until a search along it finds few enough elements."""
 
+MAX_STEPS = 4
+"""Largest number of steps along which a search looks while nothing is near."""
+
 MAX_UNUSED = 0.1
 """Largest number of unused blocks that a pattern keeps, relative to the blocks of fixed stencils."""
 
 
 @cached(inline="always")
-def _is_beyond(x, origin, i, square):  # type: ignore[no-untyped-def]
-    """1 if the distance of point i to its origin, squared, exceeds ``square`` [m²] or is NaN; else 0."""
+def _is_beyond(x, origin, path, at, i, square):  # type: ignore[no-untyped-def]
+    """1 if the distance of point i to its place on the path, squared, exceeds ``square`` [m²] or is NaN; else
+    0.
+    """
     a, b, c = x[i, 0] - origin[i, 0], x[i, 1] - origin[i, 1], x[i, 2] - origin[i, 2]
+    a, b, c = a - at * path[i, 0], b - at * path[i, 1], c - at * path[i, 2]
     return 0 if a * a + b * b + c * c <= square else 1
 
 
 @cached()
-def _any_beyond(x, origin, radius):  # type: ignore[no-untyped-def]
-    """Whether any point x (n, 3) is farther than ``radius`` from its origin."""
+def _any_beyond(x, origin, path, at, radius):  # type: ignore[no-untyped-def]
+    """Whether any point x (n, 3) is farther than ``radius`` from origin + at · path."""
     square, far = radius * radius, 0
     for row in range(len(x)):  # no early exit, so that the loop is vectorised
-        far |= _is_beyond(x, origin, Index(row), square)
+        far |= _is_beyond(x, origin, path, at, Index(row), square)
     return far != 0
 
 
@@ -112,9 +118,12 @@ class Discretisation:
         self._rows_layout = layout  # for which ``rows`` were made
         self._located: set[str] = set()  # terms whose present stencils have offsets in the pattern
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
-        self._references: list[Array] = []  # positions [m] along the path of the last search
-        self._current = 0  # index of the reference that points were last near
-        self._radius = 0.0  # distance [m] from a reference up to which the search is valid
+        # of the last search: positions and displacements (n, 3) [m], and over all ranks the products of both,
+        # and of the displacements [m²]
+        self._path: tuple[Array, Array] | None = None
+        self._begin = self._square = 0.0
+        self._steps = 1  # steps that were expected to lead along the path
+        self._radius = 0.0  # distance [m] from the path up to which the search is valid
         self._fraction = 1.0  # of the expected displacement that was searched
         self._triangles: dict[Elastic, Ints] = {}  # all triangles, on a single rank
         self._global_elements: dict[Elastic, tuple[Ints, Ints | Array]] = {}
@@ -125,27 +134,34 @@ class Discretisation:
         """Whether any stencils depend on the positions."""
         return bool(self._changing)
 
-    def update_stencils(self, x: Array, expected: Array | None = None, stops: Sequence[float] = ()) -> bool:
+    def update_stencils(
+        self, x: Array, expected: Array | None = None, ahead: Callable[[int], Array] | None = None
+    ) -> bool:
         """Update the stencils for positions x (n_local, 3) [m]; returns whether ghosts changed; collective.
 
-        ``expected`` (n_local, 3) [m] is the displacement expected from x. If it is that of a step, ``stops``
-        are the fractions of it at which stencils will be needed.
+        ``expected`` (n_local, 3) [m] is the displacement expected from x. If it is that of a step, ``ahead``
+        returns that of several steps: a search looks along these while nothing is near.
         """
         if not self._changing:
             return False
         here = x[: self.layout.n_vertices]
         to = here if expected is None else here + expected[: len(here)]
-        asked = self._terms_to_update(here, to)
+        asked = self._terms_to_update(here) if to is here else self._terms_to_update(here, to)
         if not asked:
             return False
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
-            displacement = np.zeros_like(x) if expected is None else expected
-            part = self._search(x, displacement)
-            parts = stops if stops and part == 1.0 else (part,)
-            self._references = [here + part * displacement[: len(here)] for part in (0.0, *parts)]
-            self._current = 0
             self._radius = 0.5 * min(term.skin for term in self._searching)
+            displacement, steps = np.zeros_like(x) if expected is None else expected, 1
+            if ahead is not None and self._path is not None and not self.has_near_elements:
+                # one more than the last search was valid for
+                next_steps = min(round(self._steps * self._places(here)[0]) + 1, MAX_STEPS)
+                farther = ahead(next_steps)
+                self._set_path(here, farther)
+                if not any(self.layout.global_max(not self._are_near_path(self._radius, to))):
+                    displacement, steps = farther, next_steps
+            part, self._steps = self._search(x, displacement), steps
+            self._set_path(here, part * displacement)
         for term in asked:
             if term.search_distance == 0.0:
                 self._global_elements[term] = self._exchange_elements(*term.current_elements())
@@ -172,16 +188,17 @@ class Discretisation:
             term.set_elements(elements)
         return others
 
-    def _terms_to_update(self, here: Array, to: Array) -> list[Elastic]:
-        """Terms whose elements may change between two positions of the owned vertices; collective.
+    def _terms_to_update(self, *positions: Array) -> list[Elastic]:
+        """Terms whose elements may change at any of these positions (n, 3) of the owned vertices; collective.
 
         If one term must search, all terms that search are returned, before the others.
         """
-        stale = self.layout.global_max(*(term.stale for term in self._changing))
-        leaves = not all(self._is_covered(at, self._radius) for at in ([here] if to is here else [to, here]))
+        leaves, *stale = self.layout.global_max(
+            not self._are_near_path(self._radius, *positions), *(term.stale for term in self._changing)
+        )
         if self._global_elements and not leaves and not any(stale):
             return []
-        searches = leaves and bool(self._searching)
+        searches = bool(leaves and self._searching)
         new = [term for term, is_stale in zip(self._changing, stale, strict=True) if is_stale]
         if not self._global_elements:
             searches, new = True, self._changing
@@ -195,32 +212,50 @@ class Discretisation:
 
     def searched_fraction(self, x: Array, displacement: Array) -> float:
         """Fraction ≤ 1 of a displacement (n_owned, 3) [m] from x that the last search covers; collective."""
-        if not self.limits_motion or not self._references:
+        if not self.limits_motion or self._path is None:
             return 1.0
         n = self.layout.n_vertices
         radius = 0.5 * min(term.approach_limit for term in self._searching)
         x, displacement = x[:n], displacement[:n]
-        if self._is_covered(x, radius):
-            for part in (1.0, self._fraction) if 0.0 < self._fraction < 1.0 else (1.0,):
-                if self._is_covered(x + part * displacement, radius):
-                    return part
-        # points near several references may move farther from one of them than from another
-        beyond = self.layout.global_max(*(_any_beyond(x, origin, radius) for origin in self._references))
+        for part in (1.0, self._fraction) if 0.0 < self._fraction < 1.0 else (1.0,):
+            near = self._are_near_path(radius, x, x + part * displacement)
+            if not any(self.layout.global_max(not near)):
+                return part
+        # points beside the path may move farther from one of its places than from another
+        places, (origin, path) = (0.0, *self._places(x), 1.0), self._path
+        beyond = self.layout.global_max(*(_any_beyond(x, origin, path, at, radius) for at in places))
         fractions = [
-            0.0 if far else _fraction_within(x, displacement, origin, radius)
-            for far, origin in zip(beyond, self._references, strict=True)
+            0.0 if far else _fraction_within(x, displacement, origin + at * path, radius)
+            for far, at in zip(beyond, places, strict=True)
         ]
         return -min(self.layout.global_max(*(-fraction for fraction in fractions)))
 
-    def _is_covered(self, x: Array, radius: float) -> bool:
-        """Whether all owned vertices x (n, 3) are within ``radius`` [m] of the same reference; collective."""
-        if not self._references:
+    def _set_path(self, here: Array, displacement: Array) -> None:
+        """Set the path of the owned vertices, from positions ``here`` (n, 3) [m]; collective."""
+        path = displacement[: len(here)]
+        self._path = here.copy(), path
+        products = float(np.vdot(here, path)), float(np.vdot(path, path))
+        self._begin, self._square = self.layout.global_sum(*products).tolist()
+
+    def _places(self, *positions: Array) -> list[float]:
+        """Fraction of the path of the last search to which the owned vertices are nearest, at each of several
+        positions (n, 3); collective.
+        """
+        assert self._path is not None
+        if not self._square > 0.0:
+            return [0.0] * len(positions)
+        along = self.layout.global_sum(*[float(np.vdot(x, self._path[1])) for x in positions]).tolist()
+        return [min(max((each - self._begin) / self._square, 0.0), 1.0) for each in along]
+
+    def _are_near_path(self, radius: float, *positions: Array) -> bool:
+        """Whether this rank's vertices are within ``radius`` [m] of one place on the path, at each of several
+        positions (n, 3); collective.
+        """
+        if self._path is None:
             return False
-        if not any(self.layout.global_max(_any_beyond(x, self._references[self._current], radius))):
-            return True
-        beyond = self.layout.global_max(*(_any_beyond(x, origin, radius) for origin in self._references))
-        self._current = beyond.index(min(beyond))
-        return not beyond[self._current]
+        origin, path = self._path
+        places = zip(positions, self._places(*positions), strict=True)
+        return not any([_any_beyond(x, origin, path, at, radius) for x, at in places])
 
     def _search(self, x: Array, displacement: Array) -> float:
         """Find the elements of all terms that search, along displacements (n_local, 3) [m]; collective.

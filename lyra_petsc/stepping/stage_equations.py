@@ -18,7 +18,7 @@ This module works on arrays only, without PETSc. Methods that return sums over r
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -128,6 +128,7 @@ class StageEquations:
     has_active_pairs = False
     _frozen_before: Mapping[Term, Any] | None = None
     _start_velocity: Array | None = None  # found by `find_start`
+    _past_velocity: Array | None = None  # (n_owned, 3) before the last step, if there is contact
 
     def __init__(
         self,
@@ -221,13 +222,12 @@ class StageEquations:
         after = self.integrator.stage_offset(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
         displacement = self._expected_displacement() if self.discretisation.limits_motion else None
-        stops = () if displacement is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
-        self._update_stencils(self.x, displacement, stops)
+        self._update_stencils(self.x, displacement, self._expected_displacement)
         self._freeze(t0 + after)
         if self.active.pushing:  # obstacles may have come near
             # again, with the ghosts of now
             displacement = None if displacement is None else self._expected_displacement()
-            self._update_stencils(self.x, displacement, stops)
+            self._update_stencils(self.x, displacement, self._expected_displacement)
         # the start of a step may differ from the time of an event by round-off
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in (self.integrator, *self.followers):
@@ -245,11 +245,16 @@ class StageEquations:
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
 
-    def _expected_displacement(self) -> Array:
-        """Displacements (n_local, 3) [m] of the step at constant velocities, of handles exactly."""
-        displacement, n = self.dt * self.v, self.points.n_owned
+    def _expected_displacement(self, steps: int = 1) -> Array:
+        """Displacements (n_local, 3) [m] of the step at constant velocities, of handles exactly.
+
+        Those of several ``steps`` are with the accelerations of the last step.
+        """
+        displacement, n = steps * self.dt * self.v, self.points.n_owned
+        if steps > 1 and self._past_velocity is not None:
+            displacement[:n] += 0.5 * steps**2 * self.dt * (self.v[:n] - self._past_velocity)
         x = self.x[:n].take(self.prescribed.indices)
-        self.prescribed.overwrite(displacement[:n], self.prescribed.goal - x)
+        self.prescribed.overwrite(displacement[:n], float(steps) * (self.prescribed.goal - x))
         self.points.update_ghosts(displacement)
         return displacement
 
@@ -371,13 +376,14 @@ class StageEquations:
             self.prescribed.overwrite_with_end_velocity(rate)
         self.state.set(moved, rate)
         if self.active.limiting and self.integrator.dynamic:
-            from lyra_petsc.stepping import impacts  # needed with contact only
-
+            self._past_velocity = rate_before
             if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
-                self._update_stencils(self._xs, self.x - self._xs, (1.0,))
+                self._update_stencils(self._xs, self.x - self._xs)
             if not self.discretisation.has_near_elements:
                 self.integrator.surplus, self.contact_impulses = max(self.integrator.surplus, 0.0), None
                 return
+            from lyra_petsc.stepping import impacts  # needed only if something is near
+
             if self.removes_contact_surplus:
                 left = self.integrator.surplus
                 self.integrator.surplus = impacts.remove_surplus(self, self._contact_energy, before, left)
@@ -674,10 +680,11 @@ class StageEquations:
         moved by the obstacles that would hit them. Obstacles and prescribed unknowns move as they must;
         collective.
         """
-        still = self.stationary_velocity()
-        moves = self.prescribed.velocity != still.take(self.prescribed.indices)
+        at = self.prescribed.indices
+        moves = self.prescribed.velocity != (self.x.take(at) - self._xh.take(at)) / self.stage.c
         if not any(self.points.global_max(bool(self.active.pushing) or bool(moves.any()))):
             return True
+        still = self.stationary_velocity()
         at_rest, refused = self.integrator.starts_at_rest, None
         candidates = [still] if at_rest else [still, self.v[: len(still)]]
         tried = [(v, False) for v in candidates]
@@ -751,14 +758,14 @@ class StageEquations:
     # -- residual and Jacobian -----------------------------------------------------------------------
 
     def _update_stencils(
-        self, x: Array, displacement: Array | None = None, stops: Sequence[float] = ()
+        self, x: Array, displacement: Array | None = None, ahead: Callable[[int], Array] | None = None
     ) -> None:
         """Update changing stencils to positions x (n_local, 3), and all arrays to their ghosts; collective.
 
-        ``displacement`` and ``stops`` are as in `Discretisation.update_stencils`.
+        ``displacement`` and ``ahead`` are as in `Discretisation.update_stencils`.
         """
         discretisation = self.discretisation
-        if not discretisation.stencils_change or not discretisation.update_stencils(x, displacement, stops):
+        if not discretisation.stencils_change or not discretisation.update_stencils(x, displacement, ahead):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
@@ -799,8 +806,9 @@ class StageEquations:
         self._squares = []
         yield self._with_square("inertia", self.mass[:, None] * vdot)
         del vdot
-        if self.active.constraints:
-            yield self._with_square("springs", self._sum(self.active.constraints, x))
+        constraints = self._present(self.active.constraints)
+        if constraints:
+            yield self._with_square("springs", self._sum(constraints, x))
         yield self._with_square("loads", -self.applied.force_at(x))
         if self.damping.active:
             yield self._with_square("damping", self.damping.product(vs))
@@ -814,6 +822,11 @@ class StageEquations:
         """The part of F, after its square is kept for `largest_force`."""
         self._squares.append(squared_norm_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
+
+    def _present(self, terms: Sequence[Elastic]) -> list[Elastic]:
+        """Those of ``terms`` that have elements on any rank: all while something is near."""
+        near = self.discretisation.has_near_elements
+        return [term for term in terms if near or not term.registration.neighbours]
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
         return self.active.gradient(terms, at, self.points)
@@ -877,8 +890,9 @@ class StageEquations:
 
         Collective.
         """
-        number = sum(term.n_friction_pairs for term in self.active.changing)
-        return self.discretisation.has_near_elements and any(self.points.global_max(number))
+        if not self.discretisation.has_near_elements:
+            return False
+        return any(self.points.global_max(sum(term.n_friction_pairs for term in self.active.changing)))
 
     @property
     def may_impact(self) -> bool:

@@ -353,6 +353,7 @@ class ContactBarrier(Elastic):
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
         self._obstacle_x = self._next_obstacle_x = np.stack([self.obstacles.positions(0.0)] * 3)
+        self._at_rest = ObstaclePositions(*self._obstacle_x, *[self.obstacles.rigid_motions(0.0, 0.0)] * 2)
         self.stale = False
         self._deviations, self._obstacle_boxes = np.zeros(1), None
 
@@ -392,9 +393,7 @@ class ContactBarrier(Elastic):
 
     def freeze(self, step: UpcomingStep) -> ObstaclePositions:
         if not self.moving:
-            start, stage, end = self._obstacle_x
-            at_rest = self.obstacles.rigid_motions(step.start, step.target_time)
-            return ObstaclePositions(start, stage, end, at_rest, at_rest)
+            return self._at_rest
         times = step.start, step.target_time, step.end
         self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in times])
         largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
