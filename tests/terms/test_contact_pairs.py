@@ -631,5 +631,5 @@ def test_negative_normal_forces_are_subtracted_on_the_same_side() -> None:
     normal = np.array([up, up, [0.1, 0.0, 1.0], down, down, up, down])
     force = np.array([0.9, -0.4, 0.6, 0.5, -0.1, 2.0, -3.0])
     vertex, kind = np.array([4, 4, 4, 4, 4, 7, 7]), np.full(7, VERTEX_TRIANGLE)
-    contact_pairs.cancel_negative_forces(kind, vertex, normal, force)
+    contact_pairs.cancel_negative(kind, vertex, normal, force)
     np.testing.assert_allclose(force, [0.9 * 11 / 15, 0.0, 0.6 * 11 / 15, 0.4, 0.0, 2.0, 0.0], rtol=1e-14)

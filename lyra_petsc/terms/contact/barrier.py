@@ -805,7 +805,7 @@ class ContactBarrier(Elastic):
         n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
         beta, normal, force, pair = (part[:n] for part in found)
         if (force < 0.0).any():
-            contact_pairs.cancel_negative_forces(self.kind[pair], self.points[pair, 0], normal, force)
+            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, force)
         kept = force > 0.0
         return beta[kept], normal[kept], force[kept], pair[kept]
 
@@ -822,9 +822,14 @@ class ContactBarrier(Elastic):
         active = self.active_pairs(x, frozen.end)
         square = active.square
         stiffness = active.weight * active.stiffness
-        rows = np.flatnonzero((stiffness > 0.0) & (square > 0.0) & np.isfinite(stiffness))
-        pair, stiffness, beta = active.pair[rows], stiffness[rows], active.beta[rows]
+        rows = np.flatnonzero((stiffness != 0.0) & (square > 0.0) & np.isfinite(stiffness))
         normal = active.derivatives[rows, :3] / np.sqrt(square[rows])[:, None]
+        stiffness, pair = stiffness[rows], active.pair[rows]
+        if (stiffness < 0.0).any():
+            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, stiffness)
+            kept = stiffness > 0.0
+            rows, pair, normal, stiffness = rows[kept], pair[kept], normal[kept], stiffness[kept]
+        beta = active.beta[rows]
         points, obstacle = self.points[pair], self.obstacle[pair]
         moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
         pushed = np.einsum("ek,ek->e", moved, normal)

@@ -1226,30 +1226,31 @@ def find_contacts(x, x_obs, kind, points, offset, gap, stiffness, parallel, boun
 
 
 @kernel()
-def cancel_negative_forces(kind, vertex, normal, force):  # type: ignore[no-untyped-def]
-    """Subtract negative normal forces (E,) [N] from the positive ones on the same side of their vertex; they
-    become 0.
+def cancel_negative(kind, vertex, normal, values):  # type: ignore[no-untyped-def]
+    """Subtract negative normal forces [N] or stiffnesses [N/m] of pairs, ``values`` (E,), from the positive
+    ones on the same side of their vertex; they become 0.
 
-    They occur where the surface in front of a vertex of a sheet is concave. A vertex between two layers has
-    forces of both, which are treated separately. Pairs of a vertex must follow each other.
+    They occur where the surface in front of a vertex of a sheet is concave, and on a side between triangles
+    of which both are the nearest. A vertex between two layers has pairs with both, which are treated
+    separately. Pairs of a vertex must follow each other.
     """
     begin = 0
-    while begin < len(force):
+    while begin < len(values):
         end = begin + 1
-        while end < len(force) and vertex[end] == vertex[begin] and kind[end] == kind[begin]:
+        while end < len(values) and vertex[end] == vertex[begin] and kind[end] == kind[begin]:
             end += 1
         for j in range(begin, end):
-            if not force[j] < 0.0 or kind[j] != VERTEX_TRIANGLE or vertex[j] < 0:
+            if not values[j] < 0.0 or kind[j] != VERTEX_TRIANGLE or vertex[j] < 0:
                 continue
             positive = 0.0
             for i in range(begin, end):
-                if force[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
-                    positive += force[i]
-            factor = max(0.0, 1.0 + force[j] / positive) if positive > 0.0 else 0.0
+                if values[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
+                    positive += values[i]
+            factor = max(0.0, 1.0 + values[j] / positive) if positive > 0.0 else 0.0
             for i in range(begin, end):
-                if force[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
-                    force[i] *= factor
-            force[j] = 0.0
+                if values[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
+                    values[i] *= factor
+            values[j] = 0.0
         begin = end
 
 
