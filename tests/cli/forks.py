@@ -26,12 +26,17 @@ from compile_once import compile_once
 ROOT = Path(__file__).parents[2]
 
 EARLY = (
-    *("cli.app", "cli.progress", "scene.load", "scene.dump", "scene.json_schema", "mesh.build"),
-    *("mesh.obj_file", "mesh.msh_file", "mesh.geo_file", "kernels.scatter", "terms.registry"),
-    *("terms.membrane", "terms.bending", "terms.prescribed_handles", "terms.gravity"),
-    *("linear.pattern", "linear.block_rows", "linear.gauss_seidel", "linear.edge_couplings"),
-    *("stepping.step_control", "output.read_run", "output.run_folder"),
-    *("output.vtkhdf_file", "output.summary"),
+    *("h5py", "ruamel.yaml", "lyra_petsc.cli.app", "lyra_petsc.cli.progress", "lyra_petsc.scene.load"),
+    *("lyra_petsc.scene.dump", "lyra_petsc.scene.json_schema", "lyra_petsc.mesh.build"),
+    *("lyra_petsc.mesh.obj_file", "lyra_petsc.mesh.msh_file", "lyra_petsc.mesh.geo_file"),
+    *("lyra_petsc.mesh.near", "lyra_petsc.kernels.scatter", "lyra_petsc.terms.membrane"),
+    *("lyra_petsc.terms.bending.hinge_forces", "lyra_petsc.terms.bending.hinge_rows"),
+    *("lyra_petsc.terms.handles.prescribed_handles", "lyra_petsc.linear.block_product"),
+    *("lyra_petsc.linear.block_rows", "lyra_petsc.linear.gauss_seidel", "lyra_petsc.linear.edge_couplings"),
+    *("lyra_petsc.stepping.integrators.beuler", "lyra_petsc.stepping.integrators.static"),
+    *("lyra_petsc.stepping.step_control", "lyra_petsc.output.history", "lyra_petsc.output.run_folder"),
+    *("lyra_petsc.output.stored", "lyra_petsc.output.summary", "lyra_petsc.output.vtkhdf_file"),
+    *("lyra_petsc.output.xdmf",),
 )
 """Modules that runs load, and that do not use MPI."""
 
@@ -48,12 +53,12 @@ DRAWING = (
 REPORTING = ("render", "report", "stress", "study", "verify")
 
 
-def load(*modules: str) -> None:
-    """Import modules that are installed, for all processes that are forked later."""
+def load(*modules: str, optional: bool = False) -> None:
+    """Import modules, optional ones if they are installed, for all processes that are forked later."""
     if set(modules) <= set(sys.modules):
         return
     for module in modules:
-        with contextlib.suppress(ModuleNotFoundError):
+        with contextlib.suppress(*[ModuleNotFoundError] * optional):
             importlib.import_module(module)
     # else a forked process copies the memory that the collector visits at its end: a third of its time
     gc.collect()
@@ -61,7 +66,10 @@ def load(*modules: str) -> None:
 
 
 def become(asked: dict[str, Any], out: int, err: int) -> None:
-    """Take over environment, folder and streams of the requesting process."""
+    """Take over environment, folder and streams of the requesting process.
+
+    Packages that ``TESTS_WITHOUT`` names cannot be imported, as if they were not installed.
+    """
     os.setsid()
     os.chdir(asked["folder"])
     os.environ.clear()
@@ -69,6 +77,8 @@ def become(asked: dict[str, Any], out: int, err: int) -> None:
     for number, file in enumerate((os.open(os.devnull, os.O_RDONLY), out, err)):
         os.dup2(file, number)
         os.close(file)
+    hidden = os.environ.pop("TESTS_WITHOUT", "").split()
+    sys.modules.update(dict.fromkeys([*hidden, *(n for n in sys.modules if n.partition(".")[0] in hidden)]))
     sys.argv = [str(ROOT / "lyra_petsc" / "__main__.py"), *asked["arguments"]]
 
 
@@ -101,7 +111,7 @@ def serve() -> None:
         message, files, *_ = socket.recv_fds(connection, 2**18, 2)
         asked = json.loads(message)
         if asked["arguments"][:1] and asked["arguments"][0] in REPORTING:
-            load(*DRAWING)
+            load(*DRAWING, optional=True)
         if os.fork() == 0:
             listener.close()
             attend(connection, asked, *files)
@@ -111,7 +121,7 @@ def serve() -> None:
             os.close(file)
 
 
-load(*(f"lyra_petsc.{name}" for name in EARLY))
+load(*EARLY)
 compile_once()
 assert not {"mpi4py.MPI", "petsc4py.PETSc"} & set(sys.modules)
 serve()

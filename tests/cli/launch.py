@@ -41,6 +41,9 @@ LAUNCHER = {
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
     # more ranks than cores: a waiting rank yields its core
     "OMPI_MCA_mpi_yield_when_idle": "1",
+    # a process without mpirun starts no daemon, and none looks for networks: up to half a second each
+    "OMPI_MCA_ess_singleton_isolated": "1",
+    "OMPI_MCA_pml": "ob1",
 }
 
 SCENE = """\
@@ -60,6 +63,9 @@ REDUNDANT = ("-ksp_type", "preonly", "-pc_type", "redundant")
 
 PICTURES = ("matplotlib", "jinja2")
 """Packages without which reports have no pictures."""
+
+PLAIN = {"TESTS_WITHOUT": " ".join(PICTURES)}
+"""Environment for commands whose pages a test does not look at: drawing takes longer than small cases."""
 
 
 @dataclass
@@ -253,12 +259,7 @@ def lyra(
 
 def without(packages: Sequence[str], arguments: Sequence[object], folder: Path) -> Left:
     """Run the program on one rank as if these packages were not installed."""
-    program = (
-        f"import sys; sys.modules.update(dict.fromkeys({list(packages)!r}));"
-        "from lyra_petsc.cli.app import run_command_line;"
-        "sys.exit(run_command_line(['lyra-petsc', *sys.argv[1:]]))"
-    )
-    return lyra(arguments, folder, program=("-c", program))
+    return lyra(arguments, folder, extra={"TESTS_WITHOUT": " ".join(packages)})
 
 
 def done(

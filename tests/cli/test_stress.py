@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from launch import (
+    PLAIN,
     REDUNDANT,
     done,
     finish,
@@ -70,7 +71,7 @@ def test_a_given_scene_runs_the_cases_that_apply_to_it(tmp_path: Path, ranks: in
     scene = write_scene(tmp_path)
     names = "bending-1e6,jump,slivers"
     words = ["stress", scene, "--quick", "--only", names, "--set", "gravity=[0, 0, -5]"]
-    left = done([*words, *REDUNDANT], tmp_path, ranks)
+    left = done([*words, *REDUNDANT], tmp_path, ranks, PLAIN)
     assert "slivers: left out" in left.out
     assert "2 of 2 cases passed" in left.out
     content = read_json(tmp_path / "stress" / "scene" / "stress.json")
@@ -81,13 +82,13 @@ def test_a_given_scene_runs_the_cases_that_apply_to_it(tmp_path: Path, ranks: in
 def test_a_second_call_uses_another_folder(tmp_path: Path) -> None:
     (tmp_path / "stress" / "scene").mkdir(parents=True)
     (tmp_path / "stress" / "scene" / "stress.csv").write_text("")
-    done(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path)
+    done(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path, extra=PLAIN)
     assert (tmp_path / "stress" / "scene-2" / "stress.csv").exists()
 
 
 def test_a_failed_verdict_is_exit_code_1(tmp_path: Path) -> None:
     # steps that stop at a tenth of their first residual violate the scene's tolerances
-    left = lyra(["stress", "--quick", *TWO, "--out", "out", "-snes_rtol", "0.1"], tmp_path)
+    left = lyra(["stress", "--quick", *TWO, "--out", "out", "-snes_rtol", "0.1"], tmp_path, extra=PLAIN)
     assert left.code == 1, left.err + left.out
     assert "equations: worst in step" in left.out
     assert left.ours == []
@@ -110,7 +111,7 @@ def test_ranks_option_starts_mpirun(tmp_path: Path) -> None:
     """One mpirun per case, as for ``study``."""
     scene = write_scene(tmp_path)
     words = ["stress", scene, "--quick", "--only", "membrane-1e-3", "--ranks", "2", "--out", "out"]
-    left = lyra([*words, *REDUNDANT], tmp_path)
+    left = lyra([*words, *REDUNDANT], tmp_path, extra=PLAIN)
     if "not found" in left.err:
         pytest.skip("needs mpirun")
     assert left.code == 0, left.err + left.out
@@ -142,6 +143,7 @@ def test_petsc_options_are_passed_on_and_unused_ones_reported(tmp_path: Path) ->
     left = lyra(
         ["stress", "--quick", "--only", "one-triangle", "-pc_type", "lu", "-snes_typo", "1", "--out", "out"],
         tmp_path,
+        extra=PLAIN,
     )
     assert left.code == 0, left.err + left.out
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]

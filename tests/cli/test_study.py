@@ -90,7 +90,7 @@ def test_a_study_writes_all_files(tmp_path: Path) -> None:
 def test_exact_answers_on_two_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
     words = ["study", "scene.yaml", "--vary", "integrator=beuler,midpoint", "--vary", "dt=0.025,0.0125"]
-    done([*words, "--repeats", "1", "--out", "two"], tmp_path, ranks=2)
+    done([*words, "--repeats", "1", "--out", "two", "--quantities", "position"], tmp_path, ranks=2)
     rows = read_csv(tmp_path / "two" / "study.csv")
     assert read_json(tmp_path / "two" / "study.json")["references"][0]["kind"] == "exact"
     assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
@@ -145,7 +145,8 @@ def test_if_all_combinations_fail_the_exit_code_is_3(tmp_path: Path) -> None:
     assert "★" not in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
 
 
-LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.002", "--repeats", "1", "--out", "out"]
+LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.002", "--repeats", "1", "--out", "out",
+        "--quantities", "energy"]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -185,7 +186,8 @@ def test_a_stopped_study_resumes_without_repeating(tmp_path: Path, number: int, 
 @pytest.mark.slow
 def test_ranks_option_starts_an_mpirun_for_each_case(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
-    words = ["study", "scene.yaml", "--vary", "dt=0.025,0.0125", "--repeats", "1", "--ranks", "2"]
+    words = ["study", "scene.yaml", "--vary", "dt=0.025,0.0125", "--repeats", "1", "--ranks", "2",
+             "--quantities", "position"]  # fmt: skip
     done([*words, "--vary", "integrator=beuler", "--out", "two", "-ksp_rtol", "1e-4"], tmp_path)
     rows = read_csv(tmp_path / "two" / "study.csv")
     assert [row["ranks"] for row in rows] == ["2", "2"]
@@ -210,7 +212,7 @@ def test_a_signal_stops_all_ranks(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
-    words = ["study", "scene.yaml", "--vary", "dt=0.05", "--repeats", "1", "--out", "out"]
+    words = [*LONG[:3], "dt=0.05", *LONG[4:]]
     done(words, tmp_path)
     with (tmp_path / "out" / "study.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -228,7 +230,8 @@ def test_an_existing_run_as_reference(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     fine = ["run", "scene.yaml", "--set", "time.step=0.001", "--out", "fine"]
     done(fine, tmp_path)
-    words = ["study", "scene.yaml", "--vary", "dt=0.01", "--repeats", "1", "--out", "out"]
+    words = ["study", "scene.yaml", "--vary", "dt=0.01", "--repeats", "1", "--quantities", "position",
+             "--out", "out"]  # fmt: skip
     done([*words, "--reference", "run:fine"], tmp_path)
     whole = read_json(tmp_path / "out" / "study.json")
     assert whole["references"][0]["kind"] == "run"

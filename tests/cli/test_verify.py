@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import PICTURES, done, finish, lyra, read_csv, read_json, start, wait_until, without
+from launch import PICTURES, PLAIN, done, finish, lyra, read_csv, read_json, start, wait_until, without
 
 from lyra_petsc.experiments.verification.cases import CASES
 
@@ -62,7 +62,7 @@ def test_tables_without_the_packages_for_pictures(tmp_path: Path, words: list[st
 def test_a_wrong_answer_is_exit_code_1(tmp_path: Path) -> None:
     # stopped after two steps the sheet has not fallen as far as it should
     arguments = ["verify", "free-fall", "patch-states", "--quick", "--out", "out", "-ts_max_steps", "2"]
-    left = lyra(arguments, tmp_path)
+    left = lyra(arguments, tmp_path, extra=PLAIN)
     assert left.code == 1, left.err
     assert "1 of 2 cases passed" in left.out
     assert "FAILED" in left.out
@@ -73,7 +73,7 @@ def test_a_wrong_answer_is_exit_code_1(tmp_path: Path) -> None:
 
 def test_a_failed_simulation_is_a_row_and_exit_code_1(tmp_path: Path) -> None:
     arguments = ["verify", "oscillator", "patch-states", "--quick", "-snes_max_it", "0"]
-    left = lyra(arguments, tmp_path)
+    left = lyra(arguments, tmp_path, extra=PLAIN)
     assert left.code == 1, left.err
     assert "could not run" in left.out
     assert "patch-states  passed" in left.out
