@@ -25,7 +25,7 @@ LONG = (
     "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
     "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane", "roll-up", "plate-curvature",
     "heavy-cantilever", "tip-load", "catenary-elastic", "sze-end-shear", "uniaxial-pull", "wind-drag",
-    "frames", "sections", "supported-disc", "pressed-strip",
+    "frames", "sections", "supported-disc", "pressed-strip", "hinge-plate",
 )  # fmt: skip
 """Cases whose finest resolutions are slow."""
 
@@ -37,12 +37,16 @@ FEWER: dict[str, dict[str, object]] = {
     "elastica-tip": {"KINDS": ("criss-cross", "gmsh")},
     "plate-vibration": {"KINDS": ("criss-cross", "gmsh")},
     "hinged-roof": {"PATTERNS": ("alternating",)},
-    "incline": {"SLOPES": (5.0, 60.0)},
+    "incline": {"SLOPES": (5.0, 60.0), "END": 1.5},
+    "capstan": {"WRAPS": ((0.5, 0.1), (1.0, 0.3), (1.5, 0.5))},
+    "collision": {"THROWS": (("bdf2", 0.0), ("beuler", 0.3), ("midpoint", 0.3))},
     "sheets": {"SLIDERS": ("bdf2",)},
     "cusick": {"MESHES": ("irregular",), "STARTS": 2},
 }  # fmt: skip
 """Parameters omitted from cases that repeat others: further meshes, which `plate`, `column` and other shells
-have; the middle slope; integrators, which `tests/stepping/test_friction.py` has; starts.
+have; the middle slope, and 1.5 of 2 s of creep, which is 1e-15 m of 1e-6 m; wraps between others; throws
+without friction, which have the same contact; integrators, which `tests/stepping/test_friction.py` has;
+starts.
 """
 
 TOGETHER = (
