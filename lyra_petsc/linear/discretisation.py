@@ -152,7 +152,8 @@ class Discretisation:
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
             self._radius = 0.5 * min(term.skin for term in self._searching)
-            displacement, steps = np.zeros_like(x) if expected is None else expected, 1
+            expected = np.zeros_like(x) if expected is None else expected
+            displacement, steps = expected, 1
             if ahead is not None and self._path is not None and not self.has_near_elements:
                 # one more than the last search was valid for
                 next_steps = min(round(self._steps * self._places(here)[0]) + 1, MAX_STEPS)
@@ -160,8 +161,13 @@ class Discretisation:
                 self._set_path(here, farther)
                 if not any(self.layout.global_max(not self._are_near_path(self._radius, to))):
                     displacement, steps = farther, next_steps
-            part, self._steps = self._search(x, displacement), steps
+            part = self._search(x, displacement)
+            if steps > 1 and (part < 1.0 or self._any_found()):
+                # they may be near only after the step, or only because the guess is wrong
+                displacement, steps = expected, 0
+                part = self._search(x, displacement)
             self._set_path(here, part * displacement)
+            self._steps = steps
         for term in asked:
             if term.search_distance == 0.0:
                 self._global_elements[term] = self._exchange_elements(*term.current_elements())
@@ -269,6 +275,11 @@ class Discretisation:
         self._fraction = part
         self._global_elements |= {term: each for term, each in found.items() if each is not None}
         return part
+
+    def _any_found(self) -> bool:
+        """Whether the last search found elements on any rank; collective."""
+        found = any(len(self._global_elements[term][0]) for term in self._searching)
+        return any(self.layout.global_max(found))
 
     def _find_elements(self, term: Elastic, x: Array, u: Array) -> tuple[Ints, Ints] | None:
         """Stencils (E, n) in global numbers, and attributes (E, m), of a term's elements near owned vertices.

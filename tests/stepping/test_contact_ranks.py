@@ -250,16 +250,24 @@ def test_points_as_far_from_the_end_of_a_displacement_as_allowed_are_near_its_st
 def test_searches_look_ahead_where_the_step_is_expected_to_lead(comm: MPI.Comm) -> None:
     with Simulation(falling(0.02), comm) as simulation:
         contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, x = simulation.problem.discretisation, simulation.problem.system.x + 1.0
-        step = np.full_like(x, 3.0 * contact.approach_limit)
+        known, near = simulation.problem.discretisation, simulation.problem.system.x
+        assert known.has_near_elements
+        step = np.full_like(near, -3.0 * contact.approach_limit)
+        x = near - 5.0 * step
         known.update_stencils(x)
         assert not known.has_near_elements
         known.update_stencils(x, step, lambda steps: -steps * step)  # a wrong guess
         assert known.searched_fraction(x, step) == 1.0
         assert known.searched_fraction(x, -step) < 0.2
-        known.update_stencils(x + step, step, lambda steps: steps * step)
-        assert known.searched_fraction(x + step, 2.0 * step) == 1.0
-        assert known.searched_fraction(x + step, 3.0 * step) < 1.0
+        x = x + step
+        known.update_stencils(x, step, lambda steps: steps * step)
+        assert known.searched_fraction(x, 2.0 * step) == 1.0
+        assert known.searched_fraction(x, 3.0 * step) < 1.0
+        x = x + 2.0 * step
+        known.update_stencils(x, step, lambda steps: steps * step)  # to the floor
+        assert not known.has_near_elements
+        assert known.searched_fraction(x, step) == 1.0
+        assert known.searched_fraction(x, 2.0 * step) < 1.0
 
 
 def test_only_the_start_of_increments_through_many_parts_is_searched(
