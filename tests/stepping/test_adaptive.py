@@ -12,7 +12,7 @@ from physics import grid, shape, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.step_control import ToleranceControl
+from lyra_petsc.stepping.step_control import StepControl, ToleranceControl
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -131,3 +131,21 @@ def test_after_a_repeated_step_in_contact_the_next_is_not_longer() -> None:
         assert control.next_end(0.0) == pytest.approx(0.005 if touches else 0.01)
         assert control.accept(0.005, 0.01, 2, touches=touches)
         assert control.next_end(0.0) == pytest.approx(0.01)
+
+
+def test_first_order_error_estimate_of_free_fall_is_exact(comm: MPI.Comm) -> None:
+    """Backward Euler has an error of ½ g Δt² in every step, and the errors add up."""
+    time = {"end": END, "step": "auto", "tolerance": 0.02}
+    with simulated(comm, handles=[], time=time) as simulation:
+        while not simulation.finished:
+            simulation.step()
+        fallen = shape(simulation)[:, 2]
+        error = np.abs(fallen + 0.5 * 9.81 * END**2).max() / SIZE
+        assert simulation.estimated_error == pytest.approx(error, rel=0.02)
+        assert error < 1.2 * 0.02
+
+
+def test_round_off_of_the_time_causes_no_tiny_step() -> None:
+    control = StepControl(0.1, 0.3, None, [], 1e-5)
+    assert control.next_end(0.2 - 1e-9) == 0.3
+    assert control.next_end(0.1 - 1e-9) == pytest.approx(0.2 - 1e-9, abs=1e-15)

@@ -298,3 +298,29 @@ def test_the_limit_of_direct_solvers_counts_vertices_not_directors(
         points = simulation.problem.points
         assert points.n_vertices_global < 60 < points.n_global
         assert simulation.stepper.presets[0] == "direct"
+
+
+def test_static_analyses_end_at_their_tolerance(comm: MPI.Comm) -> None:
+    """The last proximal step must not end far above a loose tolerance, nor far below it."""
+    left, weight = [], 0.2 * 0.8 * 9.81
+    for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
+        content = {"handles": [{"nodes": [0, 6]}], "solver": {"force_tolerance": tolerance}}
+        with at_rest(comm, **content) as simulation:
+            force = simulation.problem.system.out_of_balance()[0]
+            norm = np.sqrt(comm.allreduce(float(np.vdot(force, force))))
+            # the largest part of the forces is hardly larger than the pull of the two handles
+            left.append(norm / (tolerance * weight))
+    assert max(left) < 5.0, left
+
+
+def test_a_static_analysis_starts_in_equilibrium(comm: MPI.Comm) -> None:
+    """Forces that hold the start shape decrease with the load factor."""
+    still = {"gravity": [0, 0, 0], "initial": {"noise": 5e-3}, "handles": [{"nodes": [0, 6]}]}
+    with motion(comm, **still, time={"analysis": "static"}) as simulation:
+        system, left = simulation.problem.system, []
+        for factor in (0.0, 0.5, 1.0):
+            system.applied.factor = factor
+            system.begin_step(0.0, factor)
+            left.append(comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
+        assert left[0] < 1e-12 * left[2]
+        assert left[1] == pytest.approx(0.5 * left[2])
