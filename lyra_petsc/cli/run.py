@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from lyra_petsc.show.view.live import LivePage
 
 
+COMPILING_TAKES = "half a minute, one to two with contact or midedge"
 NO_CACHE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 
 
@@ -113,10 +114,10 @@ class TerminalProgress(ProgressCallbacks):
 
     def _announce_compilation(self) -> None:
         """Tell the user that kernels are being compiled, above the bar once there is one."""
-        text = "compiling kernels, once, about 15 s"
+        text = f"compiling kernels, once: {COMPILING_TAKES}"
         if not COMPILATION.all_cached:
             self._noted_cache = True
-            text = f"compiling kernels, about 15 s in every run: {NO_CACHE}"
+            text = f"compiling kernels in every run: {COMPILING_TAKES}; {NO_CACHE}"
         if self._progress is not None:
             self._progress.say(text)
         else:
