@@ -151,23 +151,7 @@ class Discretisation:
             return False
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
-            self._radius = 0.5 * min(term.skin for term in self._searching)
-            expected = np.zeros_like(x) if expected is None else expected
-            displacement, steps = expected, 1
-            if ahead is not None and self._path is not None and not self.has_near_elements:
-                # one more than the last search was valid for
-                next_steps = min(round(self._steps * self._places(here)[0]) + 1, MAX_STEPS)
-                farther = ahead(next_steps)
-                self._set_path(here, farther)
-                if not any(self.layout.global_max(not self._are_near_path(self._radius, to))):
-                    displacement, steps = farther, next_steps
-            part = self._search(x, displacement)
-            if steps > 1 and (part < 1.0 or self._any_found()):
-                # they may be near only after the step, or only because the guess is wrong
-                displacement, steps = expected, 0
-                part = self._search(x, displacement)
-            self._set_path(here, part * displacement)
-            self._steps = steps
+            self._search_ahead(x, np.zeros_like(x) if expected is None else expected, ahead)
         for term in asked:
             if term.search_distance == 0.0:
                 self._global_elements[term] = self._exchange_elements(*term.current_elements())
@@ -193,6 +177,28 @@ class Discretisation:
                 self._located.discard(term.name)
             term.set_elements(elements)
         return others
+
+    def _search_ahead(self, x: Array, expected: Array, ahead: Callable[[int], Array] | None) -> None:
+        """Search along ``expected`` (n_local, 3), or the displacement of several steps; collective.
+
+        Several steps are tried, one more than the last search was valid for, while nothing is near. What is
+        found then may be near only after the step, or only because the guess is wrong.
+        """
+        here = x[: self.layout.n_vertices]
+        self._radius = 0.5 * min(term.skin for term in self._searching)
+        displacement, steps = expected, 1
+        if ahead is not None and self._path is not None and not self.has_near_elements:
+            next_steps = min(round(self._steps * self._places(here)[0]) + 1, MAX_STEPS)
+            farther, to = ahead(next_steps), here + expected[: len(here)]
+            self._set_path(here, farther)
+            if not any(self.layout.global_max(not self._are_near_path(self._radius, to))):
+                displacement, steps = farther, next_steps
+        part = self._search(x, displacement)
+        if steps > 1 and (part < 1.0 or self._any_found()):
+            displacement, steps = expected, 0
+            part = self._search(x, displacement)
+        self._set_path(here, part * displacement)
+        self._steps = steps
 
     def _terms_to_update(self, *positions: Array) -> list[Elastic]:
         """Terms whose elements may change at any of these positions (n, 3) of the owned vertices; collective.

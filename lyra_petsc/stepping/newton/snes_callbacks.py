@@ -113,9 +113,11 @@ class Newton:
         self._last_iterate: PETSc.Vec | None = None
         self._last_c = 0.0
         self._convex_at_start = False
-        self._bends = not system.integrator.dynamic and linear.factors and bool(system.active.with_edges)
+        self._can_correct = (
+            not system.integrator.dynamic and linear.factors and bool(system.active.with_edges)
+        )
         self._arcs: Arcs | None = None
-        if self._bends:
+        if self._can_correct:
             from lyra_petsc.stepping.newton.arcs import Arcs, can_factor  # needed in equilibria only
 
             self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
@@ -140,7 +142,7 @@ class Newton:
     @property
     def _corrects(self) -> bool:
         """Whether steps follow arcs and are corrected: in equilibria of shells, while no parts are near."""
-        return self._bends and not self._system.discretisation.has_near_elements
+        return self._can_correct and not self._system.discretisation.has_near_elements
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
