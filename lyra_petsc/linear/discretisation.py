@@ -195,7 +195,7 @@ class Discretisation:
                 displacement, steps = farther, next_steps
         part = self._search(x, displacement)
         if steps > 1 and (part < 1.0 or self._any_found()):
-            displacement, steps = expected, 0
+            displacement, steps = expected, 0  # so that the next search tries one step
             part = self._search(x, displacement)
         self._set_path(here, part * displacement)
         self._steps = steps

@@ -680,11 +680,10 @@ class StageEquations:
         moved by the obstacles that would hit them. Obstacles and prescribed unknowns move as they must;
         collective.
         """
-        at = self.prescribed.indices
-        moves = self.prescribed.velocity != (self.x.take(at) - self._xh.take(at)) / self.stage.c
+        still = self.stationary_velocity()
+        moves = self.prescribed.velocity != still.take(self.prescribed.indices)
         if not any(self.points.global_max(bool(self.active.pushing) or bool(moves.any()))):
             return True
-        still = self.stationary_velocity()
         at_rest, refused = self.integrator.starts_at_rest, None
         candidates = [still] if at_rest else [still, self.v[: len(still)]]
         tried = [(v, False) for v in candidates]

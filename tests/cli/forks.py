@@ -58,7 +58,7 @@ def load(*modules: str, optional: bool = False) -> None:
     if set(modules) <= set(sys.modules):
         return
     for module in modules:
-        with contextlib.suppress(*[ModuleNotFoundError] * optional):
+        with contextlib.suppress(ModuleNotFoundError) if optional else contextlib.nullcontext():
             importlib.import_module(module)
     # else a forked process copies the memory that the collector visits at its end: a third of its time
     gc.collect()

@@ -299,10 +299,10 @@ def test_two_checkouts_are_compared_in_pairs():
 
 
 def test_a_checkout_is_compared_with_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "PAIRS", 1)
+    monkeypatch.setattr(measures, "PAIRS", 2)
     limits = Limits(steps=2, seconds=0.1, process=120.0)
     found = measures.against("gmsh", 36, "beuler", 1, [], tmp_path, limits, SCRIPTS.parent)
-    assert [len(found[name]) for name in ("here", "other")] == [1, 1]
+    assert [len(found[name]) for name in ("here", "other")] == [2, 2]
     assert len(against_table([found])) == 5
 
 

@@ -133,6 +133,8 @@ LAWS: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     ),
 }
 
+INTEGRATORS = ("semi-implicit", "beuler", "midpoint", "bdf2", "alpha2", "static")
+
 
 def scene(integrator: str, material: Mapping[str, Any] | None = None, **more: Any) -> Scene:
     """The pulled sheet; an equilibrium has no wind but its pressure."""
@@ -188,7 +190,7 @@ def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Arr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["midpoint", "static"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_each_parameter(integrator: str) -> None:
     pulled, numbers = scene(integrator), of_integrator(integrator, NUMBERS)
     found = tangents(pulled, numbers)
@@ -196,12 +198,6 @@ def test_each_parameter(integrator: str) -> None:
         expected = difference(pulled, {key: value}, STEP)
         assert np.linalg.norm(expected) > 1e-7, key
         assert np.linalg.norm(found[key] - expected) < 1e-6 * np.linalg.norm(expected), key
-
-
-@pytest.mark.parametrize("integrator", ["semi-implicit", "beuler", "bdf2", "alpha2"])
-def test_all_parameters_together(integrator: str) -> None:
-    """Terms enter the equations of all integrators in the same way; none has less than 1/50 of the change."""
-    agree(scene(integrator), NUMBERS)
 
 
 @pytest.mark.parametrize("integrator", ["static", "beuler", "midpoint", "bdf2"])
@@ -218,14 +214,15 @@ def agree(pulled: Scene, numbers: Mapping[str, float]) -> None:
     assert np.linalg.norm(sum(found.values()) - expected) < 1e-6 * scale
 
 
-@pytest.mark.parametrize("integrator", ["static", "beuler", "midpoint", "alpha2", "bdf2"])
+@pytest.mark.parametrize("integrator", ["static", "beuler", "alpha2", "bdf2"])
 def test_curved_sheets_with_directors(integrator: str) -> None:
     agree(scene(integrator, CURVED, **TURNED), of_integrator(integrator, OF_CURVED))
 
 
 @pytest.mark.slow
-def test_each_parameter_of_curved_sheets_with_directors() -> None:
-    pulled = scene("semi-implicit", CURVED, **TURNED)
+@pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint"])
+def test_each_parameter_of_curved_sheets_with_directors(integrator: str) -> None:
+    pulled = scene(integrator, CURVED, **TURNED)
     for key, value in OF_CURVED.items():
         agree(pulled, {key: value})
 

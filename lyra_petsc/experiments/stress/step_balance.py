@@ -94,7 +94,7 @@ def force_work(
     tolerance : float
         Error of the integral [J] that is accepted.
     """
-    from scipy.integrate import quad_vec
+    from scipy.integrate import fixed_quad, quad_vec
 
     membrane: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
     contact = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
@@ -120,9 +120,8 @@ def force_work(
         )
         return float(value) if info.success else None
 
-    nodes, weights = np.polynomial.legendre.leggauss(2)  # type: ignore[no-untyped-call]
-    powers = [power(membrane, 0.5 * (1.0 + node)) for node in nodes]
-    value, by_energies = 0.5 * float(np.dot(weights, powers)), False
+    along_membrane, _ = fixed_quad(lambda at: np.array([power(membrane, s) for s in at]), 0.0, 1.0, n=2)
+    value, by_energies = float(along_membrane), False
     turn = math.inf if start_frames else _largest_turn(hinges, x0, dx)
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
     largest_dx, skin = largest(comm, dx[:n]), min((term.skin for term in contact), default=0.0)

@@ -21,12 +21,11 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
         out[:] = system.start_velocity()
-        predicted = integrator.predicted if isinstance(integrator, Static) else None
-        if predicted is None or system.discretisation.has_near_elements:
+        if not isinstance(integrator, Static) or integrator.predicted is None:
             return False
-        guess = predicted * system.stage.sigma
+        guess = integrator.predicted / integrator.pseudo_dt
         system.prescribe(guess)
-        if not system.moves_freely(out, guess - out):
+        if system.discretisation.has_near_elements or not system.moves_freely(out, guess - out):
             return False
         out[:] = guess
         system.linearise_at_state()

@@ -803,11 +803,16 @@ class ContactBarrier(Elastic):
         found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
         given = active.lower_bound, active.forces, n_counted
         n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
-        beta, normal, force, pair = (part[:n] for part in found)
-        if (force < 0.0).any():
-            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, force)
-        kept = force > 0.0
+        beta, normal, force = (part[:n] for part in found[:3])
+        pair = found[3][:n]
+        kept = self._cancel_negative(pair, normal, force)
         return beta[kept], normal[kept], force[kept], pair[kept]
+
+    def _cancel_negative(self, pair: Ints, normal: Array, values: Array) -> NDArray[np.bool_]:
+        """Subtract negative forces or stiffnesses from positive ones; returns which of them (m,) are left."""
+        if (values < 0.0).any():
+            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, values)
+        return values > 0.0
 
     def vertex_of(self, pair: Ints) -> Ints:
         """The vertex of a sheet in each of pairs (m,), −1 for pairs of edges and of points of obstacles."""
@@ -824,12 +829,10 @@ class ContactBarrier(Elastic):
         stiffness = active.weight * active.stiffness
         rows = np.flatnonzero((stiffness != 0.0) & (square > 0.0) & np.isfinite(stiffness))
         normal = active.derivatives[rows, :3] / np.sqrt(square[rows])[:, None]
-        stiffness, pair = stiffness[rows], active.pair[rows]
-        if (stiffness < 0.0).any():
-            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, stiffness)
-            kept = stiffness > 0.0
-            rows, pair, normal, stiffness = rows[kept], pair[kept], normal[kept], stiffness[kept]
-        beta = active.beta[rows]
+        stiffness = stiffness[rows]
+        kept = self._cancel_negative(active.pair[rows], normal, stiffness)
+        rows, normal, stiffness = rows[kept], normal[kept], stiffness[kept]
+        pair, beta = active.pair[rows], active.beta[rows]
         points, obstacle = self.points[pair], self.obstacle[pair]
         moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
         pushed = np.einsum("ek,ek->e", moved, normal)

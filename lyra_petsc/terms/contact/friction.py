@@ -347,7 +347,7 @@ class CoulombFriction(Elastic):
         self._vertex_data[:, OWED] = 0.0 if self._next_owed is None else self._next_owed
         self._next_owed = None
         if not self.n_elements:
-            self._obstacle_loads = np.zeros(self._obstacle_loads.shape)
+            self._obstacle_loads = np.zeros_like(self._obstacle_loads)
             self._update_pairs(x, frozen.end_points, self._element_pairs)
             return
         data, slip = self._kernel_data(frozen.end_motions)

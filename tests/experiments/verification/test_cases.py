@@ -37,15 +37,13 @@ FEWER: dict[str, dict[str, object]] = {
     "elastica-tip": {"KINDS": ("criss-cross", "gmsh")},
     "plate-vibration": {"KINDS": ("criss-cross", "gmsh")},
     "hinged-roof": {"PATTERNS": ("alternating",)},
-    "incline": {"SLOPES": (5.0, 60.0), "END": 1.5},
+    "incline": {"SLOPES": (5.0, 60.0)},
     "capstan": {"WRAPS": ((0.5, 0.1), (1.0, 0.3), (1.5, 0.5))},
-    "collision": {"THROWS": (("bdf2", 0.0), ("beuler", 0.3), ("midpoint", 0.3))},
     "sheets": {"SLIDERS": ("bdf2",)},
     "cusick": {"MESHES": ("irregular",), "STARTS": 2},
 }  # fmt: skip
 """Parameters omitted from cases that repeat others: further meshes, which `plate`, `column` and other shells
-have; the middle slope, and 1.5 of 2 s of creep, which is 1e-15 m of 1e-6 m; wraps between others; throws
-without friction, which have the same contact; integrators, which `tests/stepping/test_friction.py` has;
+have; the middle slope; wraps between others; integrators, which `tests/stepping/test_friction.py` has; and
 starts.
 """
 
