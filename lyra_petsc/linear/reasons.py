@@ -55,6 +55,11 @@ def preconditioner_failed(ksp: PETSc.KSP) -> bool:
     return ksp.getConvergedReason() in _PRECONDITIONER
 
 
+def in_set_up(error: Exception) -> bool:
+    """Whether PETSc raised an error while it set up a preconditioner."""
+    return "PCSetUp() at " in str(error)
+
+
 def error_message(error: Exception) -> str:
     """The innermost message of an error from within PETSc, in one line."""
     lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]

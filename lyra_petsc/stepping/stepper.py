@@ -9,13 +9,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
-from lyra_petsc.linear.petsc_options import PYTHON_SUFFIXES, Value, culprits, fill_gaps, is_set, refused
+from lyra_petsc.linear.petsc_options import (
+    PYTHON_SUFFIXES,
+    Value,
+    culprits,
+    fill_gaps,
+    is_set,
+    quoted,
+    refused,
+)
 from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
@@ -403,6 +412,9 @@ class Stepper:
             if not isinstance(error, PETSc.Error) and not _runs_foreign_python():
                 raise
             together = all_ranks_arrive(system.points.comm)
+            if together and self._next_may_help(error):
+                self._linear_failed = True
+                return None, f"the preconditioner could not be set up: {reasons.error_message(error)}"
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.error_message(error)}; "
@@ -425,6 +437,14 @@ class Stepper:
         if system.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
         return velocity, ""
+
+    def _next_may_help(self, error: Exception) -> bool:
+        """Whether an error of PETSc's on all ranks is one of this preset's set-up, not of a user's option,
+        and another preset is left; collective.
+        """
+        users = set(quoted(error)).difference(f"-{name}" for name in self._filled)
+        may_help = len(self.presets) > 1 and reasons.in_set_up(error) and not users
+        return bool(self._system.points.comm.allreduce(int(may_help), op=MPI.MIN))
 
     def saved_state(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at ``time`` [s]; collective."""

@@ -8,12 +8,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import grid, shape, stepped
 
+from lyra_petsc.errors import SolverError
 from lyra_petsc.linear.failed_factors import MARGIN, replace_failed
 from lyra_petsc.linear.hierarchy import Level
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.linear.vcycle import Coarsest
 from lyra_petsc.mesh.points import Points
+from lyra_petsc.stepping.stepper import Stepper
 
 FAILED = PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
 WORKSPACE = "mat_mumps_icntl_14"
@@ -116,3 +118,23 @@ def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
             assert used == margin if margin > 0 else used >= MARGIN
             ends.append(shape(simulation))
     np.testing.assert_allclose(*ends, atol=1e-9)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
+def test_an_error_in_the_set_up_is_left_to_the_next_solver(
+    comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = {"mesh": grid(1.0, 1.0, 20, 20), "gravity": [0, 0, -9.81], "handles": [{"nodes": [0, 20]}]}
+    scene["time"] = {"end": 0.02, "step": 0.01, "integrator": integrator}
+    monkeypatch.setattr(Stepper, "_candidates", lambda stepper: ["gamg", "block-jacobi"])
+    asked_for = {"mg_levels_pc_type": "unknown"}
+    with (
+        stepped(comm, scene, **asked_for) as simulation,
+        pytest.raises(SolverError, match="check -mg_levels_pc_type"),
+    ):
+        simulation.step()
+    monkeypatch.setitem(PRESETS, "gamg", PRESETS["gamg"] | asked_for)
+    with stepped(comm, scene) as simulation:
+        simulation.step()
+        assert simulation.notes == ["step 1: linear solver 'gamg' broke down, going on with 'block-jacobi'"]
