@@ -172,7 +172,8 @@ class Discretisation:
             found = self._global_elements
             asked = [term for term, n in zip(asked, had, strict=True) if n or len(found[term][0])]
         for term in self._changing if others else asked:
-            elements = self._local_elements(*self._global_elements[term])
+            searched = term.search_distance > 0.0
+            elements = self._local_elements(*self._global_elements[term], sort=searched)
             if others or not np.array_equal(elements.stencil, term.stencil):
                 self._located.discard(term.name)
             term.set_elements(elements)
@@ -383,17 +384,19 @@ class Discretisation:
         stencils, attribute_parts = zip((stencil, attributes), *received, strict=True)
         return np.concatenate(stencils), np.concatenate(attribute_parts)
 
-    def _local_elements(self, stencil: Ints, attributes: Ints | Array) -> Elements:
+    def _local_elements(self, stencil: Ints, attributes: Ints | Array, *, sort: bool) -> Elements:
         """Elements in local numbers, from global numbers (E, n) and attributes (E, m).
 
-        Elements whose energy this rank counts come first.
+        Elements whose energy this rank counts come first. Those that a term itself returned (not ``sort``)
+        stay in its order.
         """
         layout = self.layout
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
-        # sorted, so that the same elements give the same stencil after every search
-        parts = np.flatnonzero(counted), np.flatnonzero(~counted)
-        order = np.concatenate([sort_rows(part, stencil, attributes, SORT_COLUMNS) for part in parts])
+        parts = [np.flatnonzero(counted), np.flatnonzero(~counted)]
+        if sort:  # so that the same elements give the same stencil after every search
+            parts = [sort_rows(part, stencil, attributes, SORT_COLUMNS) for part in parts]
+        order = np.concatenate(parts)
         if (order[1:] < order[:-1]).any():
             stencil, attributes = stencil[order], attributes[order]
         local = layout.local(stencil.ravel()).reshape(stencil.shape).astype(np.int32)

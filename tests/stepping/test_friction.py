@@ -413,3 +413,23 @@ def test_checkpoints_of_older_versions_have_no_impulses_left() -> None:
     term.restore(kept | {"friction_owed": older * [0.0, 1.0, 0.0]})
     np.testing.assert_array_equal(term.state()["friction_owed"], older * [0.0, 1.0, 0.0])
     simulation.destroy()
+
+
+def test_each_pair_remembers_its_own_slip(comm: MPI.Comm) -> None:
+    """Pairs and their elements are in the same order, also if nearest points are on vertices or edges."""
+    sheets = grid(0.4, 0.4, 8, 8, "alternating"), *2 * [grid(0.4, 0.4, 7, 9)]
+    content = {
+        "mesh": [mesh | {"transform": {"translate": [0, 0, 0.02 * i]}} for i, mesh in enumerate(sheets)],
+        "handles": [{"nodes": list(range(81))}],
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"friction": 0.3, "thickness": 0.005},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    (friction,) = (term for term in simulation.problem.terms.values() if isinstance(term, CoulombFriction))
+    for _ in range(4):
+        pairs, *_ = friction.contact_state()
+        simulation.step()
+        numbers = simulation.problem.system.discretisation.layout.global_number
+        np.testing.assert_array_equal(numbers[friction.stencil[: friction.n_owned]], pairs.stencil)
+    assert comm.allreduce(len(pairs.stencil)) > 50
+    simulation.destroy()
