@@ -31,6 +31,9 @@ SCENE: dict[str, Any] = {
 }
 """A sheet thrown on a floor, which every vertex touches."""
 
+ABOVE = grid(0.1, 0.1, 2, 2) | {"transform": {"translate": [0.04, 0.05, 0.023]}}
+"""A smaller sheet above it: blocks of pairs are added to the matrix."""
+
 KINDS: dict[str, dict[str, str]] = {
     "jacobi": {"pc_type": "jacobi"},
     "pbjacobi": {"pc_type": "pbjacobi"},
@@ -48,7 +51,7 @@ def thrown(comm: MPI.Comm, options: dict[str, str]) -> Array:
     """Positions (V, 3) after the steps, in mesh order, when every vertex has touched."""
     for name, value in options.items():
         PETSc.Options().setValue(name, value)
-    simulation = SteppedScene(comm, scene_of(SCENE))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"mesh": [SCENE["mesh"], ABOVE]}))
     contacts = 0.0
     for _ in range(STEPS):
         simulation.step()

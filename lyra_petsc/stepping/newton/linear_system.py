@@ -189,6 +189,7 @@ class LinearSystem:
     def _create(self) -> None:
         discretisation = self._system.discretisation
         self._system.update_pattern()  # stencils may have changed since the last matrix
+        self._is_empty = True  # whether the preconditioner's new matrix has no values yet
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
         kind = presets.matrix_type(self._preset)
@@ -285,7 +286,8 @@ class LinearSystem:
             return
         assert self._ksp is not None
         # an equilibrium's Newton steps are large, and factors cost less than one more
-        keep = keep and (self._system.integrator.dynamic or not self.factors)
+        keep = keep and not self._is_empty and (self._system.integrator.dynamic or not self.factors)
+        self._is_empty = False
         self.kept_preconditioner = keep
         self.uses_operator = convex and not keep and shows_negative_curvature(self._ksp.getPC())
         if self.uses_operator:
