@@ -42,6 +42,7 @@ KINDS: dict[str, dict[str, str]] = {
     "gasm": {"pc_type": "gasm"},
     "gamg": {"pc_type": "gamg"},
     "mg": {"pc_type": "mg"},
+    "telescope": {"pc_type": "telescope"},
     "mumps": {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
     "the program's choice": {},
 }

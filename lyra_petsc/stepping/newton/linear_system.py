@@ -252,6 +252,8 @@ class LinearSystem:
         assert self._ksp is not None
         if self._multigrid is not None:
             self._multigrid.attach(self._ksp)
+        if self._ksp.getPC().getType() == PETSc.PC.Type.TELESCOPE:
+            self._ksp.getPC().reset()  # it would copy the new matrix into one with the old pattern
         self._ksp.setOperators(self.operator.mat, self.preconditioner.mat)
         self.begin_solve()
         self.reuse.discard()
