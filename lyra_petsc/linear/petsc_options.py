@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from petsc4py import PETSc
 
@@ -83,12 +83,16 @@ def _number(text: str) -> float | None:
         return None
 
 
-def culprits(error: Exception) -> str:
-    """The options that an error is probably about, for a message: those it quotes, else likely ones."""
+def culprits(error: Exception, ours: Collection[str] = ()) -> str:
+    """The options that an error is probably about, for a message: those it quotes, else likely ones.
+
+    Options that the program set itself, ``ours``, are named only if there are no others.
+    """
     options = PETSc.Options().getAll()
     names = quoted(error) or [f"-{name}" for name in options if name.endswith(PYTHON_SUFFIXES)]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
-    return " or ".join(sorted(names)) or "PETSc options"
+    users = [name for name in names if name.split()[0].removeprefix("-") not in ours]
+    return " or ".join(sorted(users or names)) or "PETSc options"
 
 
 def _text(value: Value) -> str:

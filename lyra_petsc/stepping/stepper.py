@@ -418,7 +418,7 @@ class Stepper:
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.error_message(error)}; "
-                f"{kept} is kept; check {culprits(error)}",
+                f"{kept} is kept; check {culprits(error, self._filled)}",
                 collective=together,
             ) from None
         self._linear_failed = False

@@ -80,6 +80,12 @@ def test_a_petsc_error_in_a_step_keeps_the_last_state(tmp_path: Path) -> None:
     assert read_json(tmp_path / "out/summary.json")["outcome"] in line
 
 
+def test_a_petsc_error_is_not_blamed_on_options_of_the_program(tmp_path: Path) -> None:
+    left = lyra(["run", write_scene(tmp_path), "--out", "out", "-pc_type", "bddc"], tmp_path)
+    assert left.code == 3, left.err
+    assert left.ours[0].endswith("; check -pc_type bddc")
+
+
 def test_a_failed_step_is_repeated_with_a_smaller_dt(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, STIFF)
     few = ["--set", "solver.max_iterations=6", "--set", "solver.hessian=regularised"]
