@@ -103,8 +103,13 @@ def test_without_friction_rigid_motions_are_held_by_the_proximal_term(comm: MPI.
 RADIUS, MU, LENGTH, WIDTH, LONG = 0.05, 0.3, 0.5, 0.02, 80
 
 
-def over_a_rod(comm: MPI.Comm, folder: Path, ratio: float, pressed: float) -> SteppedScene:
-    """A strip over a rod, ``ratio`` times as long on one side, which starts ``pressed`` gaps above it."""
+def over_a_rod(
+    comm: MPI.Comm, folder: Path, ratio: float, pressed: float, friction: float = MU, more: Any = None
+) -> SteppedScene:
+    """A strip over a rod, ``ratio`` times as long on one side, which starts ``pressed`` gaps above it.
+
+    ``more`` has further blocks of the scene.
+    """
     gap = 5e-4
     radius, hangs = RADIUS + pressed * gap, LENGTH - np.pi * RADIUS
     s = np.linspace(0.0, LENGTH, LONG + 1)
@@ -125,11 +130,11 @@ def over_a_rod(comm: MPI.Comm, folder: Path, ratio: float, pressed: float) -> St
         "mesh": {"file": str(folder / "strip.obj")},
         "material": {"cloth": "gray-interlock"},
         "gravity": [0, 0, -9.81],
-        "contact": {"gap": gap, "friction": MU, "self": False},
+        "contact": {"gap": gap, "friction": friction, "self": False},
         "obstacles": {"rod": {"capsule": {"from": [0, -0.5, 0], "to": [0, 0.5, 0], "radius": RADIUS}}},
         "time": STATIC,
     }
-    return SteppedScene(comm, scene_of(content))
+    return SteppedScene(comm, scene_of(content | (more or {})))
 
 
 @pytest.mark.parallel(1)
@@ -153,6 +158,34 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     simulation.destroy()
     assert newton < 250
     assert 0.0 < torque < 1.01 * allowed
+
+
+@pytest.mark.parallel
+def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """It slides, with at most the friction of Eytelwein's formula, but more than by normal forces two load
+    steps before.
+
+    It starts bent to the rod. Forces that hold the start shape would push it on as it slides, away from any
+    equilibrium.
+    """
+    load, friction, row = 0.02, 0.1, np.arange(3) * (LONG + 1)
+    pulled = {
+        "loads": [{"nodes": (row + LONG).tolist(), "force": [0, 0, -load]}],
+        "handles": [{"nodes": row.tolist(), "motion": "pull"}],
+        "motions": {"pull": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, -0.1]}]},
+        "time": STATIC | {"step": 0.25},
+    }
+    simulation, newton = over_a_rod(comm, shared_tmp, 1.0, 1.0, friction, pulled), 0
+    while not simulation.finished:
+        newton += simulation.step().newton_iterations
+    force = simulation.energy_balance.obstacle_forces(1)[0]
+    simulation.destroy()
+    assert newton < 300
+    both, difference = -force[2], -force[4] / RADIUS
+    # without the weight of the strip on the rod
+    both -= WEIGHT * WIDTH * np.pi * RADIUS
+    ratio, most = (both + difference) / (both - difference), np.exp(friction * np.pi)
+    assert 1.0 + 0.5 * (most - 1.0) < ratio < 1.05 * most
 
 
 @pytest.mark.parallel(1)
