@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,30 @@ def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
     both -= WEIGHT * WIDTH * np.pi * RADIUS
     ratio, most = (both + difference) / (both - difference), np.exp(friction * np.pi)
     assert 1.0 + 0.5 * (most - 1.0) < ratio < 1.05 * most
+
+
+@pytest.mark.parallel(1)
+def test_a_cloth_is_pulled_into_a_ring_against_friction(comm: MPI.Comm) -> None:
+    """While the handle moves, forces grow. Progress counts from there, and while the cloth moves: after a
+    failed solve forces differ only by friction.
+    """
+    angle, cells = np.linspace(0.0, 2.0 * np.pi, 17), 8
+    corners = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    ring = {
+        f"part{k}": {"capsule": {"from": a.tolist(), "to": b.tolist(), "radius": 0.02}}
+        for k, (a, b) in enumerate(pairwise(corners))
+    }
+    scene = laid(0.5, [-0.25, -0.25, 0.04], ring, 0.5, {"step": 0.5})
+    scene["mesh"]["grid"] |= {"nx": cells, "ny": cells}
+    scene["contact"]["gap"] = 0.005
+    scene["handles"] = [{"nodes": [(cells + 2) * cells // 2], "motion": "pull"}]
+    scene["motions"] = {"pull": [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, -0.2]}]}
+    simulation = SteppedScene(comm, scene_of(scene))
+    while not simulation.finished:
+        simulation.step()
+    lowest = gathered(simulation.problem.points, simulation.problem.system.x)[:, 2].min()
+    simulation.destroy()
+    assert lowest == pytest.approx(0.04 - 0.2)
 
 
 @pytest.mark.parallel(1)

@@ -240,7 +240,8 @@ class Equilibrium:
             balancing = restarted_at + _last_progress([each.residual for each in history[restarted_at:]])
             last_progress = max(balancing, _last_fall(potentials))
             message = self._failure_message(solves, last_progress, x, solved_once=solved_once)
-            diverging = force > WORSE * history[balancing].residual
+            # after a failed solve only friction has changed, to what the normal forces allow
+            diverging = attempt.converged and force > WORSE * history[balancing].residual
             if (
                 not message
                 and solved_once
@@ -251,7 +252,7 @@ class Equilibrium:
                 message = "no equilibrium: proximal steps lead farther off"
             if message:
                 break
-            if force > WORSE * last:
+            if attempt.converged and force > WORSE * last:
                 self._integrator.pseudo_dt *= SHRINK
             last = force
             if attempt.converged:
@@ -273,6 +274,8 @@ class Equilibrium:
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if attempt.converged:
+                if not solved_once:  # the force before is smaller if handles move
+                    restarted_at = len(history)
                 solved_once = True
                 system.active.transport_frames(system.x)  # edges may turn far until they are in equilibrium
                 used = self._integrator.pseudo_dt
