@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
 
-Result = TypeVar("Result", bound="Array | tuple[Array, ...]")
+Result = TypeVar("Result", bound="NDArray[Any] | tuple[NDArray[Any], ...]")
 
 
 def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:

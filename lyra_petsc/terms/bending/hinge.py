@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.bending import hinge_forces, hinge_shape
+from lyra_petsc.terms.bending import hinge_fading, hinge_forces, hinge_shape
 from lyra_petsc.terms.bending.hinge_energy import fading_limit
 from lyra_petsc.terms.bending.hinge_rows import add_across, add_within
 from lyra_petsc.terms.bending.hinge_triangles import triangles_of
@@ -29,6 +29,9 @@ from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Couplings, Elastic, OffDiagonal, Offsets
 
 Stencil = NDArray[np.int32] | NDArray[np.int64]
+
+NONE = np.empty(0, dtype=np.int64)
+"""No hinges."""
 
 
 class HingeGeometry(NamedTuple):
@@ -42,11 +45,14 @@ class HingeGeometry(NamedTuple):
         Dihedral angles [rad] in [−π, π], 0 where a triangle has no normal.
     lengths : (E,)
         Edge lengths [m].
+    fading : (F,) int64
+        Numbers of the hinges that fade.
     """
 
     triangles: Array
     angles: Array
     lengths: Array
+    fading: NDArray[np.int64]
 
 
 def dihedral_angles(x: Array, stencil: Stencil) -> Array:
@@ -84,10 +90,14 @@ class Bending(Elastic):
         corners, sides, _ = self._triangles
         triangles = np.empty((len(corners), 7))
         sine, cosine, length = (np.empty(self.n_elements) for _ in range(3))
-        hinge_shape.triangles(x, corners, self._limit, triangles)
+        any_fades = hinge_shape.triangles(x, corners, self._limit, triangles)
         hinge_shape.angle_parts(x, self.stencil, sides, triangles, sine, cosine, length)
         # NumPy's functions of whole arrays use SIMD instructions
-        return HingeGeometry(triangles, np.arctan2(sine, cosine, out=sine), length)
+        angles, fading = np.arctan2(sine, cosine, out=sine), NONE
+        if any_fades:
+            fading = np.flatnonzero((triangles[sides[:-1] >> 2, 6] == 0.0).any(axis=1))
+            angles[fading] = dihedral_angles(x, self.stencil[fading])
+        return HingeGeometry(triangles, angles, length, fading)
 
     def angles(self, x: Array) -> Array:
         """Dihedral angles of all hinges of this rank [rad], (E,), a read-only array."""
@@ -96,7 +106,7 @@ class Bending(Elastic):
     def weights(self, x: Array) -> Array:
         """Factor of each hinge's energy by which it fades, (E,); 1 unless a triangle has nearly collapsed."""
         out = np.empty(self.n_elements)
-        hinge_forces.weights(x, self.stencil, self._triangles.sides, self._limit, out)
+        hinge_fading.weights(x, self.stencil, self._triangles.sides, self._limit, out)
         return out
 
     def energies(self, x: Array, frozen: None = None) -> Array:
@@ -104,18 +114,26 @@ class Bending(Elastic):
 
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
-        out, (triangles, angles, _) = np.empty(n), self._geometry(x)
-        hinges = self.stencil, self._triangles.sides
-        hinge_forces.energies(x, *hinges, triangles, self._limit, angles, self._k, self._rest, out)
+        geometry = self._geometry(x)
+        out = self._k[:n] * (geometry.angles[:n] - self._rest[:n]) ** 2
+        if len(geometry.fading):
+            hinge_fading.energies(x, *self._fading(geometry), out)
         return out
+
+    def _fading(self, geometry: HingeGeometry) -> tuple[Array | Stencil, ...]:
+        """Arguments of the functions of ``hinge_fading`` about the hinges and their law."""
+        hinges = self.stencil, self._triangles.sides, geometry.fading
+        return *hinges, self._limit, geometry.angles, self._k, self._rest
 
     def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
         corners, sides, hinges = self._triangles
-        triangles, angles, lengths = self._geometry(x)
-        geometry, law = (triangles, self._limit, angles, lengths), (self._k, self._rest)
+        geometry = self._geometry(x)
+        triangles, angles, lengths, fading = geometry
         forces = np.empty(self.n_elements + 1)
-        hinge_forces.edge_forces(x, self.stencil, sides, *geometry, *law, forces, out)
+        hinge_forces.edge_forces(sides, triangles, angles, lengths, self._k, self._rest, forces)
         hinge_forces.add_gradient(corners, hinges, triangles, forces, out)
+        if len(fading):
+            hinge_fading.add_gradient(x, *self._fading(geometry), out)
 
     @property
     def couplings(self) -> Couplings:
@@ -132,11 +150,14 @@ class Bending(Elastic):
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         corners, sides, hinges = self._triangles
-        within, across, shape = offsets[self.name], offsets[f"{self.name} across"], self._geometry(x)
+        within, across, geometry = offsets[self.name], offsets[f"{self.name} across"], self._geometry(x)
+        triangles, angles, lengths, fading = geometry
         factors = np.empty((self.n_elements + 1, 2))
-        law = self._k, self._rest, self._limit, weight
-        add_across(x, self.stencil, sides, *shape, blend, *law, within, across, values, factors)
-        add_within(x, corners, hinges, sides, shape.triangles, factors, within, values)
+        law = self._k, self._rest, weight
+        add_across(sides, triangles, angles, lengths, blend, *law, across, values, factors)
+        add_within(x, corners, hinges, sides, triangles, factors, within, values)
+        if len(fading):
+            hinge_fading.add_hessian(x, *self._fading(geometry), blend, weight, within, across, values)
         self._geometry.forget()  # frees memory for the linear solve that follows
 
     def force_scale(self, size: float) -> Array:

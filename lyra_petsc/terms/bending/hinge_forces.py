@@ -1,68 +1,24 @@
-"""Energies of hinges and their gradients, from the triangles' ``shape`` (T, 7) of ``hinge_shape``.
+"""Forces of hinges that do not fade, from the triangles' ``shape`` (T, 7) of ``hinge_shape``.
 
 The gradient is assembled by triangles, since all forces of a triangle's hinges act along its normal.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.vector3 import point
-from lyra_petsc.terms.bending.dihedral_angle import angle_parts
-from lyra_petsc.terms.bending.hinge_energy import hinge_energy, hinge_gradient, hinge_weight
 from lyra_petsc.terms.bending.hinge_shape import fades
 
 
-@kernel(inline="always")
-def limits_of(limit, sides, h):  # type: ignore[no-untyped-def]
-    """The limits of |normal|² of the two triangles of hinge h."""
-    return limit[sides[h, 0] >> 2], limit[sides[h, 1] >> 2]
-
-
 @kernel()
-def weights(x, s, sides, limit, out):  # type: ignore[no-untyped-def]
-    """Write the factor w(a1) w(a2) of each hinge into out (E,); 1 unless a triangle has nearly collapsed."""
-    for h in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
-        limits = limits_of(limit, sides, h)
-        out[h] = hinge_weight(square1, square2, limits[0], limits[1])
-
-
-@kernel()
-def energies(x, s, sides, shape, limit, theta, k, rest, out):  # type: ignore[no-untyped-def]
-    """Write the energy [J] of the first len(out) hinges."""
-    for h in range(out.shape[0]):
-        change = theta[h] - rest[h]
-        out[h] = k[h] * change * change
-        if fades(shape, sides, h):
-            x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-            _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
-            out[h] = hinge_energy(theta[h], square1, square2, k[h], rest[h], limits_of(limit, sides, h))
-
-
-@kernel()
-def edge_forces(x, s, sides, shape, limit, theta, length, k, rest, force, out):  # type: ignore[no-untyped-def]
+def edge_forces(sides, shape, theta, length, k, rest, force):  # type: ignore[no-untyped-def]
     """Write the hinges' moments over their edge lengths [N] into force (E + 1,).
 
-    Entries of hinges that fade, and the last one, are 0; the gradients of hinges that fade are added to out
-    (n_local, 3).
+    Entries of hinges that fade, and the last one, are 0.
     """
-    g = np.empty((4, 3))
     force[-1] = 0.0
-    for h in range(s.shape[0]):
-        if not fades(shape, sides, h):
-            force[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
-        else:
-            force[h] = 0.0
-            x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-            limits = limits_of(limit, sides, h)
-            moment = hinge_gradient(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, g)
-            for a in range(4):
-                for i in range(3):
-                    out[s[h, a], i] += moment * g[a, i]
+    for h in range(len(k)):
+        force[h] = 0.0 if fades(shape, sides, h) else 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
 
 
 @kernel()

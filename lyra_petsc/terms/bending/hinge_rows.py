@@ -13,81 +13,33 @@ products of γ = (c_j, c_i, −ℓ).
 
 from __future__ import annotations
 
-import numpy as np
-
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.kernels.scatter import AHEAD, fetch_ahead
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 from lyra_petsc.kernels.vectors import add_outers, add_six, fetch
-from lyra_petsc.terms.bending.hinge_energy import hinge_hessian
-from lyra_petsc.terms.bending.hinge_forces import limits_of
 from lyra_petsc.terms.bending.hinge_shape import fades, triangles_at
 
 
 @kernel(inline="always")
-def _ends(corner):  # type: ignore[no-untyped-def]
+def ends(corner):  # type: ignore[no-untyped-def]
     """The two other corners of a triangle, in its orientation."""
     return (corner + 1 if corner < 2 else 0), (corner - 1 if corner > 0 else 2)
 
 
-@kernel(inline="always")
-def _pair_index(a, b):  # type: ignore[no-untyped-def]
-    """Index of the coupling of corners a and b among (0, 0), (0, 1), …, (2, 2) of a triangle."""
-    low, high = min(a, b), max(a, b)
-    return low * (5 - low) // 2 + high
-
-
-@kernel(inline="always")
-def _same_block(at, swapped):  # type: ignore[no-untyped-def]
-    """Offset of the same block, to which values are added transposed if ``swapped``."""
-    return 2 * (at >> 1) + int(swapped) if at >= 0 else at
-
-
 @kernel()
-def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
-    """Write the offsets of all couplings of hinge h into out (10,)."""
-    one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3
-    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs against the edge
-    out[0] = within[one, _pair_index(i, i)]
-    out[1] = _same_block(within[one, _pair_index(i, j)], s[h, 0] < s[h, 1])
-    out[2] = _same_block(within[one, _pair_index(i, p)], s[h, 0] < s[h, 2])
-    out[3] = _same_block(within[two, _pair_index(k, q)], s[h, 0] < s[h, 3])
-    out[4] = within[one, _pair_index(j, j)]
-    out[5] = _same_block(within[one, _pair_index(j, p)], s[h, 1] < s[h, 2])
-    out[6] = _same_block(within[two, _pair_index(m, q)], s[h, 1] < s[h, 3])
-    out[7] = within[one, _pair_index(p, p)]
-    out[8] = across[h]
-    out[9] = within[two, _pair_index(q, q)]
-
-
-@kernel()
-def _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight times all blocks of hinge h, which fades."""
-    gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
-    x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-    hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, gradient, blocks)
-    add_element(weight[h], blocks, offsets, values)
-
-
-@kernel()
-def add_across(  # type: ignore[no-untyped-def]
-    x, s, sides, shape, theta, length, blend, k, rest, limit, weight, within, across, values, factors
-):
+def add_across(sides, shape, theta, length, blend, k, rest, weight, across, values, factors):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks across the hinges' edges; ``blend`` 0 is exact.
 
-    Writes ``factors`` (E + 1, 2), k'/s and z/√s times the weight, for ``add_within``. Hinges that fade are
-    added completely and get factors 0.
+    Writes ``factors`` (E + 1, 2), k'/s and z/√s times the weight, for ``add_within``; 0 for hinges that fade,
+    which are left out.
     """
-    offsets = np.empty(10, dtype=within.dtype)
+    n = len(k)
     factors[-1, 0] = factors[-1, 1] = 0.0
-    for h in range(s.shape[0]):
-        fetch(values, across[min(h + AHEAD, s.shape[0] - 1)] >> 1)
+    for h in range(n):
+        fetch(values, across[min(h + AHEAD, n - 1)] >> 1)
         if fades(shape, sides, h):
             factors[h, 0] = factors[h, 1] = 0.0
-            hinge_offsets(h, s, sides, within, across, offsets)
-            limits = limits_of(limit, sides, h)
-            _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values)
             continue
         one, two = triangles_at(sides, h)
         square = length[h] * length[h]
@@ -106,7 +58,7 @@ def _beyond_side(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
     """
     h = Index(hinge >> 1)
     side = sides[h, Index(1 - (hinge & 1))]
-    t, (i, j) = Index(side >> 2), _ends(side & 3)
+    t, (i, j) = Index(side >> 2), ends(side & 3)
     stiff = factors[h, 0]
     normal = shape[t, 0], shape[t, 1], shape[t, 2]
     return stiff, factors[h, 1], stiff * shape[t, Index(3 + i)], stiff * shape[t, Index(3 + j)], normal

@@ -15,8 +15,9 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
     """Write the geometry of triangles into out (T, 7), from which derivatives of hinges are computed.
 
     Unit normal (3), cotangents of the corners' angles (3), |normal| [m²] (twice the area). All are 0 for
-    triangles whose hinges fade, that is, |normal|² is not above ``limit`` (T,).
+    triangles whose hinges fade, that is, |normal|² is not above ``limit`` (T,). Returns whether any do.
     """
+    any_fades = False
     for t in range(corners.shape[0]):
         a, b, c = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
         e0, e1, e2 = minus(c, b), minus(a, c), minus(b, a)
@@ -24,6 +25,7 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
         square = dot(m, m)
         if not square > limit[t]:
             out[t, :] = 0.0
+            any_fades = True
             continue
         size = math.sqrt(square)
         inverse = 1.0 / size
@@ -32,6 +34,7 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
         out[t, 4] = -inverse * dot(e2, e0)
         out[t, 5] = -inverse * dot(e0, e1)
         out[t, 6] = size
+    return any_fades
 
 
 @kernel(inline="always")
@@ -50,15 +53,15 @@ def fades(shape, sides, h):  # type: ignore[no-untyped-def]
 
 @kernel()
 def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-untyped-def]
-    """Write sines and cosines (E,) of dihedral angles, up to a common factor, and edge lengths (E,) [m]."""
+    """Write sines and cosines (E,) of dihedral angles, up to a common factor, and edge lengths (E,) [m].
+
+    Angles of hinges that fade are 0.
+    """
     for h in range(s.shape[0]):
-        x0, x1 = point(x, s[h, 0]), point(x, s[h, 1])
-        e = minus(x1, x0)
+        e = minus(point(x, s[h, 1]), point(x, s[h, 0]))
         length[h] = math.sqrt(dot(e, e))
         if fades(shape, sides, h):
-            sine[h], cosine[h], _, _ = dihedral_angle.angle_parts(
-                x0, x1, point(x, s[h, 2]), point(x, s[h, 3])
-            )
+            sine[h], cosine[h] = 0.0, 1.0
             continue
         one, two = triangles_at(sides, h)
         n1 = shape[one, 0], shape[one, 1], shape[one, 2]
