@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Ints
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 
 FEW = 16
 """Number of rows up to which rows with the same number in the first column are sorted by insertion."""
 
 
-def sort_rows(rows: Ints, first: NDArray[np.int64], second: NDArray[np.generic], n_columns: int) -> Ints:
+def sort_rows(rows: Ints, first: NDArray[np.int64], second: Array, n_columns: int) -> Ints:
     """The numbers ``rows`` (m,) in lexicographic order of these rows of ``first`` (n, p), and then of the
     first ``n_columns`` of ``second`` (n, q).
     """
@@ -72,4 +72,6 @@ def _merge(order, spare, begin, middle, end, first, second, n_columns):  # type:
             spare[place], a = order[a], a + 1
         else:
             spare[place], b = order[b], b + 1
-    order[begin:end] = spare[begin:end]
+    # not a slice: numba would compile its error message, too, which takes longer than all else here
+    for place in range(begin, end):
+        order[place] = spare[place]

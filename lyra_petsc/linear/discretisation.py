@@ -390,7 +390,7 @@ class Discretisation:
         Elements whose energy this rank counts come first. Those that a term itself returned (not ``sort``)
         stay in its order.
         """
-        layout = self.layout
+        layout, attributes = self.layout, attributes.astype(np.float64, copy=False)
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
         parts = [np.flatnonzero(counted), np.flatnonzero(~counted)]
@@ -400,7 +400,7 @@ class Discretisation:
         if (order[1:] < order[:-1]).any():
             stencil, attributes = stencil[order], attributes[order]
         local = layout.local(stencil.ravel()).reshape(stencil.shape).astype(np.int32)
-        data = {"what": attributes.astype(np.float64, copy=False), "number": stencil.astype(np.float64)}
+        data = {"what": attributes, "number": stencil.astype(np.float64)}
         return Elements(local, data, len(parts[0]))
 
     def update_pattern(self, acting: Mapping[Elastic, NDArray[np.bool_]]) -> bool:

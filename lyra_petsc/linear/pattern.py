@@ -149,7 +149,7 @@ class BlockPattern:
         if isinstance(coupling, MixedStencil):
             assert self.edge_couplings is not None
             return self.edge_couplings.offsets_of(coupling, self)
-        stencil = _stencil(coupling)
+        stencil = np.ascontiguousarray(_stencil(coupling))
         n = stencil.shape[1]
         out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
         _look_up(self.indptr, self.columns, stencil, out)

@@ -142,23 +142,23 @@ def kernels_of(law: str) -> Kernels:
 
     @kernel()
     def add_hessian(  # type: ignore[no-untyped-def]
-        x, y, z, s, blend, inverse, area, c, law, weight, offsets, values
+        x, y, z, linearised, s, blend, inverse, area, c, law, weight, offsets, values
     ):
         """Add weight (E,) times the Hessian blocks [N/m] to block rows at ``offsets`` (E, 6).
 
-        The geometric part contains the stress of the strain at z linearised at y, or of that at x if y and z
-        are None. The regularised Hessian replaces this stress by the tensile part of the stress of extensions
-        along the material axes, as the original Lyra. Three blocks are computed; those with the first vertex
-        follow from invariance under translation.
+        The geometric part contains the stress of the strain at z linearised at y, or of that at x if not
+        ``linearised``. The regularised Hessian replaces this stress by the tensile part of the stress of
+        extensions along the material axes, as the original Lyra. Three blocks are computed; those with the
+        first vertex follow from invariance under translation.
         """
         for e in range(s.shape[0]):
             fetch_ahead(e, offsets, values, 6)
             m, w = Index(law[e]), weight[e] * area[e]
             f = _deformation(x, s, e, inverse)
-            if y is None:
-                e0, e1, e2 = _green(f)
-            else:
+            if linearised:
                 e0, e1, e2 = _linearised_green(_deformation(z, s, e, inverse), _deformation(y, s, e, inverse))
+            else:
+                e0, e1, e2 = _green(f)
             s0, s1, s2 = stress(e0, e1, e2, c, m)
             c11, c12, c22, c33, c13, c23 = tangent(e0, e1, e2, c, m)
             if blend > 0.0:
@@ -231,10 +231,11 @@ class Membrane(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        y, z = (None, None) if predicted is None else predicted
+        y, z = (x, x) if predicted is None else predicted
         constants = self._inverse, self._area, *self.laws
+        strained = x, y, z, predicted is not None
         self._kernels.add_hessian(
-            x, y, z, self.stencil, blend, *constants, weight, offsets[self.name], values
+            *strained, self.stencil, blend, *constants, weight, offsets[self.name], values
         )
 
     def force_scale(self, size: float) -> Array:

@@ -568,7 +568,7 @@ def find_active(x, x_obs, kind, points, offset, gap, stiffness, parallel, shares
 
 @kernel()
 def _enlarged(keys, link, n):  # type: ignore[no-untyped-def]
-    """Copies with new_keys than n + 1 rows."""
+    """Copies with more than n + 1 rows."""
     new_keys, new_link = np.empty((2 * n + 64, 4), dtype=np.int64), np.full(2 * n + 64, -1)
     for row in range(len(link)):  # assignments of whole arrays take seconds to compile
         for k in range(4):
@@ -1080,7 +1080,7 @@ def add_corrections(x, x_obs, dx, kind, points, offset, gap, target, side, loade
         for i in range(4):
             if points[e, i] >= 0 and beta[i] != 0.0:
                 row, row_weight = Index(points[e, i]), abs(beta[i])
-                weight[row] += row_weight
+                weight[row, 0] += row_weight
                 for k in range(3):
                     out[row, k] += row_weight * shortfall * beta[i] / square * n[k]
     return found

@@ -155,7 +155,7 @@ class SheetSearch:
         while True:
             out, new_bounds = np.empty((self._capacity, 7), dtype=np.int64), known.copy()
             between = patch_pairs, known, extra, new_bounds, drift
-            constants = 3 * patches.MAX_TRIANGLES, self._rings, limit
+            constants = 3 * patches.MAX_TRIANGLES, self._rings, float(limit)
             n_found = _find_pairs(x, dx, *between, *simplices, numbers, *radii, *constants, out)
             if n_found > limit:
                 return None

@@ -113,7 +113,7 @@ def _no_pairs() -> Pairs:
 
 def _order(key: Ints) -> Ints:
     """Rows (E,) of keys (E, 10) in ascending order of the keys."""
-    return sort_rows(np.arange(len(key)), key, key, 0)
+    return sort_rows(np.arange(len(key)), key, np.empty((len(key), 0)), 0)
 
 
 class CoulombFriction(Elastic):
