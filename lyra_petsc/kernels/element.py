@@ -17,3 +17,8 @@ leaf: Any = partial(kernel, _nrt=False)
 """For functions that kernels call and that create no arrays: without reference counting of their arguments.
 Numba counts references in a whole function or not at all, and atomic counting takes several times as long as
 a few sums."""
+
+inlined: Any = partial(leaf, forceinline=True)
+"""Like ``leaf``, for small functions: LLVM copies them to where they are called. Numba's ``inline="always"``
+copies them before it infers types, which takes longer to compile and runs as fast; it is for functions whose
+arguments are literals, which would be compiled for each of them."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_triangle
 from lyra_petsc.mesh.elements import Elements
@@ -34,7 +34,7 @@ from lyra_petsc.terms.term import Elastic, Offsets
 Stencil = NDArray[np.int32]
 
 
-@kernel(inline="always")
+@inlined()
 def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
     """Columns fu and fv of the deformation gradient of triangle e, six numbers."""
     a, b, c = Index(s[e, 0]), Index(s[e, 1]), Index(s[e, 2])
@@ -47,7 +47,7 @@ def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@kernel(inline="always")
+@inlined()
 def _green(f):  # type: ignore[no-untyped-def]
     """Green strain (E_uu, E_vv, 2 E_uv) of a deformation gradient."""
     ux, uy, uz, vx, vy, vz = f
@@ -58,7 +58,7 @@ def _green(f):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel(inline="always")
+@inlined()
 def _linearised_green(f, g):  # type: ignore[no-untyped-def]
     """Green strain of deformation gradient f, linearised at g: without the terms quadratic in f − g."""
     ux, uy, uz, vx, vy, vz = f
@@ -71,7 +71,7 @@ def _linearised_green(f, g):  # type: ignore[no-untyped-def]
     return e0, e1, e2
 
 
-@kernel(inline="always")
+@inlined()
 def _factors(s, c, ga, gb):  # type: ignore[no-untyped-def]
     """Factors (uu, uv, vu, vv, geometric) of a Hessian block of two vertices with gradients ga and gb.
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, scaled
 
 
-@kernel(inline="always")
+@inlined()
 def angle_parts(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """|n1| |n2| sin θ and |n1| |n2| cos θ, both 0 where a triangle has no normal; |n1|² and |n2|² [m⁴]."""
     e = minus(x1, x0)
@@ -33,7 +33,7 @@ def angle(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     return math.atan2(sine, cosine), square1, square2
 
 
-@kernel(inline="always")
+@inlined()
 def angle_gradients(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """Gradients of θ at the four points [1/m]; |n1|² and |n2|² [m⁴]."""
     e, a, b = minus(x1, x0), minus(x2, x0), minus(x3, x0)
@@ -47,7 +47,7 @@ def angle_gradients(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     return (g0, g1, g2, g3), square1, square2
 
 
-@kernel(forceinline=True)
+@inlined()
 def triangle_derivatives(length, u, p, m):  # type: ignore[no-untyped-def]
     """One triangle's part in the derivatives of θ: unit normal n, ω_c and ∇b_c of its corners, and t.
 

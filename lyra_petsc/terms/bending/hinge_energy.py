@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus
 from lyra_petsc.terms.bending.dihedral_angle import add_angle_hessian, angle_gradients
 
@@ -53,7 +53,7 @@ def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-d
     return fade(square1, limit1)[0] * fade(square2, limit2)[0]
 
 
-@kernel(inline="always")
+@inlined()
 def hinge_energy(theta, square1, square2, k, rest, limits):  # type: ignore[no-untyped-def]
     """Energy [J] of stiffness k [N·m] at angle theta, with rest angle ``rest`` [rad]."""
     full = k * (theta - rest) * (theta - rest)
@@ -62,7 +62,7 @@ def hinge_energy(theta, square1, square2, k, rest, limits):  # type: ignore[no-u
     return full * hinge_weight(square1, square2, limits[0], limits[1])
 
 
-@kernel(inline="always")
+@inlined()
 def _write_angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     """Write the gradient of θ into g (4, 3); return |n1|² and |n2|² [m⁴]."""
     slopes, square1, square2 = angle_gradients(x0, x1, x2, x3)
@@ -71,7 +71,7 @@ def _write_angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     return square1, square2
 
 
-@kernel(inline="always")
+@inlined()
 def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[no-untyped-def]
     """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the energy's gradient [N]."""
     square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
@@ -81,7 +81,7 @@ def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[n
     return 2.0 * k * change
 
 
-@kernel(inline="always")
+@inlined()
 def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
     """Write the Hessian blocks [N/m] into out (4, 4, 3, 3); g (4, 3) is work space.
 
@@ -122,7 +122,7 @@ def _square_gradients(x0, x1, x2, x3, out):  # type: ignore[no-untyped-def]
     out *= 2.0
 
 
-@kernel(inline="always")
+@inlined()
 def _set_row(row, values):  # type: ignore[no-untyped-def]
     row[0], row[1], row[2] = values
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.scatter import add_element
 from lyra_petsc.kernels.vector3 import point
 from lyra_petsc.terms.bending.dihedral_angle import angle_parts
@@ -16,7 +16,7 @@ from lyra_petsc.terms.bending.hinge_energy import hinge_energy, hinge_gradient, 
 from lyra_petsc.terms.bending.hinge_rows import ends
 
 
-@kernel(inline="always")
+@inlined()
 def limits_of(limit, sides, h):  # type: ignore[no-untyped-def]
     """The limits of |normal|² of the two triangles of hinge h."""
     return limit[sides[h, 0] >> 2], limit[sides[h, 1] >> 2]
@@ -55,14 +55,14 @@ def add_gradient(x, s, sides, fading, limit, theta, k, rest, out):  # type: igno
                 out[s[h, a], i] += moment * g[a, i]
 
 
-@kernel(inline="always")
+@inlined()
 def _pair_index(a, b):  # type: ignore[no-untyped-def]
     """Index of the coupling of corners a and b among (0, 0), (0, 1), …, (2, 2) of a triangle."""
     low, high = min(a, b), max(a, b)
     return low * (5 - low) // 2 + high
 
 
-@kernel(inline="always")
+@inlined()
 def _same_block(at, swapped):  # type: ignore[no-untyped-def]
     """Offset of the same block, to which values are added transposed if ``swapped``."""
     return 2 * (at >> 1) + int(swapped) if at >= 0 else at

@@ -14,14 +14,14 @@ products of γ = (c_j, c_i, −ℓ).
 from __future__ import annotations
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.scatter import AHEAD, fetch_ahead
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 from lyra_petsc.kernels.vectors import add_outers, add_six, fetch
 from lyra_petsc.terms.bending.hinge_shape import fades, triangles_at
 
 
-@kernel(inline="always")
+@inlined()
 def ends(corner):  # type: ignore[no-untyped-def]
     """The two other corners of a triangle, in its orientation."""
     return (corner + 1 if corner < 2 else 0), (corner - 1 if corner > 0 else 2)
@@ -51,7 +51,7 @@ def add_across(sides, shape, theta, length, blend, k, rest, weight, across, valu
         add_outers(values, across[h], 0.0, ((left, right),))
 
 
-@kernel(inline="always")
+@inlined()
 def _beyond_side(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
     """Data of the triangle beyond a side: the hinge's two factors, the first of them times γ of that triangle
     at the side's two ends (in the order of this triangle), and the normal.
@@ -64,7 +64,7 @@ def _beyond_side(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
     return stiff, factors[h, 1], stiff * shape[t, Index(3 + i)], stiff * shape[t, Index(3 + j)], normal
 
 
-@kernel(forceinline=True)
+@inlined()
 def _diagonal_block(n, g, corner, one, other):  # type: ignore[no-untyped-def]
     """R and L of the diagonal block of a corner, with the two sides ``one`` and ``other`` at it."""
     _, _, turn, slope, _ = corner
@@ -73,7 +73,7 @@ def _diagonal_block(n, g, corner, one, other):  # type: ignore[no-untyped-def]
     return ((g, n), (p, n1), (q, n2), *left), left
 
 
-@kernel(forceinline=True)
+@inlined()
 def _off_diagonal_block(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
     """R and L of the block of corners a and b, with the side between them.
 

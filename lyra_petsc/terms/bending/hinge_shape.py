@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point
 from lyra_petsc.terms.bending import dihedral_angle
 
@@ -37,13 +37,13 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
     return any_fades
 
 
-@kernel(inline="always")
+@inlined()
 def triangles_at(sides, h):  # type: ignore[no-untyped-def]
     """Numbers of the two triangles of hinge h."""
     return Index(sides[h, 0] >> 2), Index(sides[h, 1] >> 2)
 
 
-@kernel(inline="always")
+@inlined()
 def fades(shape, sides, h):  # type: ignore[no-untyped-def]
     """Whether hinge h fades, because one of its triangles has hardly any area."""
     # no ``or``: with a branch numba counts references to the arrays here, for each hinge

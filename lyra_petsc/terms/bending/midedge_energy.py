@@ -36,7 +36,7 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import cross, dot, point, scaled
 from lyra_petsc.kernels.vectors import add_corners, fetch
 from lyra_petsc.terms.bending.hinge_energy import VANISHED, add_square_hessian, fade
@@ -56,14 +56,14 @@ AHEAD = 4
 """Number of triangles by which the prefetch of blocks runs ahead of the assembly."""
 
 
-@kernel(inline="always")
+@inlined()
 def _stiffness_of(stiffness, e):  # type: ignore[no-untyped-def]
     """K_00, K_01, K_02, K_11, K_12 and K_22 of triangle e."""
     k = stiffness
     return k[e, 0], k[e, 1], k[e, 2], k[e, 3], k[e, 4], k[e, 5]
 
 
-@kernel(inline="always")
+@inlined()
 def _rest_tangents(rest, e):  # type: ignore[no-untyped-def]
     """The three T̄ and the three S̄ of triangle e."""
     if rest.shape[0] == 0:
@@ -72,21 +72,21 @@ def _rest_tangents(rest, e):  # type: ignore[no-untyped-def]
     return u0, u1, u2, coupling_tangent(u0), coupling_tangent(u1), coupling_tangent(u2)
 
 
-@kernel(inline="always")
+@inlined()
 def _diagonal(k, rest, t0, t1, t2):  # type: ignore[no-untyped-def]
     """K_ii (T_i − T̄_i) of a triangle for i = 0, 1, 2, and the three T_i − T̄_i."""
     f0, f1, f2 = t0 - rest[0], t1 - rest[1], t2 - rest[2]
     return k[0] * f0, k[3] * f1, k[5] * f2, f0, f1, f2
 
 
-@kernel(inline="always")
+@inlined()
 def _coupling(k, rest, s0, s1, s2):  # type: ignore[no-untyped-def]
     """Σ_j≠i K_ij (S_j − S̄_j) of a triangle for i = 0, 1, 2, and the three S_i − S̄_i."""
     h0, h1, h2 = s0 - rest[3], s1 - rest[4], s2 - rest[5]
     return k[1] * h1 + k[2] * h2, k[1] * h0 + k[4] * h2, k[2] * h0 + k[4] * h1, h0, h1, h2
 
 
-@kernel(inline="always")
+@inlined()
 def _twice_energy(diagonal, coupling):  # type: ignore[no-untyped-def]
     """Twice the energy, from the results of `_diagonal` and `_coupling`."""
     return (
@@ -99,7 +99,7 @@ def _twice_energy(diagonal, coupling):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel(inline="always")
+@inlined()
 def _twice_friction(friction, e):  # type: ignore[no-untyped-def]
     """Twice the energy of friction of triangle e."""
     return 2.0 * friction[e, 1] if friction.shape[0] > 0 else 0.0
@@ -123,13 +123,13 @@ def energies(tangent, stiffness, rest, limit, friction, out):  # type: ignore[no
             out[e] = np.inf
 
 
-@kernel(inline="always")
+@inlined()
 def _axpy(f, u, v):  # type: ignore[no-untyped-def]
     """f u + v."""
     return f * u[0] + v[0], f * u[1] + v[1], f * u[2] + v[2]
 
 
-@kernel(inline="always")
+@inlined()
 def _combine(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
     """a u + b v + c w."""
     return (
@@ -170,7 +170,7 @@ def _load_constants(  # type: ignore[no-untyped-def]
         batch[Index(BATCH * 36) + Index(number)] = friction[min(first + number, last), 0]
 
 
-@kernel(inline="always")
+@inlined()
 def _unpack(batch, i):  # type: ignore[no-untyped-def]
     """Data of triangle i of a batch: e_i, N, |N|², T and its ``derivatives_below_45``, γ_i, K, T̄ with S̄, q
     and the c of friction.
@@ -187,7 +187,7 @@ def _unpack(batch, i):  # type: ignore[no-untyped-def]
     return e0, e1, e2, normal, dot(normal, normal), (t0, t1, t2), slopes, spins, k, rest, q, c
 
 
-@kernel(inline="always")
+@inlined()
 def _moments(k, rest, tangent, slopes):  # type: ignore[no-untyped-def]
     """The moments p of a triangle, and the results of `_diagonal` and `_coupling`."""
     t0, t1, t2 = tangent
@@ -196,7 +196,7 @@ def _moments(k, rest, tangent, slopes):  # type: ignore[no-untyped-def]
     return (d[0] * a0 + c[0] * b0, d[1] * a1 + c[1] * b1, d[2] * a2 + c[2] * b2), d, c
 
 
-@kernel(inline="always")
+@inlined()
 def _corner_gradients(e0, e1, e2, normal, square, spins, moments):  # type: ignore[no-untyped-def]
     """Gradients Σ_i p_i ∂α_i/∂x_c at corners 1 and 2; those of all three corners sum to 0."""
     (p0, p1, p2), (g0, g1, g2) = moments, spins
@@ -262,7 +262,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
             flat[indices[e, j]] += edge_forces[j]
 
 
-@kernel(inline="always")
+@inlined()
 def _outers(g, w):  # type: ignore[no-untyped-def]
     """Σ_i g_i w_iᵀ of three vectors g and three w, a 3 × 3 block by rows."""
     (a, b, c), (d, e, f) = g, w
@@ -279,7 +279,7 @@ def _outers(g, w):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel(inline="always")
+@inlined()
 def _symmetric(a, b, c, d):  # type: ignore[no-untyped-def]
     """a bᵀ + b aᵀ + c dᵀ + d cᵀ, a 3 × 3 block by rows."""
     xx, yy, zz = (
@@ -293,7 +293,7 @@ def _symmetric(a, b, c, d):  # type: ignore[no-untyped-def]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
-@kernel(inline="always")
+@inlined()
 def _sum(u, v):  # type: ignore[no-untyped-def]
     """Sum of two 3 × 3 blocks."""
     return (
@@ -303,13 +303,13 @@ def _sum(u, v):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@kernel(inline="always")
+@inlined()
 def _times(f, u):  # type: ignore[no-untyped-def]
     """A 3 × 3 block times f."""
     return f * u[0], f * u[1], f * u[2], f * u[3], f * u[4], f * u[5], f * u[6], f * u[7], f * u[8]
 
 
-@kernel(inline="always")
+@inlined()
 def _second_derivative(spin, e, square, n, scale, moment):  # type: ignore[no-untyped-def]
     """moment (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of edge e, square = |e|²; s ρ = 2 e / |e|² + γ × t."""
     about = _axpy(2.0 / square, e, cross(spin, scaled(1.0 / math.sqrt(square), e)))
@@ -358,14 +358,14 @@ def _fade_hessian(x0, x1, x2, normal, square, limit, energy, exact, moments, g1,
     return three, one, two, (weight * a, weight * b, weight * c, weight * d, weight * e, weight * f)
 
 
-@kernel(inline="always")
+@inlined()
 def _block(blocks, a, b):  # type: ignore[no-untyped-def]
     """Block (a, b) of an array (4, 4, 3, 3), by rows."""
     u = blocks[a, b]
     return u[0, 0], u[0, 1], u[0, 2], u[1, 0], u[1, 1], u[1, 2], u[2, 0], u[2, 1], u[2, 2]
 
 
-@kernel(inline="always")
+@inlined()
 def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
     """Add factor times the coupling (3,) of a vertex with an edge.
 
@@ -378,7 +378,7 @@ def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
         flat[first + stride + stride] += factor * column[2]
 
 
-@kernel(inline="always")
+@inlined()
 def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-untyped-def]
     """Add factor times the couplings of the three corners with an edge; that of corner 0 is −one − two."""
     both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
@@ -387,14 +387,14 @@ def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-u
     _add_column(flat, offsets[e, 6 + edge], two, factor)
 
 
-@kernel(inline="always")
+@inlined()
 def _add_scalar(flat, at, value):  # type: ignore[no-untyped-def]
     """Add the coupling of two edges; ``at`` is negative if it is not stored."""
     if at >= 0:
         flat[Index(at)] += value
 
 
-@kernel(inline="always")
+@inlined()
 def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
     """Prefetch the matrix values to which a later triangle is added, in units of 3 × 3 blocks."""
     later = min(e + AHEAD, offsets.shape[0] - 1)
@@ -406,7 +406,7 @@ def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
         fetch(values, offsets[later, pair] // 9)
 
 
-@kernel(inline="always")
+@inlined()
 def _hessian(e0, e1, e2, normal, square, tangent, slopes, spins, k, rest, sliding, q, exact):  # type: ignore[no-untyped-def]
     """The Hessian of one triangle, and the energy, moments p and gradients of α that `_fade_hessian` needs.
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.vector3 import cross, dot, minus, point, scaled
 
 EXTENSION = 0.75 * math.pi
@@ -127,7 +127,7 @@ def transported(frames: Frames, direction: Array) -> Array:
     return out
 
 
-@kernel(inline="always")
+@inlined()
 def _parallel_transport(t0, a0, t):  # type: ignore[no-untyped-def]
     """The vector a₀ parallel transported from t₀ to t."""
     c, b = dot(t0, t), cross(t0, t)
@@ -156,7 +156,7 @@ def directors(x, ends, direction, reference, cosine, sine, out):  # type: ignore
             out[k, i] = cosine[k] * a[i] + sine[k] * w[i]
 
 
-@kernel(inline="always")
+@inlined()
 def spin(t0, e):  # type: ignore[no-untyped-def]
     """The vector γ [1/m] of an edge e [m] with the frame direction t₀.
 
@@ -166,14 +166,14 @@ def spin(t0, e):  # type: ignore[no-untyped-def]
     return scaled(-1.0 / (square + math.sqrt(square) * dot(t0, e)), cross(t0, e))
 
 
-@kernel(inline="always")
+@inlined()
 def vector_at(values, k, first):  # type: ignore[no-untyped-def]
     """Three values of row k, from column ``first``."""
     k = Index(k)
     return values[k, first], values[k, first + 1], values[k, first + 2]
 
 
-@kernel(inline="always")
+@inlined()
 def edges_and_normal(x0, x1, x2):  # type: ignore[no-untyped-def]
     """Edges e_i of a triangle, its normal N = 2A n and |N|²."""
     e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
@@ -181,7 +181,7 @@ def edges_and_normal(x0, x1, x2):  # type: ignore[no-untyped-def]
     return e0, e1, e2, normal, dot(normal, normal)
 
 
-@kernel(inline="always")
+@inlined()
 def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
     """T of the angle about edge e from the normal N of a triangle to a director d; NaN if undefined."""
     height, side = _height_and_side(d, e, normal)
@@ -190,7 +190,7 @@ def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
     return _extended_tangent(side, height)
 
 
-@kernel(inline="always")
+@inlined()
 def _height_and_side(d, e, normal):  # type: ignore[no-untyped-def]
     """Components of a director d along the normal N and in the triangle's plane, both times |N|."""
     return dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
@@ -204,7 +204,7 @@ def _extended_tangent(side, height):  # type: ignore[no-untyped-def]
     return math.copysign(1.0 + 2.0 * (math.atan2(abs(side), height) - 0.25 * math.pi), side)
 
 
-@kernel(inline="always")
+@inlined()
 def derivatives(t):  # type: ignore[no-untyped-def]
     """T', T'', S, S' and S'' at the angle with T = t."""
     if abs(t) < 1.0:
@@ -212,7 +212,7 @@ def derivatives(t):  # type: ignore[no-untyped-def]
     return _extended_derivatives(t)
 
 
-@kernel(inline="always")
+@inlined()
 def derivatives_below_45(t):  # type: ignore[no-untyped-def]
     """T', T'', S, S' and S'' at the angle with T = t, up to 45°."""
     slope = 1.0 + t * t
@@ -228,13 +228,13 @@ def _extended_derivatives(t):  # type: ignore[no-untyped-def]
     return 2.0, 0.0, math.copysign(_coupling_polynomial(x), t), slope, math.copysign(1.0, t) * bend
 
 
-@kernel(inline="always")
+@inlined()
 def _coupling_polynomial(x):  # type: ignore[no-untyped-def]
     """S at an angle x [rad] beyond 45°."""
     return 1.0 + x * (2.0 + x * (QUADRATIC + x * CUBIC))
 
 
-@kernel(inline="always")
+@inlined()
 def coupling_tangent(t):  # type: ignore[no-untyped-def]
     """S at the angle with T = t."""
     if abs(t) < 1.0:
@@ -282,7 +282,7 @@ def load_edges(x, stencil, first, batch):  # type: ignore[no-untyped-def]
         store(batch, 6, i, minus(x1, x0))
 
 
-@kernel(inline="always")
+@inlined()
 def _without_rest_angle(director, edges, rest_rotation, e, i, edge):  # type: ignore[no-untyped-def]
     """The director of edge i of triangle e, rotated about the edge by −ᾱ."""
     d = vector_at(director, edges[e, i], 0)
@@ -303,7 +303,7 @@ def _load_directors(edges, director, rest_rotation, first, batch):  # type: igno
         store(batch, 15, i, _without_rest_angle(director, edges, rest_rotation, e, 2, load(batch, 6, i)))
 
 
-@kernel(inline="always")
+@inlined()
 def _tangent_below_45(d, e, normal):  # type: ignore[no-untyped-def]
     """T of an angle up to 45°, 2 beyond."""
     height, side = _height_and_side(d, e, normal)

@@ -44,7 +44,7 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel, leaf
+from lyra_petsc.kernels.element import inlined, kernel, leaf
 from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
 from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, scaled
 from lyra_petsc.kernels.vectors import add_outers
@@ -77,7 +77,7 @@ PARALLEL = 1e-12
 """Squared sine of the angle of two edges or triangle sides below which they are treated as parallel."""
 
 
-@kernel(inline="always")
+@inlined()
 def _segment_parameter(p, a, b):  # type: ignore[no-untyped-def]
     """Parameter t of the point of segment a b that is nearest to p: 0 at a, 1 at b."""
     dx = minus(b, a)
@@ -86,7 +86,7 @@ def _segment_parameter(p, a, b):  # type: ignore[no-untyped-def]
     return min(max(t, 0.0), 1.0)
 
 
-@kernel(inline="always")
+@inlined()
 def _nearest_on_segment(p, a, b):  # type: ignore[no-untyped-def]
     """Parameter t of the nearest point of segment a b, and its squared distance from p."""
     t = _segment_parameter(p, a, b)
@@ -94,7 +94,7 @@ def _nearest_on_segment(p, a, b):  # type: ignore[no-untyped-def]
     return t, dot(g, g)
 
 
-@kernel(forceinline=True)
+@inlined()
 def _nearest_in_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
     """Barycentric coordinates v and w (of b and c) of the point of a triangle that is nearest to p.
 
@@ -285,7 +285,7 @@ def _load_points(x, x_obs, points, e, p):  # type: ignore[no-untyped-def]
             p[i, 0], p[i, 1], p[i, 2] = x_obs[n, 0], x_obs[n, 1], x_obs[n, 2]
 
 
-@kernel(inline="always")
+@inlined()
 def barrier(delta, gap):  # type: ignore[no-untyped-def]
     """b / k for 0 < δ < gap and its first two derivatives."""
     left, part = gap - delta, gap / delta

@@ -10,7 +10,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel, leaf
+from lyra_petsc.kernels.element import inlined, kernel, leaf
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.near import near_pairs_by_tree
 from lyra_petsc.mesh.topology import edge_table
@@ -237,7 +237,7 @@ def _simplex_boxes(x, dx, corners, first, needed, drift, out, patch_box):  # typ
             patch_box[p, 6] = max(patch_box[p, 6], out[6, at])
 
 
-@kernel(inline="always")
+@inlined()
 def _interval_distance(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
     """Distance of two intervals; 0 if they overlap."""
     above, below = other_low - high, low - other_high

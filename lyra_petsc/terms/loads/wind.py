@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vector3 import area_normal, dot, scaled
 from lyra_petsc.kernels.vectors import add_outers
@@ -36,7 +36,7 @@ def normals(x, s, out):  # type: ignore[no-untyped-def]
         out[e, 0], out[e, 1], out[e, 2] = scaled(1.0 / length if length > 0.0 else 0.0, n)
 
 
-@kernel(inline="always")
+@inlined()
 def _relative(v, s, e, n, wind):  # type: ignore[no-untyped-def]
     """v_rel and its normal component v_n of triangle e."""
     a, b, c = s[e, 0], s[e, 1], s[e, 2]
@@ -75,7 +75,7 @@ def add_gradient(v, s, area, n, wind, density, drag, out):  # type: ignore[no-un
             out[i, 2] -= fz
 
 
-@kernel(inline="always")
+@inlined()
 def _hessian_factors(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-def]
     """Factors of n nᵀ and of the identity in each block of the Hessian of triangle e."""
     _, _, _, vn = _relative(v, s, e, n, wind)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined
 
 THRESHOLD = 0.75**2
 """λ₀²."""
@@ -26,7 +26,7 @@ COINCIDENT = 1e-6
 """Difference of the two λ² below which they count as equal."""
 
 
-@kernel(inline="always")
+@inlined()
 def _barrier(c):  # type: ignore[no-untyped-def]
     """φ/b as a function of c = λ², and its first two derivatives."""
     if c >= THRESHOLD:
@@ -38,13 +38,13 @@ def _barrier(c):  # type: ignore[no-untyped-def]
     return q * q * q + (slope + 0.5 * second * beyond) * beyond, slope + second * beyond, second
 
 
-@kernel(inline="always")
+@inlined()
 def _stretches(e0, e1, e2):  # type: ignore[no-untyped-def]
     """Mean and half the difference of the two λ²."""
     return 1.0 + e0 + e1, math.sqrt((e0 - e1) * (e0 - e1) + e2 * e2)
 
 
-@kernel(inline="always")
+@inlined()
 def energy(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²] of the Green strain (E_uu, E_vv, 2 E_uv); b [N/m]."""
     mean, half = _stretches(e0, e1, e2)
@@ -53,7 +53,7 @@ def energy(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     return b * (_barrier(mean - half)[0] + _barrier(mean + half)[0])
 
 
-@kernel(inline="always")
+@inlined()
 def _slopes(mean, half):  # type: ignore[no-untyped-def]
     """φ'₁ + φ'₂, (φ'₂ − φ'₁)/half, φ''₁ + φ''₂ and φ''₂ − φ''₁, divided by b."""
     _, slope1, second1 = _barrier(mean - half)
@@ -62,7 +62,7 @@ def _slopes(mean, half):  # type: ignore[no-untyped-def]
     return slope1 + slope2, ratio, second1 + second2, second2 - second1
 
 
-@kernel(inline="always")
+@inlined()
 def stress(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     mean, half = _stretches(e0, e1, e2)
@@ -73,7 +73,7 @@ def stress(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     return b * (both + ratio * d), b * (both - ratio * d), b * ratio * e2
 
 
-@kernel(inline="always")
+@inlined()
 def tangent(e0, e1, e2, b):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     mean, half = _stretches(e0, e1, e2)

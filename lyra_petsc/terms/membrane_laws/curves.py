@@ -14,7 +14,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined, kernel
 from lyra_petsc.scene.materials.curves import interpolation
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.terms.membrane_laws import compression
@@ -72,21 +72,21 @@ def _shear(e, c, m):  # type: ignore[no-untyped-def]
     return total, (force if e >= 0.0 else -force), slope
 
 
-@kernel(inline="always")
+@inlined()
 def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²]."""
     sheet = _axial(e0, c, m, 0)[0] + _axial(e1, c, m, 1)[0] + _shear(e2, c, m)[0]
     return sheet + compression.energy(e0, e1, e2, c[m, 0])
 
 
-@kernel(inline="always")
+@inlined()
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     s0, s1, s2 = compression.stress(e0, e1, e2, c[m, 0])
     return s0 + _axial(e0, c, m, 0)[1], s1 + _axial(e1, c, m, 1)[1], s2 + _shear(e2, c, m)[1]
 
 
-@kernel(inline="always")
+@inlined()
 def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     c11, c12, c22, c33, c13, c23 = compression.tangent(e0, e1, e2, c[m, 0])

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.terms.membrane_laws import compression
 
@@ -51,7 +51,7 @@ _N = np.array([vector for vectors in FIBRES for vector in vectors])
 _COEFFICIENT = np.repeat(np.arange(len(FIBRES)), [len(vectors) for vectors in FIBRES])
 
 
-@kernel(inline="always")
+@inlined()
 def _stiffening(s):  # type: ignore[no-untyped-def]
     """h at s > 0, and its first two derivatives."""
     if s < FULL_STRAIN:
@@ -60,7 +60,7 @@ def _stiffening(s):  # type: ignore[no-untyped-def]
     return 0.5 * s * (s - FULL_STRAIN) + FULL_STRAIN * FULL_STRAIN / 6.0, s - 0.5 * FULL_STRAIN, 1.0
 
 
-@kernel(inline="always")
+@inlined()
 def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²]."""
     s0, s1, s2 = c[m, 0] * e0 + c[m, 1] * e1, c[m, 1] * e0 + c[m, 2] * e1, c[m, 3] * e2
@@ -72,7 +72,7 @@ def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel(inline="always")
+@inlined()
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     s0, s1, s2 = compression.stress(e0, e1, e2, c[m, 4])
@@ -89,7 +89,7 @@ def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     return s0, s1, s2
 
 
-@kernel(inline="always")
+@inlined()
 def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     c11, c12, c22, c33, c13, c23 = compression.tangent(e0, e1, e2, c[m, 4])

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined
 from lyra_petsc.scene.materials.library import ShellMaterial
 
 SOFTENS = False
@@ -21,7 +21,7 @@ SMALLEST_DETERMINANT = 1e-3
 """det C below which W is extended as a parabola: strains predicted in Newton's method may have det C < 0."""
 
 
-@kernel(inline="always")
+@inlined()
 def _volume(e0, e1, e2, beta):  # type: ignore[no-untyped-def]
     """t = det C − 1; and t/2 + g, 1 + 2 g' and g'' of g = ((det C)^−β − 1)/2β as a function of t."""
     t = 2.0 * (e0 + e1) + 4.0 * e0 * e1 - e2 * e2
@@ -34,7 +34,7 @@ def _volume(e0, e1, e2, beta):  # type: ignore[no-untyped-def]
     return t, value + (0.5 * slope + 0.5 * second * beyond) * beyond, slope + 2.0 * second * beyond, second
 
 
-@kernel(inline="always")
+@inlined()
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     _, _, slope, _ = _volume(e0, e1, e2, c[m, 1])
@@ -42,14 +42,14 @@ def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     return mu * (slope - 2.0 * rest * e1), mu * (slope - 2.0 * rest * e0), mu * rest * e2
 
 
-@kernel(inline="always")
+@inlined()
 def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²]."""
     _, value, _, _ = _volume(e0, e1, e2, c[m, 1])
     return c[m, 0] * (value - 2.0 * e0 * e1 + 0.5 * e2 * e2)
 
 
-@kernel(inline="always")
+@inlined()
 def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     _, _, slope, second = _volume(e0, e1, e2, c[m, 1])

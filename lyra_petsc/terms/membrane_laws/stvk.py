@@ -8,26 +8,26 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import inlined
 from lyra_petsc.scene.materials.library import ShellMaterial
 
 SOFTENS = True
 
 
-@kernel(inline="always")
+@inlined()
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     return c[m, 0] * e0 + c[m, 1] * e1, c[m, 1] * e0 + c[m, 2] * e1, c[m, 3] * e2
 
 
-@kernel(inline="always")
+@inlined()
 def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """Energy [J] per rest area [m²]."""
     s0, s1, s2 = c[m, 0] * e0 + c[m, 1] * e1, c[m, 1] * e0 + c[m, 2] * e1, c[m, 3] * e2
     return 0.5 * (e0 * s0 + e1 * s1 + e2 * s2)
 
 
-@kernel(inline="always")
+@inlined()
 def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
     """c11, c12, c22, c33, c13, c23 [N/m]."""
     return c[m, 0], c[m, 1], c[m, 2], c[m, 3], 0.0, 0.0
