@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lyra_petsc.show.view.live import LivePage
 
 
-COMPILING_TAKES = "half a minute, or one to two minutes with contact or midedge"
+COMPILING_TAKES = "about 15 s, or half to one and a half minutes with contact or midedge"
 NO_CACHE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 
 
