@@ -71,7 +71,7 @@ def _write_angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     return square1, square2
 
 
-@inlined()
+@kernel()
 def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[no-untyped-def]
     """Write g (4, 3) [1/m] and return a moment [N·m]; their product is the energy's gradient [N]."""
     square1, square2 = _write_angle_gradient(x0, x1, x2, x3, g)
@@ -81,7 +81,7 @@ def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[n
     return 2.0 * k * change
 
 
-@inlined()
+@kernel()
 def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
     """Write the Hessian blocks [N/m] into out (4, 4, 3, 3); g (4, 3) is work space.
 
