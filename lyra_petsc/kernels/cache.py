@@ -10,6 +10,7 @@ import inspect
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from glob import escape
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -52,9 +53,9 @@ class KernelCache(FunctionCache):
         super().__init__(function)  # type: ignore[no-untyped-call]
         file, program = Path(inspect.getfile(function)), Path(__file__).parents[1]
         within = file.is_relative_to(program)
-        stamp = digest(program / file.relative_to(program).parts[0] if within else file.parent)
-        name = f"{self._impl.filename_base}-{stamp}"
-        self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)  # type: ignore[no-untyped-call]
+        self._stamp = digest(program / file.relative_to(program).parts[0] if within else file.parent)
+        name = f"{self._impl.filename_base}-{self._stamp}"
+        self._cache_file = IndexDataCacheFile(self._cache_path, name, self._stamp)  # type: ignore[no-untyped-call]
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         """Numba's key, but with the names of functions in the closure instead of their pickled contents.
@@ -85,8 +86,17 @@ class KernelCache(FunctionCache):
         """Store a compiled function if the disk permits."""
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            self._remove_outdated()
         except OSError:
             COMPILATION.all_cached = False
+
+    def _remove_outdated(self) -> None:
+        """Remove the files of older sources of this function, whatever its line was."""
+        function, line = self._impl.filename_base.rsplit("-", 1)
+        version = line.partition(".")[2]
+        for file in Path(self._cache_path).glob(f"{escape(function)}-*.{version}-*.nb[ci]"):
+            if f"-{self._stamp}." not in file.name:
+                file.unlink(missing_ok=True)
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -46,11 +47,20 @@ def test_compiled_functions_are_found_again(place: Path) -> None:
     assert len(files(place, "nbi")) == len(files(place, "nbc")) == 1
 
 
-def test_a_change_of_any_module_invalidates_the_cache(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_of_any_module_replaces_the_cache(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled(2.5)
+    (before,) = files(place, "nbc")
+    other = before.with_name(before.name.replace("twice", "twice_as_much"))
+    moved = before.with_name(re.sub(r"-\d+\.", "-9999.", before.name))
+    for file in (other, moved):
+        file.write_bytes(before.read_bytes())
     monkeypatch.setattr(kernel_cache, "digest", lambda room: "changed")
     assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 1)
+    assert not before.exists()
+    assert not moved.exists()
     assert len(files(place, "nbc")) == 2
+    assert other.exists()
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
