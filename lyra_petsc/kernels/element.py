@@ -19,6 +19,9 @@ Numba counts references in a whole function or not at all, and atomic counting t
 a few sums."""
 
 inlined: Any = partial(leaf, forceinline=True)
-"""Like ``leaf``, for small functions: LLVM copies them to where they are called. Numba's ``inline="always"``
-copies them before it infers types, which takes longer to compile and runs as fast; it is for functions whose
-arguments are literals, which would be compiled for each of them."""
+"""Like ``leaf``, for small functions, which LLVM copies to where they are called.
+
+Functions that these call must not create arrays either. Numba's ``inline="always"`` copies functions before
+it infers types: kernels run as fast, but take longer to compile. It remains for functions called with many
+different literals, since others would be compiled for each literal.
+"""

@@ -172,8 +172,7 @@ class Discretisation:
             found = self._global_elements
             asked = [term for term, n in zip(asked, had, strict=True) if n or len(found[term][0])]
         for term in self._changing if others else asked:
-            searched = term.search_distance > 0.0
-            elements = self._local_elements(*self._global_elements[term], sort=searched)
+            elements = self._local_elements(*self._global_elements[term], sort=term.search_distance > 0.0)
             if others or not np.array_equal(elements.stencil, term.stencil):
                 self._located.discard(term.name)
             term.set_elements(elements)

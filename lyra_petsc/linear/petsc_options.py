@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from petsc4py import PETSc
 
@@ -76,6 +76,11 @@ def quoted(error: Exception) -> list[str]:
     return named or [name for name, value in options.items() if _number(value) in numbers]
 
 
+def of_user(names: Iterable[str], ours: Collection[str]) -> list[str]:
+    """Those options, with or without values, that the program did not set itself (``ours``, without -)."""
+    return [name for name in names if name.split()[0].removeprefix("-") not in ours]
+
+
 def _number(text: str) -> float | None:
     try:
         return float(text)
@@ -86,13 +91,12 @@ def _number(text: str) -> float | None:
 def culprits(error: Exception, ours: Collection[str] = ()) -> str:
     """The options that an error is probably about, for a message: those it quotes, else likely ones.
 
-    Options that the program set itself, ``ours``, are named only if there are no others.
+    Options that the program set itself (``ours``, without -) are named only if there are no others.
     """
     options = PETSc.Options().getAll()
     names = quoted(error) or [f"-{name}" for name in options if name.endswith(PYTHON_SUFFIXES)]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
-    users = [name for name in names if name.split()[0].removeprefix("-") not in ours]
-    return " or ".join(sorted(users or names)) or "PETSc options"
+    return " or ".join(sorted(of_user(names, ours) or names)) or "PETSc options"
 
 
 def _text(value: Value) -> str:

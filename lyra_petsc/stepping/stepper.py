@@ -22,6 +22,7 @@ from lyra_petsc.linear.petsc_options import (
     culprits,
     fill_gaps,
     is_set,
+    of_user,
     quoted,
     refused,
 )
@@ -442,8 +443,8 @@ class Stepper:
         """Whether an error of PETSc's on all ranks is one of this preset's set-up, not of a user's option,
         and another preset is left; collective.
         """
-        users = set(quoted(error)).difference(f"-{name}" for name in self._filled)
-        may_help = len(self.presets) > 1 and reasons.in_set_up(error) and not users
+        blamed = of_user(quoted(error), self._filled)
+        may_help = len(self.presets) > 1 and reasons.in_set_up(error) and not blamed
         return bool(self._system.points.comm.allreduce(int(may_help), op=MPI.MIN))
 
     def saved_state(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:

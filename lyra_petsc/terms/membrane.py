@@ -231,11 +231,10 @@ class Membrane(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        y, z = (x, x) if predicted is None else predicted
+        positions, linearised = (x, *(predicted or (x, x))), predicted is not None
         constants = self._inverse, self._area, *self.laws
-        strained = x, y, z, predicted is not None
         self._kernels.add_hessian(
-            *strained, self.stencil, blend, *constants, weight, offsets[self.name], values
+            *positions, linearised, self.stencil, blend, *constants, weight, offsets[self.name], values
         )
 
     def force_scale(self, size: float) -> Array:

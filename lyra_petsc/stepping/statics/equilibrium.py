@@ -161,7 +161,7 @@ class Equilibrium:
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
         self._scale = self._norm(force)
-        # forces that hold a sheet which then slides would push it on
+        # if the sheet slides, forces that hold its start shape would push it along
         held = not system.discretisation.has_near_elements
         if held and self._scale > floor and not self._unstable():
             system.applied.unbalanced = -force

@@ -1,7 +1,7 @@
-"""Hinges that fade: energies, gradients and Hessians of those few with a triangle of hardly any area.
+"""Energies, gradients and Hessians of hinges that fade, because a triangle has hardly any area.
 
-They are kernels of their own, called only where there are such hinges, so that other scenes need not compile
-them. ``fading`` (F,) are the hinges' numbers.
+Such hinges are rare. Their kernels are separate from those of the others, and called only if some hinges
+fade, so that most scenes need not compile them. ``fading`` (F,) are the numbers of these hinges.
 """
 
 from __future__ import annotations

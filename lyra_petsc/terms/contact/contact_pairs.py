@@ -285,7 +285,7 @@ def _load_points(x, x_obs, points, e, p):  # type: ignore[no-untyped-def]
             p[i, 0], p[i, 1], p[i, 2] = x_obs[n, 0], x_obs[n, 1], x_obs[n, 2]
 
 
-@kernel(forceinline=True)  # also for arrays
+@kernel(forceinline=True)  # not `inlined`, as δ may be an array
 def barrier(delta, gap):  # type: ignore[no-untyped-def]
     """b / k for 0 < δ < gap and its first two derivatives."""
     left, part = gap - delta, gap / delta
