@@ -40,7 +40,7 @@ from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.statics.equilibrium import MAX_GROWTH
+from lyra_petsc.stepping.statics.pseudo_time import MAX_GROWTH
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames, transported
 from lyra_petsc.terms.term import Term

@@ -28,9 +28,11 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
-from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
+from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
+from lyra_petsc.stepping.statics.progress import PROGRESS, Progress
+from lyra_petsc.stepping.statics.pseudo_time import LEAP_ITERATIONS, PseudoTimeStep
 from lyra_petsc.stepping.statics.relaxation import Relaxation
 from lyra_petsc.stepping.statics.stability import Examination, Stability
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -41,12 +43,8 @@ if TYPE_CHECKING:
 MAX_SOLVES = 100
 """Largest number of proximal steps in a load step."""
 
-PATIENCE, PROGRESS = 15, 0.9
-"""A load step is given up after so many proximal steps without progress, that is without a force below this
-fraction of the least one so far, and without friction also without a fall of the potential energy."""
-
-MIN_FALL = 0.01
-"""Fall of the potential energy below its least value that counts as progress, over its range so far."""
+PATIENCE = 15
+"""A load step is given up after so many proximal steps without progress."""
 
 MAX_FAILURES = 8
 """Number of proximal steps after which a load step is given up if none has converged."""
@@ -58,28 +56,8 @@ MAX_IN_VAIN = 60
 """Number of proximal steps without progress since the last equilibrium after which smaller increments are
 not tried."""
 
-EASY, FAIR = 6, 15
-"""Newton iterations up to which Δτ grows fast, and up to which it grows."""
-
-GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
-"""Factors of Δτ."""
-
-LEAP, LEAP_ITERATIONS = 1e3, 30
-"""A leap is a solve with Δτ larger by this factor, or with the last Δτ of the load step before. It is given
-up after so many iterations, and no further leaps are tried."""
-
 MAX_RESUMED = 3
 """Number of leaps in a load step that are resumed where they ended: a snap may take more iterations."""
-
-BELOW_CEILING, CEILING_GROWTH = 0.5, 2.0
-"""With contact Δτ stays below this fraction of a ceiling, the Δτ of the last failed solve. The ceiling grows
-by the second factor in each solve: while sheets fall before they come to rest, longer Δτ fail repeatedly."""
-
-MAX_GROWTH = 1e7
-"""Largest Δτ over the first one: beyond it the last term is below round-off."""
-
-UNLIMITED = float(np.finfo(np.float64).max)
-"""A number larger than any Δτ."""
 
 HARD_STEP = 14
 """After a load step with more Newton iterations, the next one begins with `WholeStiffness`."""
@@ -96,7 +74,6 @@ MAX_SLIDING = 5
 
 WORSE = 2.0
 """Δτ is reduced after a solve in which the out-of-balance force grows by more than this factor."""
-
 
 MAX_DESCENTS = 5
 """Largest number of unstable equilibria that are left along their lowest mode."""
@@ -139,7 +116,6 @@ class Equilibrium:
         assert isinstance(system.integrator, Static)
         self._system, self._stepper, self._integrator = system, stepper, system.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
-        self._max_pseudo_dt, self._safe_pseudo_dt = MAX_GROWTH, 1.0
         self._whole_first = False  # whether the next load step begins with it
         self._in_vain = 0
         self._friction = FrictionBalance(system)
@@ -153,8 +129,13 @@ class Equilibrium:
         # load factor λ of the last equilibrium, change of the loads over that of λ [N], and tangent dx/dλ [m]
         self._last_factor, self._load_rate = 0.0, np.zeros((system.points.n_owned, 3))
         self._tangent: Array | None = None
-        # with factors the first solve may take any Δτ
-        self._last_pseudo_dt = UNLIMITED if stepper.linear.factors else 0.0
+        self._pseudo_time = PseudoTimeStep(
+            self._integrator,
+            spacing,
+            leaps=not system.active.viscous,
+            contact=system.discretisation.limits_motion,
+            factors=stepper.linear.factors,
+        )
         self._extrapolation = Extrapolation(system.points.comm)
         self._follows = bool(system.active.viscous or system.active.following)
         system.applied.factor = 0.0
@@ -212,59 +193,52 @@ class Equilibrium:
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
         system.applied.factor = factor
-        newton = linear = solves = restarted_at = resumed = 0
-        moving_energy, last, solved_once, leaping = 0.0, np.inf, False, not system.active.viscous
-        ceiling, contact, held = np.inf, system.discretisation.limits_motion, self._is_held()
+        newton = linear = solves = resumed = 0
+        moving_energy, last, solved_once = 0.0, np.inf, False
+        contact = system.discretisation.limits_motion
+        judges_energy = contact and self._is_held()
         contacts = system.active.contact_state()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
-        history: list[Iteration] = []
-        potentials: list[float] = []
-        relaxation = Relaxation(system.points.comm)
+        progress, relaxation = Progress(), Relaxation(system.points.comm)
+        self._pseudo_time.begin_load_step()
         self._friction.begin_step()
         attempt = Attempt(False, 0, 0, 0.0)
         while True:
-            force = self._out_of_balance(before, factor, first=solves == 0)
+            force, fastest = self._out_of_balance(before, factor)
             if not solves:
+                self._pseudo_time.start(fastest)
                 self._predict_by_tangent(before, factor)
                 moving_energy, frozen = system.moving_energy_before, system.active.frozen
-            history.append(_history_entry(force, attempt if solves else None))
-            if solves and contact and held and not system.has_friction_pairs:
-                potentials.append(self._potential_energy(x))
+            progress.record_force(force, attempt.linear_iterations if solves else None)
+            if solves and judges_energy and not system.has_friction_pairs:
+                progress.record_potential(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             if balanced and self._friction.is_settled():
                 self._friction.record_success(factor - before)
                 system.moving_energy_before = moving_energy
-                self._in_vain, self._last_pseudo_dt, self._last_factor = 0, self._integrator.pseudo_dt, factor
+                self._in_vain, self._last_factor = 0, factor
+                self._pseudo_time.sufficed = self._integrator.pseudo_dt
                 linear += self._compute_tangent(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
-            balancing = restarted_at + _last_progress([each.residual for each in history[restarted_at:]])
-            last_progress = max(balancing, _last_fall(potentials))
-            message = self._failure_message(solves, last_progress, x, solved_once=solved_once)
+            message = self._failure_message(solves, progress, x, solved_once=solved_once)
             # after a failed solve only friction has changed, to what the normal forces allow
-            diverging = attempt.converged and force > WORSE * history[balancing].residual
-            if (
-                not message
-                and solved_once
-                and diverging
-                and solves - last_progress >= MAX_SLIDING
-                and self._friction.sliding_message()
-            ):
-                message = "no equilibrium: proximal steps lead farther off"
+            diverges = attempt.converged and force > WORSE * progress.least_force
+            if diverges and solved_once and not message:
+                message = self._message_if_sliding_on(solves - progress.last)
             if message:
                 break
-            if attempt.converged and force > WORSE * last:
-                self._integrator.pseudo_dt *= SHRINK
-            last = force
             if attempt.converged:
+                if force > WORSE * last:
+                    self._pseudo_time.shrink()
                 system.active.accept_substep(system.x)
+            last = force
             if balanced:  # except for friction
-                restarted_at = len(history)
-                longest, leaping = self._integrator.pseudo_dt, not system.active.viscous
-                last = self._out_of_balance(before, factor, first=True)
-                self._integrator.pseudo_dt = longest
+                progress.restart()
+                last, fastest = self._out_of_balance(before, factor)
+                self._pseudo_time.restart(fastest)
             if self._follows:
                 linear += self._update_loads(relaxation, before, factor, first=solves == 0)
-            leap = leaping and self._integrator.pseudo_dt > self._safe_pseudo_dt
+            leap = self._pseudo_time.is_leap
             attempt = self._proximal_step(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
                 relaxation.record(system.applied.force_at(system.x))
@@ -275,34 +249,26 @@ class Equilibrium:
             linear += attempt.linear_iterations
             if attempt.converged:
                 if not solved_once:  # the force before is smaller if handles move
-                    restarted_at = len(history)
+                    progress.restart()
                 solved_once = True
                 system.active.transport_frames(system.x)  # edges may turn far until they are in equilibrium
-                used = self._integrator.pseudo_dt
-                grown = min(used * growth(attempt.newton_iterations), BELOW_CEILING * ceiling)
-                self._safe_pseudo_dt = longest = max(grown, used)
-                ceiling *= CEILING_GROWTH
-                longest *= LEAP if leaping else 1.0
-                self._integrator.pseudo_dt = min(longest, self._max_pseudo_dt)
+                self._pseudo_time.record_success(attempt.newton_iterations)
             elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
                 resumed += 1
-            elif leap:  # Δτ was too long, perhaps too long to set up a preconditioner
-                leaping = self._last_pseudo_dt == UNLIMITED and not solved_once and not contact
-                self._integrator.pseudo_dt = self._safe_pseudo_dt
+            elif leap:
+                self._pseudo_time.record_failed_leap(first=not solved_once)
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
                 if contact:
-                    ceiling = self._integrator.pseudo_dt
                     self._resume_from_lowest(attempt)
-                self._integrator.pseudo_dt *= SHRINK
-                leaping = False
+                self._pseudo_time.record_failure()
         slides = self._friction.record_failure(factor - before) if message and solved_once else ""
         if slides:
             message = f"{message}; {slides}"
-        self._last_pseudo_dt = 0.0
-        self._in_vain += solves - balancing if solved_once else 0
-        stuck = attempt.failed_solve or self._failed_solve(before, factor, history, x)
+        self._pseudo_time.sufficed = 0.0
+        self._in_vain += solves - progress.of_force if solved_once else 0
+        stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
         system.active.transport_frames(system.x, frozen)
@@ -453,7 +419,7 @@ class Equilibrium:
                 if displacement is None:
                     break
             x = system.x[:n].copy()
-            self._last_pseudo_dt = 0.0
+            self._pseudo_time.sufficed = 0.0
             system.state.set(x + displacement, np.zeros_like(x))
             attempt = self.attempt(before, factor)
             newton += attempt.newton_iterations
@@ -476,7 +442,7 @@ class Equilibrium:
         """Arrays (n_owned, 3) and numbers of a checkpoint at the equilibrium at ``factor``; collective."""
         self._extrapolation.record(factor, self._system.x[: self._system.points.n_owned].copy())
         arrays, past = self._extrapolation.saved_state()
-        numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._last_pseudo_dt}
+        numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._pseudo_time.sufficed}
         numbers |= self._friction.saved_state()
         if self._tangent is not None:
             arrays["rate"] = self._tangent
@@ -487,7 +453,7 @@ class Equilibrium:
         self._scale = float(saved.get("scale", self._scale))
         self._in_vain = int(saved.get("in_vain", self._in_vain))
         self._friction.restore(saved)
-        self._last_pseudo_dt = float(saved.get("sufficed", self._last_pseudo_dt))
+        self._pseudo_time.sufficed = float(saved.get("sufficed", self._pseudo_time.sufficed))
         self._last_factor = factor
         self._tangent = np.array(arrays["rate"]) if "rate" in arrays else None
         x = self._system.x[: self._system.points.n_owned].copy()
@@ -498,11 +464,10 @@ class Equilibrium:
         """Whether attempts since the last equilibrium show that a smaller increment would not help."""
         return self._in_vain >= MAX_IN_VAIN or self._friction.in_vain
 
-    def _failure_message(self, solves: int, last_progress: int, before: Array, *, solved_once: bool) -> str:
+    def _failure_message(self, solves: int, progress: Progress, before: Array, *, solved_once: bool) -> str:
         """Why no further proximal step is taken, or an empty string; collective.
 
-        ``before`` (n_owned, 3) [m] are the positions at the start of the load step, ``last_progress`` is the
-        number of the last solve that made progress.
+        ``before`` (n_owned, 3) [m] are the positions at the start of the load step.
         """
         if not solved_once:
             return "no proximal step was found" if solves >= MAX_FAILURES else ""
@@ -510,12 +475,21 @@ class Equilibrium:
         moved = self._system.points.comm.allreduce(moved, MPI.MAX)
         if moved > MAX_DISPLACEMENT * self._size:
             return f"no equilibrium within {moved:.1g} m of the start, as if nothing held the sheet"
-        if solves - last_progress >= PATIENCE:
-            idle = solves - last_progress
+        idle = solves - progress.last
+        if idle >= PATIENCE:
             return f"no equilibrium: the last {idle} of {solves} proximal steps came no nearer"
         return f"no equilibrium within {solves} proximal steps" if solves >= MAX_SOLVES else ""
 
-    def _failed_solve(self, before: float, factor: float, history: list[Iteration], x: Array) -> FailedSolve:
+    def _message_if_sliding_on(self, idle: int) -> str:
+        """Why a load step that diverges is given up after ``idle`` proximal steps without progress, or ''.
+
+        It is if all contacts slide; collective.
+        """
+        if idle < MAX_SLIDING or not self._friction.sliding_message():
+            return ""
+        return "no equilibrium: proximal steps lead farther off"
+
+    def _failed_solve(self, before: float, factor: float, progress: Progress, x: Array) -> FailedSolve:
         """The state that the proximal steps from positions x (n_owned, 3) [m] have reached; collective."""
         system, n = self._system, self._system.points.n_owned
         system.begin_step(before, factor)
@@ -524,7 +498,7 @@ class Equilibrium:
         if system.held:
             system.prescribed.targets(before, factor, factor, goal)
         return FailedSolve(
-            iterations=tuple(history),
+            iterations=tuple(progress.history),
             norm=self._norm(force),
             time=factor,
             velocity=np.zeros_like(x),
@@ -538,27 +512,21 @@ class Equilibrium:
             linear_residuals=np.empty(0),
         )
 
-    def _out_of_balance(self, before: float, factor: float, *, first: bool) -> float:
-        """Norm [N] of the out-of-balance force; sets Δτ for the first solve of a load step; collective."""
+    def _out_of_balance(self, before: float, factor: float) -> tuple[float, float]:
+        """Norm [N] of the out-of-balance force, and the largest acceleration [m/s²] by it; collective."""
         system = self._system
         system.begin_step(before, factor)
         force, largest = system.out_of_balance()
         norm = self._norm(force)
         if not np.isfinite(norm):  # an obstacle has moved into the sheet
-            return norm
+            return norm, 0.0
         self._scale = max(self._scale, largest)
-        if first and norm > 0.0:
-            n = system.points.n_vertices
-            fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
-            if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
-                mass = system.points.global_sum(float(system.mass.sum()))[0] / system.points.n_vertices_global
-                fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
-            fastest = system.points.comm.allreduce(fastest, MPI.MAX)
-            self._safe_pseudo_dt = float(np.sqrt(self._spacing / fastest))
-            self._max_pseudo_dt = MAX_GROWTH * self._safe_pseudo_dt
-            last_pseudo_dt = 0.0 if system.active.viscous else self._last_pseudo_dt
-            self._integrator.pseudo_dt = min(max(self._safe_pseudo_dt, last_pseudo_dt), self._max_pseudo_dt)
-        return norm
+        n = system.points.n_vertices
+        fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
+        if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
+            mass = system.points.global_sum(float(system.mass.sum()))[0] / system.points.n_vertices_global
+            fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
+        return norm, system.points.comm.allreduce(fastest, MPI.MAX)
 
     def _balanced(self, force: float, last: float) -> bool:
         """Whether a force of this norm [N] counts as zero; ``last`` [N] is that one proximal step before.
@@ -589,34 +557,3 @@ def _note(found: Stability, followed: int, message: str) -> str:
     if found.neutral:
         notes.append(f"the equilibrium is neutral: nothing resists {found.neutral} motions (neutral pivots)")
     return "; ".join(notes)
-
-
-def _history_entry(force: float, attempt: Attempt | None) -> Iteration:
-    """Entry of the history: the out-of-balance force [N] after a proximal step, or before the first."""
-    return Iteration(force, attempt.linear_iterations if attempt else 0, 0, 1.0 if attempt else None)
-
-
-def _last_progress(forces: list[float]) -> int:
-    """Index of the last force that was notably less than all before."""
-    last, smallest = 0, np.inf
-    for number, force in enumerate(forces):
-        if force < PROGRESS * smallest:
-            last, smallest = number, force
-    return last
-
-
-def _last_fall(energies: list[float]) -> int:
-    """Number of the last solve whose energy was notably less than after all before; 0 if there is none."""
-    last, least, highest = 0, np.inf, -np.inf
-    for number, energy in enumerate(energies, start=1):
-        highest = max(highest, energy)
-        if energy < least - MIN_FALL * (highest - least):
-            last, least = number, energy
-    return last
-
-
-def growth(iterations: int) -> float:
-    """Factor of Δτ after a solve with this number of Newton iterations."""
-    if iterations <= EASY:
-        return GROW_FAST
-    return GROW if iterations <= FAIR else 1.0
