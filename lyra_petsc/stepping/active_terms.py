@@ -95,6 +95,11 @@ class ActiveTerms:
         """The results of `Elastic.friction_lag` of all terms."""
         return {name: sums for t in self.changing for name, sums in t.friction_lag(x, self.frozen[t]).items()}
 
+    def slip_under_changed_forces(self, x: Array, dx: Array) -> Array:
+        """The sums of `Elastic.slip_under_changed_forces` over all terms, (2,)."""
+        sums = [t.slip_under_changed_forces(x, dx, self.frozen[t]) for t in self.changing]
+        return np.sum(sums, axis=0)
+
     def contact_state(self) -> dict[Elastic, Any]:
         """State of the contacts of all terms, for `restore_contacts`."""
         return {term: term.contact_state() for term in self.changing}

@@ -504,6 +504,14 @@ class Elastic(Term):
         """
         return {}
 
+    def slip_under_changed_forces(self, x: Array, dx: Array, frozen: Any) -> tuple[float, float]:
+        """How far points slip while normal forces change, in a solve by dx (n_local, 3) [m] to x.
+
+        Two sums over this rank's vertices: slip times the change of the normal force since friction was
+        computed [J], and the larger of the normal forces before and after [N].
+        """
+        return 0.0, 0.0
+
     def contact_state(self) -> Any:
         """The contacts that the term has stored, for `restore_contacts`."""
         return None

@@ -163,8 +163,7 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
 
 @pytest.mark.parallel
 def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """It slides, with at most the friction of Eytelwein's formula, but more than by normal forces two load
-    steps before.
+    """It slides, with the friction of Eytelwein's formula: not with that of the normal forces before it slid.
 
     It starts bent to the rod. Forces that hold the start shape would push it on as it slides, away from any
     equilibrium.
@@ -181,12 +180,12 @@ def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
         newton += simulation.step().newton_iterations
     force = simulation.energy_balance.obstacle_forces(1)[0]
     simulation.destroy()
-    assert newton < 300
+    assert newton < 1200
     both, difference = -force[2], -force[4] / RADIUS
     # without the weight of the strip on the rod
     both -= WEIGHT * WIDTH * np.pi * RADIUS
     ratio, most = (both + difference) / (both - difference), np.exp(friction * np.pi)
-    assert 1.0 + 0.5 * (most - 1.0) < ratio < 1.05 * most
+    assert 0.97 * most < ratio < 1.05 * most
 
 
 @pytest.mark.parallel(1)
@@ -228,13 +227,14 @@ def test_sliding_off_an_obstacle_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel(1)
-def test_without_friction_a_cloth_is_pulled_off_a_table(comm: MPI.Comm) -> None:
+@pytest.mark.parametrize("friction", [0.0, 0.1])
+def test_a_cloth_is_pulled_off_a_table(comm: MPI.Comm, friction: float) -> None:
     """It snaps over the edge, while forces grow and the energy falls, and hangs from its handle.
 
     On one rank, as the number of iterations in a snap changes with rounding: on two ranks two runs took less
     than 900 and 1,011.
     """
-    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.0, {"step": 0.25})
+    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, friction, {"step": 0.25})
     scene["handles"] = [{"group": "right", "motion": "pull"}]
     scene["motions"] = {"pull": [{"time": 0.0}, {"time": 1.0, "translate": [0.4, 0.0, 0.0]}]}
     simulation, newton = SteppedScene(comm, scene_of(scene)), 0
@@ -242,7 +242,7 @@ def test_without_friction_a_cloth_is_pulled_off_a_table(comm: MPI.Comm) -> None:
         newton += simulation.step().newton_iterations
     x = gathered(simulation.problem.points, simulation.problem.system.x)
     simulation.destroy()
-    assert newton < 900
+    assert newton < 1200
     assert x[:, 0].min() > 0.9
     assert x[:, 2].min() == pytest.approx(0.02 - 1.2, abs=0.1)
 

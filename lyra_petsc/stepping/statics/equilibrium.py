@@ -5,8 +5,9 @@ Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²),
 that of the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton's method
 converges in few iterations, until the out-of-balance force is small without the last term. Loads that follow
 the shape (pressure, wind) are updated before every solve, under-relaxed; pressures also change during a solve
-with their own stiffness. Friction takes the normal forces of the solve before, and solves are repeated until
-these are close to the normal forces in the equilibrium.
+with their own stiffness. Friction takes the normal forces of the solve before. If points slip far while these
+change, the solve is repeated with a shorter Δτ; and solves are repeated until they are close to the normal
+forces in the equilibrium.
 
 A snap takes many solves in which the out-of-balance force grows, while the potential energy falls. If a solve
 in contact runs out of iterations, the next one starts from its iterate of least energy. With friction neither
@@ -118,7 +119,7 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._whole_first = False  # whether the next load step begins with it
         self._in_vain = 0
-        self._friction = FrictionBalance(system)
+        self._friction = FrictionBalance(system, spacing)
         self._pressures: WholeStiffness | None = None
         if system.active.following:
             from lyra_petsc.stepping.statics.whole_stiffness import (
@@ -238,7 +239,7 @@ class Equilibrium:
                 self._pseudo_time.restart(fastest)
             if self._follows:
                 linear += self._update_loads(relaxation, before, factor, first=solves == 0)
-            leap = self._pseudo_time.is_leap
+            leap, begin = self._pseudo_time.is_leap, system.x[:n].copy()
             attempt = self._proximal_step(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
                 relaxation.record(system.applied.force_at(system.x))
@@ -247,7 +248,11 @@ class Equilibrium:
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
-            if attempt.converged:
+            lags = attempt.converged and self._friction.lags(begin)
+            if lags and self._pseudo_time.shorten_to_repeat():
+                system.state.set(begin, np.zeros_like(x))
+                attempt = dataclasses.replace(attempt, converged=False)
+            elif attempt.converged:
                 if not solved_once:  # the force before is smaller if handles move
                     progress.restart()
                 solved_once = True

@@ -1,7 +1,8 @@
 """Consistency of friction with the normal forces of an equilibrium.
 
-Friction in a solve takes the normal forces of the solve before. A load step therefore repeats its solves
-until these are close to the normal forces in the equilibrium. If all contacts slide there may be none.
+Friction in a solve takes the normal forces of the solve before. Solves in which points slip far while normal
+forces change are therefore repeated with a shorter Δτ, and a load step repeats its solves until these are
+close to the normal forces in the equilibrium. If all contacts slide there may be none.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 LAG, MAX_ROUNDS = 1e-3, 10
 """Fraction by which friction may differ from what the normal forces of the equilibrium allow, and largest
 number of updates to reach it."""
+
+MAX_SLIP = 0.1
+"""Largest slip in a solve times the change of normal forces, over these and the mean edge length."""
 
 SLIDES, MAX_SLIDING = 0.95, 3
 """Fraction of the allowed friction from which on all contacts slide, and number of failed load steps with
@@ -33,8 +38,9 @@ class FrictionBalance:
         Whether so many load steps failed with sliding that a smaller one would not help.
     """
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system = system
+    def __init__(self, system: StageEquations, spacing: float) -> None:
+        self._system, self._spacing = system, spacing
+        self._acts = any(term.slips for term in system.active.changing)
         self.lag = 0.0
         self._rounds = self._sliding_steps = 0
         self._sliding_increment = 0.0  # the last increment of the load factor in which all slid
@@ -42,6 +48,20 @@ class FrictionBalance:
     def begin_step(self) -> None:
         """Begin a load step."""
         self.lag, self._rounds = 0.0, 0
+
+    def lags(self, begin: Array) -> bool:
+        """Whether points slipped too far in the solve from positions ``begin`` (n_owned, 3) [m]; collective.
+
+        Friction may have been far from what the normal forces allow.
+        """
+        if not (self._acts and self._system.discretisation.has_near_elements):
+            return False
+        x, points = self._system.x, self._system.points
+        displacement = x.copy()
+        displacement[: len(begin)] -= begin
+        points.update_ghosts(displacement)
+        slip, normal = points.global_sum(*self._system.active.slip_under_changed_forces(x, displacement))
+        return bool(slip > MAX_SLIP * self._spacing * normal)
 
     def is_settled(self) -> bool:
         """Whether friction needs no further update in a state that is balanced otherwise; collective."""

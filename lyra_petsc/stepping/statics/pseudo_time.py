@@ -58,7 +58,7 @@ class PseudoTimeStep:
         self._integrator, self._spacing = integrator, spacing
         self._leaps, self._contact = leaps, contact
         self.sufficed = UNLIMITED if factors else 0.0
-        self._safe, self._longest = 1.0, MAX_GROWTH
+        self._first, self._safe, self._longest = 1.0, 1.0, MAX_GROWTH
         self.begin_load_step()
 
     def begin_load_step(self) -> None:
@@ -68,6 +68,7 @@ class PseudoTimeStep:
     def start(self, fastest: float) -> None:
         """Set Δτ for the first solve of a load step, with the largest acceleration [m/s²]."""
         self._limit(fastest)
+        self._first = self._safe
         if fastest > 0.0:
             sufficed = self.sufficed if self._leaps else 0.0
             self._integrator.pseudo_dt = min(max(self._safe, sufficed), self._longest)
@@ -90,6 +91,15 @@ class PseudoTimeStep:
     def shrink(self) -> None:
         """Take a shorter Δτ, as the out-of-balance force grew."""
         self._integrator.pseudo_dt *= SHRINK
+
+    def shorten_to_repeat(self) -> bool:
+        """Take a shorter Δτ, to repeat a solve, and no leaps; returns False if Δτ is not above the first."""
+        used = self._integrator.pseudo_dt
+        if used <= self._first:
+            return False
+        self._integrator.pseudo_dt = self._first if self.is_leap else max(self._first, SHRINK * used)
+        self._ceiling, self._safe, self._leaping = used, self._integrator.pseudo_dt, False
+        return True
 
     def record_success(self, iterations: int) -> None:
         """Let Δτ grow after a solve with this number of Newton iterations."""

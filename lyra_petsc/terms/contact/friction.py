@@ -441,6 +441,29 @@ class CoulombFriction(Elastic):
         sums = np.stack([error.sum(axis=0), friction.sum(axis=0), (ratio * limit).sum(axis=0)], axis=1)
         return dict(zip(names, sums, strict=True))
 
+    def slip_under_changed_forces(self, x: Array, dx: Array, frozen: ObstacleMotion) -> tuple[float, float]:
+        contact, n = self._contact, len(self._vertex_data)
+        obstacles, motions, owned = contact.obstacles, frozen.end_motions, slice(self.n_owned)
+        beta, normal, force, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        points, obstacle = contact.points[pair], contact.obstacle[pair]
+        moved = obstacles.contact_displacements(x, points, beta, obstacle, motions)
+        found = np.einsum("ei,eik->ek", np.where(points >= 0, beta, 0.0), dx[np.maximum(points, 0)]) - moved
+        found -= np.einsum("ek,ek->e", found, normal)[:, None] * normal
+        stencil, given = self.stencil[owned].astype(np.int64), self._force[owned]
+        moved = obstacles.contact_displacements(x, stencil, self._beta[owned], self._obstacle[owned], motions)
+        before = np.einsum("ecik,eik->ec", self._gradients[owned], dx[stencil])
+        before -= self._tangential(moved, owned)
+
+        def by_vertex(first: Ints, normal_force: Array, slip: Array) -> tuple[Array, Array]:
+            total = np.bincount(first, normal_force, n).astype(np.float64)
+            moment = np.bincount(first, normal_force * np.linalg.norm(slip, axis=1), n)
+            return total, moment / np.maximum(total, np.finfo(float).tiny)
+
+        after, slip_after = by_vertex(contact.stencil[pair, 0], force, found)
+        given, slip_before = by_vertex(stencil[:, 0], given, before)
+        slip = np.maximum(slip_after, slip_before)
+        return float(np.vdot(np.abs(after - given), slip)), float(np.maximum(after, given).sum())
+
     def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
         return self._pairs, self._vertex_data.copy(), self._obstacle_loads, self._contact_time
 
