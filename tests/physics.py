@@ -78,10 +78,15 @@ def obj_file(
 
 
 def mirrored(
-    path: Path, planes: str, n: int, height: Callable[[Array], Array], width: float = 1.0
+    path: Path,
+    planes: str,
+    n: int,
+    height: Callable[[Array], Array],
+    width: float = 1.0,
+    fold: Callable[[Array], Array] = lambda x: x,
 ) -> tuple[dict[str, Any], Array]:
     """A surface of this height [m] over x, y in [0, 1] times a width [m], with its images in the planes x = 0
-    and y = 0; its mesh block and vertices.
+    and y = 0; its mesh block and vertices, both after ``fold`` of the vertices.
     """
     side = np.linspace(0.0, 1.0, n + 1)
     flat = np.array([(x, y) for y in side for x in side])
@@ -93,7 +98,7 @@ def mirrored(
             faces = np.concatenate([faces, faces[:, ::-1] + len(flat)])
             flat, same = np.unique(np.round(np.concatenate([flat, image]), 12), axis=0, return_inverse=True)
             faces = same.ravel()[faces]
-    vertices = np.column_stack([width * flat, height(flat)])
+    vertices = fold(np.column_stack([width * flat, height(flat)]))
     return obj_file(path, vertices, faces), vertices
 
 

@@ -12,8 +12,10 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
+from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.overlaps import Overlaps, find_overlaps
+from lyra_petsc.mesh.overlaps import Overlaps, behind_wall, find_overlaps
+from lyra_petsc.mesh.symmetry import Wall, symmetry_walls
 from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root
@@ -30,7 +32,7 @@ class StateCrossings(NamedTuple):
     corner_pairs : (m, 2) int64
         Triangles with one common vertex that cross elsewhere.
     overlaps : mapping of str to Overlaps
-        Parts of sheets inside each obstacle.
+        Parts of sheets inside each obstacle, and behind each symmetry plane.
     """
 
     pairs: Ints
@@ -38,8 +40,27 @@ class StateCrossings(NamedTuple):
     overlaps: Mapping[str, Overlaps]
 
 
-def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: int) -> StateCrossings:
-    """Crossings in a state of a run with these obstacles.
+def run_walls(run: StoredRun) -> list[Wall]:
+    """The symmetry planes that contact lets no sheet of a run pass.
+
+    Raises
+    ------
+    InputError
+        If files of the run are gone or damaged.
+    """
+    scene = run.scene
+    if scene.contact is None or not any(handle.symmetry for handle in scene.handles):
+        return []
+    stored, flat_rest = run.mesh, np.zeros(len(run.triangles), dtype=bool)
+    start = run.positions[0] if stored.start is None else stored.start
+    arrays = start, stored.rest, stored.triangles, stored.corner_uv, flat_rest
+    return symmetry_walls(scene, Mesh(*arrays, stored.groups))
+
+
+def crossings_of(
+    run: StoredRun, obstacles: Sequence[Solid | Container], state: int, walls: Sequence[Wall] = ()
+) -> StateCrossings:
+    """Crossings in a state of a run with these obstacles and symmetry planes.
 
     Raises
     ------
@@ -53,6 +74,7 @@ def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: 
     overlaps = {
         one.name: find_overlaps(one, x, run.triangles, time, is_box=one.name in boxes) for one in obstacles
     }
+    overlaps |= {wall.container.name: behind_wall(x, run.triangles, wall) for wall in walls}
     return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 
 
@@ -61,7 +83,7 @@ MAX_NAMED = 3
 
 PAIRS = "{:>5} {:>11} {:>16} {:>17}  "
 INSIDE = "{:>11} {:>8} {:>12}  "
-"""Columns of the table; the second ones only if the scene has obstacles."""
+"""Columns of the table; the second ones only if the scene has obstacles or symmetry planes as walls."""
 
 
 def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
@@ -88,14 +110,15 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     run = on_root(comm, lambda: StoredRun(folder))
     scene = on_root(comm, lambda: run.scene)
     obstacles = on_every_rank(comm, lambda: run_obstacles(run))
-    row = PAIRS + (INSIDE if scene.obstacles else "")
+    walls = on_every_rank(comm, lambda: run_walls(run))
+    row = PAIRS + (INSIDE if scene.obstacles or walls else "")
     time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
     _print(comm, f"{folder}: {len(run)} states; pairs of triangles that cross, with")
     _print(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_every_rank(comm, partial(_count_in_state, run, obstacles, begin + comm.rank))
+        found = on_every_rank(comm, partial(_count_in_state, run, obstacles, walls, begin + comm.rank))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
                 rows.append(one[0])
@@ -103,8 +126,9 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     counts = np.array(rows)
     pairs, inside = counts[:, :2].sum(axis=1), counts[:, 2:].sum(axis=1)
     _print(comm, _summary("crossings", pairs, "pairs"))
-    if scene.obstacles:
-        _print(comm, _summary("parts of sheets in obstacles", inside, "vertices, edges and triangles"))
+    if scene.obstacles or walls:
+        subject = "parts of sheets in obstacles" + (" or behind symmetry planes" if walls else "")
+        _print(comm, _summary(subject, inside, "vertices, edges and triangles"))
     judged = crossings or (scene.contact is not None and scene.contact.self)
     if not judged:
         _print(comm, "the scene has no contact of sheets; --crossings makes a crossing exit code 1")
@@ -112,12 +136,12 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
 
 
 def _count_in_state(
-    run: StoredRun, obstacles: Sequence[Solid | Container], state: int
+    run: StoredRun, obstacles: Sequence[Solid | Container], walls: Sequence[Wall], state: int
 ) -> tuple[list[int], str] | None:
     """Counts of a state for its row of the table, and the names to print; None beyond the last state."""
     if state >= len(run):
         return None
-    found = crossings_of(run, obstacles, state)
+    found = crossings_of(run, obstacles, state, walls)
     inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
     in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else [0, 0, 0]
     pairs = np.concatenate([found.pairs[:MAX_NAMED], found.corner_pairs[:MAX_NAMED]])[:MAX_NAMED]

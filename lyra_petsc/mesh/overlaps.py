@@ -19,6 +19,7 @@ from lyra_petsc.kernels.cache import cached
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
+from lyra_petsc.mesh.symmetry import Wall, symmetry_walls
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 
@@ -59,6 +60,13 @@ def behind_planes(points: Array, triangles: Ints, on_planes: Array, normals: Arr
     out = np.zeros(len(points), dtype=bool)
     for point, normal in zip(on_planes, normals, strict=True):
         out |= (points - point) @ normal < -depth
+    return _with_vertices(out, triangles)
+
+
+def behind_wall(points: Array, triangles: Ints, wall: Wall) -> Overlaps:
+    """Parts of sheets, with positions (V, 3) [m], behind the symmetry plane in which their images begin."""
+    out = np.zeros(len(points), dtype=bool)
+    out[wall.passed(points)] = True
     return _with_vertices(out, triangles)
 
 
@@ -270,6 +278,13 @@ def refuse_crossings(
             (f"{a} and {b} {around(a, b)}" for a, b in pairs[:MAX_LISTED].tolist()),
             "move the sheets apart, or give self: false",
         )
+    for wall in symmetry_walls(scene, mesh):
+        if len(passing := behind_wall(positions, triangles, wall).triangles):
+            plane = wall.container.name
+            count = f"{_counted(len(passing), 'triangle', 'of the sheet', 'reach')} through the {plane}"
+            listed = (f"{a} {around(a)}" for a in passing[:MAX_LISTED].tolist())
+            key = f"handles[{wall.handle}].symmetry"
+            refuse(key, count, listed, "move the sheet to one side, or give contact: {self: false}")
     remedy = "move the sheet, or the obstacle"
     for obstacle in obstacles:
         key, shape = f"obstacles.{obstacle.name}", (scene.obstacles or {})[obstacle.name]

@@ -15,6 +15,9 @@ from lyra_petsc.scene.schema import VertexChoice
 
 DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 
+FLAT = 1e-6
+"""Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
+
 
 def select_vertices(mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None) -> Ints:
     """Vertices that a selector names, ascending, each once.

@@ -262,8 +262,9 @@ class EnergyBalance:
             if found is not None:
                 total += found
         if impulses := system.contact_impulses:
-            torque = np.cross(impulses.position, impulses.force)
-            np.add.at(total, impulses.obstacle, np.column_stack([impulses.force, torque]))
+            on = impulses.obstacle < count  # not symmetry planes
+            torque = np.cross(impulses.position[on], impulses.force[on])
+            np.add.at(total, impulses.obstacle[on], np.column_stack([impulses.force[on], torque]))
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

@@ -24,7 +24,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.mesh.mesh import Mesh, Source
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.select import FLAT, select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -50,9 +50,6 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
     from lyra_petsc.terms.contact.barrier import Barrier
 
-
-FLAT = 1e-6
-"""Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
 
 TOO_NEAR = 1e-3
 """Smallest separation at the start over contact's gap: nearer vertices, each with the energy k gap² / 1e-3,
@@ -435,7 +432,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: flo
     raise InputError(
         f"{when} {near.text} are {distance}; {remedy}",
         file=scene.source,
-        key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
+        key=f"obstacles.{near.obstacle}" if near.obstacle in (scene.obstacles or {}) else "contact",
     )
 
 

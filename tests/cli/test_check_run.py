@@ -138,6 +138,34 @@ def test_crossings_with_obstacles(
 
 
 @pytest.mark.parallel(2)
+@pytest.mark.parametrize("alone", [False, True])
+def test_triangles_beyond_a_symmetry_plane(
+    comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixture[str], alone: bool
+) -> None:
+    """In two states vertex 3 is below the plane z = 0 of its sheet, in one of them two of another sheet are,
+    too.
+    """
+    plane = [{"nodes": [0, 1, 2], "symmetry": "z"}]
+    run = written(shared_tmp / "run", contact={"self": not alone}, handles=plane)
+    assert check_run(comm, run) == int(not alone)
+    said = [line.split(maxsplit=7) for line in capsys.readouterr().out.splitlines()]
+    if comm.rank == 0 and not alone:
+        assert [" ".join(row[2:]) for row in said[2:7]] == [
+            "0 0 0 0 0",
+            "0 1 1 2 1 0-1, symmetry plane z = 0: vertex 3",
+            "0 0 0 0 0",
+            "2 1 3 5 2 0-2, 1-2, 0-1, symmetry plane z = 0: vertex 3",
+            "0 0 0 0 0",
+        ]
+        assert " ".join(said[8]).startswith(
+            "parts of sheets in obstacles or behind symmetry planes in 2 of 5 states, most in state 3: 10"
+        )
+    elif comm.rank == 0:
+        assert said[0][-1].endswith("with")
+        assert not any("vertices in" in " ".join(row) for row in said)
+
+
+@pytest.mark.parallel(2)
 def test_a_damaged_state_is_reported_on_all_ranks(comm: MPI.Comm, folder: Path) -> None:
     if comm.rank == 0:
         (folder / "mesh.h5").write_bytes(b"none")

@@ -10,7 +10,16 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import Simulation, direct_solver, gathered, grid, obj_file, scene_of
+from physics import (
+    Simulation,
+    direct_solver,
+    gathered,
+    grid,
+    mirrored,
+    obj_file,
+    scene_of,
+    symmetry_planes,
+)
 
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -101,10 +110,22 @@ def roll(folder: Path) -> dict[str, Any]:
     }
 
 
+def quarter(folder: Path) -> dict[str, Any]:
+    """A quarter of a sheet with two symmetry planes falls on a ball and buckles."""
+    mesh, _ = mirrored(folder / "quarter.obj", "", 14, lambda flat: 0.004 + 0.0 * flat[:, 0], 0.3)
+    return {
+        "mesh": mesh,
+        "material": {"young": 1e6, "poisson": 0.3, "thickness": 5e-4, "density": 0.2, "damping": 0.002},
+        "handles": symmetry_planes("xy"),
+        "contact": {"friction": 0.3},
+        "obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.2], "radius": 0.2}}},
+    }
+
+
 STEPS = 30
 
 
-@pytest.mark.parametrize("scene", [on(two_sheets), on(tent, 2), on(roll, 3)])
+@pytest.mark.parametrize("scene", [on(two_sheets), on(tent, 2), on(roll, 3), on(quarter, 3)])
 def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
     common = {"gravity": [0.0, 0.0, -9.81], "material": {"cloth": "gray-interlock", "damping": 0.01}}
     content = common | {"time": {"end": 1.0, "step": 0.004}}

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import mirrored, obj_file, shape, stepped, symmetry_planes
+from physics import finished, grid, mirrored, obj_file, scene_of, shape, stepped, symmetry_planes
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.build import build_scene_mesh
+from lyra_petsc.mesh.symmetry import symmetry_walls
+from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel
 
@@ -96,3 +100,111 @@ def test_a_part_touches_as_the_whole(comm: MPI.Comm, shared_tmp: Path, name: str
         for found, expected in zip(part_of[1:], whole[1:], strict=True):
             scale = np.abs(expected).max(axis=0, initial=0.0)
             assert (np.abs(found - expected) <= tolerance[1] * scale).all()
+
+
+def trough(x: Array) -> Array:
+    """Bend a flat sheet to half a pipe along y with upright sides."""
+    radius, length = 0.06, np.abs(x[:, 0])
+    angle = np.minimum(length / radius, 0.5 * np.pi)
+    out = x.copy()
+    out[:, 0] = np.sign(x[:, 0]) * radius * np.sin(angle)
+    out[:, 2] = radius * (1.0 - np.cos(angle)) + length - radius * angle
+    return out
+
+
+@pytest.mark.parametrize("thickness", [0.0, 0.004])
+def test_a_part_touches_its_image_as_the_whole_itself(
+    comm: MPI.Comm, shared_tmp: Path, thickness: float
+) -> None:
+    """The sides of a trough swing towards each other."""
+    results = []
+    for images, planes in (("xy", ""), ("y", "x"), ("", "xy")):
+        path = shared_tmp / f"trough{images}.obj"
+        made = None
+        if comm.rank == 0:
+            made = mirrored(path, images, 5, lambda flat: 0.0 * flat[:, 0], 0.3, trough)
+        mesh, start = comm.bcast(made)
+        scene = {
+            "mesh": mesh,
+            "material": {"young": 2e5, "poisson": 0.3, "thickness": 0.002, "density": 200.0},
+            "handles": symmetry_planes(planes),
+            "contact": {"gap": GAP, "thickness": thickness, "friction": 0.3},
+            "obstacles": {"far": {"plane": {"point": [0, 0, -1], "normal": [0, 0, 1]}}},
+            "time": {"end": 0.112, "step": 0.004},
+            "solver": {"force_tolerance": 1e-10, "step_tolerance": 1e-10},
+        }
+        energies, apart = [], []
+        with stepped(comm, scene, ksp_rtol=1e-12) as run:
+            system, term = run.problem.system, run.problem.terms["contact"]
+            rows, x = slice(0, run.problem.points.n_vertices), system.x[: run.problem.points.n_owned].copy()
+            v = np.zeros_like(x)
+            v[rows, 0] = -3.0 * np.sign(x[rows, 0]) * np.maximum(x[rows, 2] - 0.06, 0.0)
+            system.state.set(x, v)
+            run.stepper.start(0.0, 0)
+            run.energy_balance.measure()
+            while not run.finished:
+                run.step()
+                here = float(term.energies(system.x, system.active.frozen[term]).sum())
+                energies.append([comm.allreduce(here), run.budget.dissipation, run.budget.membrane])
+                if (gap := run.energy_balance.columns()["smallest_gap"]) < 0.9 * GAP:
+                    apart.append(gap)
+                assert not run.energy_balance.obstacle_forces(1).any()
+            x = shape(run)
+        part = np.flatnonzero((np.round(start[:, :2], 9) >= 0.0).all(axis=1))
+        part = part[np.lexsort(np.round(start[part].T, 9))]
+        results.append((x[part], 2.0 ** (2 - len(images)) * np.array(energies), np.array(apart)))
+    whole = results[0]
+    assert whole[2].min() < 0.3 * GAP
+    for part_of in results[1:]:
+        np.testing.assert_allclose(part_of[0], whole[0], rtol=0.0, atol=1e-2 * GAP)
+        assert part_of[0][:, 0].min() >= 0.0
+        # where the whole is pressed most, edges repel each other too
+        assert (np.abs(part_of[1] - whole[1]).max(axis=0) < 0.04 * np.abs(whole[1]).max(axis=0)).all()
+        np.testing.assert_allclose(part_of[2], whole[2], rtol=0.0, atol=1e-2 * GAP)
+
+
+def beside_plane(x: float, **contact: Any) -> dict[str, Any]:
+    """A sheet that begins in the plane x = 0, and a loose one that begins at x [m]."""
+    sheet = grid(0.2, 0.2, 4, 4)
+    loose = grid(0.1, 0.1, 2, 2) | {"transform": {"translate": [x, 0.03, 0.02]}}
+    return {
+        "mesh": [sheet, loose],
+        "material": {"young": 2e5, "poisson": 0.3, "thickness": 0.002, "density": 1.0},
+        "handles": [{"nodes": [0, 5, 10, 15, 20], "symmetry": "x"}, {"nodes": [4]}],
+        "contact": {"gap": 0.01} | contact,
+        "initial": {"velocity": [-3.0, 0.0, 0.0]},
+        "time": {"end": 0.08, "step": 0.004},
+    }
+
+
+def test_nothing_passes_through_a_symmetry_plane(comm: MPI.Comm) -> None:
+    for x, side in ((0.03, 1.0), (-0.13, -1.0)):
+        scene = beside_plane(x, thickness=0.001)
+        scene["initial"]["velocity"][0] *= side
+        with stepped(comm, scene) as run:
+            apart = []
+            while not run.finished:
+                run.step()
+                apart.append((side * shape(run)[25:, 0]).min())
+        assert 0.0005 < min(apart) < 0.0055
+    with finished(comm, beside_plane(0.03, self=False)) as run:
+        assert shape(run)[25:, 0].min() < -0.1
+
+
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        (-0.03, "4 triangles of the sheet reach through the symmetry plane x = 0 .*give contact: "),
+        (2e-6, "contact: at the start vertex .* and the obstacle 'symmetry plane x = 0', around"),
+    ],
+)
+def test_a_start_beyond_a_symmetry_plane_is_refused(comm: MPI.Comm, x: float, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        SteppedScene(comm, scene_of(beside_plane(x)))
+    with stepped(comm, beside_plane(x, self=False)):
+        pass
+
+
+def test_a_plane_through_the_inside_of_a_sheet_is_no_wall() -> None:
+    scene = scene_of(beside_plane(0.03) | {"handles": [{"nodes": [2, 7, 12, 17, 22], "symmetry": "x"}]})
+    assert not [wall for wall in symmetry_walls(scene, build_scene_mesh(scene)) if (wall.vertices < 25).any()]

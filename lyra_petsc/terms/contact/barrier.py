@@ -25,6 +25,7 @@ from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near_pairs, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.symmetry import symmetry_walls
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
@@ -103,6 +104,8 @@ class Barrier(NamedTuple):
         Squared sine of the angle of edges below which their energy is mollified.
     flat : float
         Radius [m] of spheres and rods from which on they count as nearly flat (`SAG`).
+    walls : tuple of Container
+        Symmetry planes, one for each side with sheets.
     """
 
     gap: float
@@ -110,6 +113,7 @@ class Barrier(NamedTuple):
     stiffness: float
     parallel: float
     flat: float = np.inf
+    walls: tuple[Container, ...] = ()
 
 
 class ObstaclePositions(NamedTuple):
@@ -181,6 +185,10 @@ class Obstacles:
         Numbers of three points, number of the obstacle, and for triangles the code of `surface_shares.rings`.
         A plane is a point and a normal. The axis of a nearly flat sphere or rod is also a degenerate
         triangle.
+    each : list of Solid or Container
+        First those of the scene, then the symmetry planes.
+    first_wall : int
+        Number of the first symmetry plane.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
     moving : bool
@@ -192,8 +200,15 @@ class Obstacles:
         number.
     """
 
-    def __init__(self, obstacles: Sequence[Solid | Container], flat: float = np.inf) -> None:
-        self.each = list(obstacles)
+    def __init__(
+        self,
+        obstacles: Sequence[Solid | Container],
+        flat: float = np.inf,
+        walls: Sequence[Container] = (),
+        wall_radius: float = 0.0,
+    ) -> None:
+        self.first_wall = len(obstacles)
+        self.each = obstacles = [*obstacles, *walls]
         parts: dict[str, list[Ints]] = {
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
         }
@@ -234,6 +249,7 @@ class Obstacles:
             if not isinstance(obstacle, Solid):
                 smooth_points.append(np.zeros(n, dtype=np.bool_))
             first += n
+        radius[self.first_wall : -1] = wall_radius
         smooth = np.concatenate(smooth_edges)
         self.smooth_points = np.concatenate(smooth_points)
         self.smooth_edges = np.sort(smooth[:, 0] * first + smooth[:, 1])
@@ -319,9 +335,10 @@ class ContactBarrier(Elastic):
         Triangles of this rank, in local rows.
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
-    marks : (F, 5)
-        Code of the triangles' surroundings (`surface_shares.rings`), and of their corners the `area_factors`
-        and a code of their symmetry planes (`_plane_codes`).
+    marks : (F, 5 + walls)
+        Code of the triangles' surroundings (`surface_shares.rings`), and of their corners the `area_factors`,
+        a code of their symmetry planes (`_plane_codes`), and for each of `Barrier.walls` bits i: whether it
+        acts on corner i.
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
@@ -338,6 +355,7 @@ class ContactBarrier(Elastic):
         self._searched: Ints | None = None  # triangles that the search has
         self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
         self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
+        self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
         self._remembered = Remembered(self._find_active)
 
     def set_up(
@@ -347,7 +365,8 @@ class ContactBarrier(Elastic):
 
         ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
         """
-        self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat)
+        walls = barrier.walls, -0.5 * barrier.thickness  # at half of the distance of a vertex from its image
+        self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat, *walls)
         self.self_contact, self.static = self_contact, static
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
@@ -367,6 +386,9 @@ class ContactBarrier(Elastic):
         self.shares = surface_shares.shares(what[:, 6])
         self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
         self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
+        self._at_wall = self.obstacle >= self.obstacles.first_wall
+        self.gap[self._at_wall] *= 0.5  # k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
+        self.pair_stiffness[self._at_wall] *= 4.0
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
         largest = np.append(np.abs(self._obstacle_x).max(axis=(0, 2)), 0.0)
@@ -397,7 +419,8 @@ class ContactBarrier(Elastic):
         times = step.start, step.target_time, step.end
         self._next_obstacle_x = np.stack([self.obstacles.positions(time) for time in times])
         largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
-        self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and len(self.obstacles.planes) > 0))
+        planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
+        self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         self._deviations = self.obstacles.path_deviations(step.start, step.end)
         start, stage, end = self._next_obstacle_x
         motions = (self.obstacles.rigid_motions(step.start, time) for time in times[1:])
@@ -420,6 +443,9 @@ class ContactBarrier(Elastic):
             self._on_planes = np.zeros((len(x), 3), dtype=np.bool_)
             codes = triangles[:, 7, None] >> np.arange(9)
             self._on_planes[triangles[:, :3]] = (codes & 1).astype(np.bool_).reshape(-1, 3, 3)
+            codes = triangles[:, None, 8:] >> np.arange(3)[:, None]
+            self._walled = np.zeros((len(x), codes.shape[2]), dtype=np.bool_)
+            self._walled[triangles[:, :3]] = (codes & 1).astype(np.bool_)
             self._searched = triangles
         limit = np.inf
         if dx.any() and not self.static:
@@ -541,6 +567,8 @@ class ContactBarrier(Elastic):
                 close = np.zeros((len(single), len(others)), dtype=np.bool_)
                 for end in (x, x + dx):  # on straight paths the distance is lowest at an end
                     close |= self._is_close(end[single], kind, others, obstacle_x, radius)
+                walls = np.flatnonzero(others[:, 3] >= self.obstacles.first_wall)
+                close[:, walls] &= self._walled[single][:, others[walls, 3] - self.obstacles.first_wall]
                 number, plane = np.nonzero(close)
                 points = np.column_stack([single[number], ~others[plane, :3]])
                 zeros = np.zeros(len(points), dtype=np.int64)
@@ -717,7 +745,8 @@ class ContactBarrier(Elastic):
         return out - self.offset
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
-        return self.distances(x, frozen.stage)[: self.n_owned]
+        # at a wall half of the distance from the image
+        return (self.distances(x, frozen.stage) * np.where(self._at_wall, 2.0, 1.0))[: self.n_owned]
 
     def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
         """The collision-free fractions (n,) of the first n pairs, with a motion from `_displacements`."""
@@ -758,10 +787,10 @@ class ContactBarrier(Elastic):
             yield int(obstacle), gradient
 
     def obstacle_forces(self, x: Array, frozen: ObstaclePositions, count: int) -> Array:
-        out = np.zeros((count, 6))
+        out = np.zeros((len(self.obstacles.each), 6))
         for obstacle, force in self._obstacle_gradients(x, frozen.stage):
             out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
-        return out
+        return out[:count]
 
     pushes = True
 
@@ -850,14 +879,15 @@ class ContactBarrier(Elastic):
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
         active, n = self.active_pairs(x, frozen.stage), self.n_owned
-        bound = active.lower_bound[:n]
-        exact = bound < self.gap[:n]
+        scale = np.where(self._at_wall[:n], 2.0, 1.0)  # as in `gaps`
+        bound = scale * active.lower_bound[:n]
+        exact = bound < scale * self.gap[:n]
         smallest = bound[exact].min(initial=np.inf)
         rows = np.flatnonzero(~exact & (bound < smallest))
         if len(rows):
             distance = np.empty(len(rows))
             contact_pairs.distances(x, frozen.stage, self.kind[rows], self.points[rows], distance)
-            smallest = min(smallest, (distance - self.offset[rows]).min())
+            smallest = min(smallest, (scale[rows] * (distance - self.offset[rows])).min())
         work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
         return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
 
@@ -897,7 +927,12 @@ def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets (rank 0)."""
     triangles = rest.mesh.triangles.astype(np.int64)
     rings, areas = surface_shares.rings(triangles), area_factors(triangles, rest.area)
-    marks = np.column_stack([rings, areas, _plane_codes(rest)])
+    walled = []
+    for wall in symmetry_walls(rest.scene, rest.mesh):
+        acts = np.zeros(rest.mesh.n_vertices, dtype=np.int64)
+        acts[wall.vertices] = 1
+        walled.append(acts[triangles] @ (1 << np.arange(3)))
+    marks = np.column_stack([rings, areas, _plane_codes(rest), *walled])
     uv = rest.mesh.triangle_uv.reshape(-1, 6)
     return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
 
@@ -960,7 +995,9 @@ def barrier(rest: RestShape) -> Barrier:
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
     stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
-    return Barrier(gap, thickness, stiffness, PARALLEL, float(length.max()) ** 2 / (8.0 * SAG * gap))
+    flat = float(length.max()) ** 2 / (8.0 * SAG * gap)
+    walls = tuple(wall.container for wall in symmetry_walls(scene, rest.mesh))
+    return Barrier(gap, thickness, stiffness, PARALLEL, flat, walls)
 
 
 def _least_height(rest: RestShape, length: Array) -> float:
@@ -978,5 +1015,5 @@ def _least_height(rest: RestShape, length: Array) -> float:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must be called next."""
-    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"].reshape(-1, 5)
+    uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"]
     return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))

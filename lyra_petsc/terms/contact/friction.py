@@ -482,7 +482,7 @@ class CoulombFriction(Elastic):
         return out
 
     def obstacle_forces(self, x: Array, frozen: ObstacleMotion, count: int) -> Array:
-        return self._obstacle_loads
+        return self._obstacle_loads[:count]
 
     def state(self) -> dict[str, Array]:
         # in older checkpoints the column of what is owed had another meaning
