@@ -77,6 +77,11 @@ class Left:
     err: str
 
     @property
+    def lines(self) -> list[str]:
+        """Lines on stderr, without that on compilation: kernels may be compiled by earlier tests."""
+        return [line for line in self.err.splitlines() if not line.startswith("compiling kernels")]
+
+    @property
     def ours(self) -> list[str]:
         """Lines on stderr that begin with the program's name, without a launcher's banner."""
         return [line for line in self.err.splitlines() if line.startswith("lyra-petsc: ")]

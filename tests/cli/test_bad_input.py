@@ -207,7 +207,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
     before = listing(tmp_path)
     left = lyra(arguments, tmp_path, patience=30)
     refusal(left, words)
-    assert left.err.splitlines() == left.ours
+    assert left.lines == left.ours
     assert listing(tmp_path) == before
 
 
@@ -246,6 +246,6 @@ def together(
 def test_ranks_agree_on_a_mistake(together: dict[str, tuple[Path, Listing, list[Left]]], name: str) -> None:
     folder, before, (first, *others) = together[name]
     refusal(first, MISTAKES[name][2])
-    assert first.err.splitlines() == first.ours
+    assert first.lines == first.ours
     assert all(other == Left(2, "", "") for other in others)
     assert listing(folder) == before

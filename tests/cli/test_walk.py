@@ -178,7 +178,7 @@ def test_the_exit_code_fits_the_message(tmp_path: Path, words: list[str]) -> Non
     """PETSc reads some options at its start only; at its end it frees objects that call Python."""
     left = lyra(["run", write_scene(tmp_path), "--out", "out", *words], tmp_path)
     assert left.code == 2, left.err
-    lines = left.err.splitlines()
+    lines = left.lines
     assert len(lines) == 1 or words[0] in NEEDS_A_DISPLAY, left.err
     assert lines[-1].startswith("lyra-petsc: "), left.err
     assert "Traceback" not in left.out + left.err
