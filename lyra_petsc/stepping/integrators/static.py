@@ -9,7 +9,7 @@ from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
 
 
 class Static(Integrator):
-    """The proximal step of `stepping.equilibrium`: backward Euler from rest in a pseudo time.
+    """The proximal step of `stepping.statics.equilibrium`: backward Euler from rest in a pseudo time.
 
     Attributes
     ----------
