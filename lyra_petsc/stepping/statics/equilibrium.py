@@ -272,7 +272,7 @@ class Equilibrium:
         if slides:
             message = f"{message}; {slides}"
         self._pseudo_time.sufficed = 0.0
-        self._in_vain += solves - progress.of_force if solved_once else 0
+        self._in_vain += solves - progress.last_by_force if solved_once else 0
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)

@@ -45,7 +45,7 @@ class Progress:
         self._restarted_at = len(self.history)
 
     @property
-    def of_force(self) -> int:
+    def last_by_force(self) -> int:
         """Number of the last solve after which the force was notably less than after all before."""
         last, smallest = 0, np.inf
         for number, entry in enumerate(self.history[self._restarted_at :]):
@@ -56,7 +56,7 @@ class Progress:
     @property
     def least_force(self) -> float:
         """The out-of-balance force [N] after that solve."""
-        return self.history[self.of_force].residual
+        return self.history[self.last_by_force].residual
 
     @property
     def last(self) -> int:
@@ -66,4 +66,4 @@ class Progress:
             highest = max(highest, energy)
             if energy < least - MIN_FALL * (highest - least):
                 last, least = number, energy
-        return max(self.of_force, last)
+        return max(self.last_by_force, last)

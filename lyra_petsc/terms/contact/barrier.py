@@ -386,9 +386,10 @@ class ContactBarrier(Elastic):
         self.shares = surface_shares.shares(what[:, 6])
         self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
         self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
-        self._at_wall = self.obstacle >= self.obstacles.first_wall
-        self.gap[self._at_wall] *= 0.5  # k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
-        self.pair_stiffness[self._at_wall] *= 4.0
+        # distance from the image in a wall over that from the wall: k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
+        self._image_scale = np.where(self.obstacle >= self.obstacles.first_wall, 2.0, 1.0)
+        self.gap /= self._image_scale
+        self.pair_stiffness *= self._image_scale**2
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
         largest = np.append(np.abs(self._obstacle_x).max(axis=(0, 2)), 0.0)
@@ -745,8 +746,7 @@ class ContactBarrier(Elastic):
         return out - self.offset
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
-        # at a wall half of the distance from the image
-        return (self.distances(x, frozen.stage) * np.where(self._at_wall, 2.0, 1.0))[: self.n_owned]
+        return (self._image_scale * self.distances(x, frozen.stage))[: self.n_owned]
 
     def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
         """The collision-free fractions (n,) of the first n pairs, with a motion from `_displacements`."""
@@ -879,7 +879,7 @@ class ContactBarrier(Elastic):
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
         active, n = self.active_pairs(x, frozen.stage), self.n_owned
-        scale = np.where(self._at_wall[:n], 2.0, 1.0)  # as in `gaps`
+        scale = self._image_scale[:n]
         bound = scale * active.lower_bound[:n]
         exact = bound < scale * self.gap[:n]
         smallest = bound[exact].min(initial=np.inf)
