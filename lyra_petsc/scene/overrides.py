@@ -118,6 +118,9 @@ def _descend(
             target.append(None)
     elif isinstance(target, dict):
         index = part
+        if not rest and value is None and index in target:  # unknown keys are kept, to be refused
+            walked.append(index)
+            return target.pop(index)
         target.setdefault(index)
     else:
         raise InputError(f"{cut(dotted(walked))} holds a single value, no keys", key=option)

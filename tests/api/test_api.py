@@ -91,6 +91,9 @@ def test_scenes_are_loaded_and_changed(tmp_path):
     assert (changed.time.end, changed.wind.velocity, changed.handles[0].until) == (0.1, (0.0, 8.0, 0.0), 1.0)
     assert flag.time.end != 0.1
     assert changed.changed({"wind": None}).wind is None
+    floor = {"plane": {"point": [0, 0, -3], "normal": [0, 0, 1]}}
+    obstructed = changed.changed({"contact": {}, "obstacles": {"a": floor, "b": floor}})
+    assert list(obstructed.changed({"obstacles.a": None}).obstacles) == ["b"]
     assert changed.source == flag.source
     # defaults follow the change: a static analysis has no integrator
     static = lyra_petsc.load(SCENE, {"time": {"analysis": "static"}})
