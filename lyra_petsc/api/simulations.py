@@ -199,6 +199,12 @@ class Simulation:
         return energies | more
 
     @property
+    def obstacle_forces(self) -> dict[str, Array]:
+        """Force [N] and torque [N m] about the origin, (6,), of the sheets on each obstacle, by its name."""
+        names = list(self.scene.obstacles or {})
+        return dict(zip(names, self._running.energy_balance.obstacle_forces(len(names)), strict=True))
+
+    @property
     def notes(self) -> list[str]:
         """Messages for the user, about mesh repairs, a changed linear solver, …"""
         return [*self._running.notes, *filter(None, [self._running.note_of_repeats])]

@@ -82,6 +82,25 @@ def test_a_loop_over_the_steps_agrees_with_a_run(shared_tmp, comm):
         assert mesh is None
 
 
+@pytest.mark.parallel(2)
+def test_forces_on_obstacles_after_each_step(shared_tmp, comm):
+    floor = {"plane": {"point": [0, 0, -0.01], "normal": [0, 0, 1]}}
+    ball = {"sphere": {"center": [0, 0, -1], "radius": 0.99}}
+    scene = SCENE | {"contact": {"friction": 0.3}, "obstacles": {"floor": floor, "ball": ball}}
+    forces = []
+    with lyra_petsc.Simulation(scene) as simulation:
+        forces.append(simulation.obstacle_forces)
+        for _ in simulation:
+            forces.append(simulation.obstacle_forces)
+    run = lyra_petsc.run(scene, shared_tmp / "out")
+    names = ["fx", "fy", "fz", "tx", "ty", "tz"]
+    table = np.column_stack([np.asarray(run.obstacles[name]) for name in names])
+    assert list(forces[0]) == ["floor", "ball"]
+    assert table[-2, 2] < -0.1
+    expected = np.concatenate([[force["floor"], force["ball"]] for force in forces])
+    np.testing.assert_allclose(table.astype(float), expected, atol=1e-9)
+
+
 def test_scenes_are_loaded_and_changed(tmp_path):
     flag = lyra_petsc.load()
     assert flag.title.startswith("Flag")
