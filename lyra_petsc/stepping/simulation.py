@@ -68,6 +68,9 @@ adaptive steps are not shortened for the error of an impact, which would lead to
 MAX_STEPS, MAX_STATES = 1e8, 1e6
 """Upper bounds of a run's numbers of steps and of states."""
 
+FIRST_ORDER_STEPS = 500
+"""Adaptive steps of a first-order integrator after which a note recommends one of second order."""
+
 SMALLEST_ADAPTED = 1e-6
 """Smallest Δt of an adaptive run over the largest (``-ts_adapt_dt_min`` overrides it)."""
 
@@ -394,6 +397,12 @@ class SteppedScene:
         if accepted:
             self.local_error.record_step(v_before, dt)
             self.estimated_error += error
+            if self._scene_integrator.order == 1 and self.step_number >= FIRST_ORDER_STEPS:
+                self._note_once(
+                    "order",
+                    f"{self.step_number} steps to t = {self.time:g} s: {self._scene_integrator.name} is of "
+                    "first order, with Δt in proportion to time.tolerance; bdf2 or alpha2 take fewer steps",
+                )
             if error > share and dt <= NEAR_MINIMUM * max(minimum, control.smallest):
                 where = "of those that follow impacts " if minimum > control.smallest else ""
                 self._note_once(

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from physics import grid, shape, stepped
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping import simulation as stepping_of_scenes
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import StepControl, ToleranceControl
 
@@ -86,6 +87,18 @@ def test_smallest_and_largest_step_are_kept_with_a_note(comm: MPI.Comm) -> None:
     assert lengths[0] == pytest.approx(0.005, rel=0.3)
     assert min(lengths) > 0.0019
     assert max(lengths) <= 0.008 + 1e-12
+
+
+@pytest.mark.parametrize(("integrator", "notes"), [("beuler", 1), ("bdf2", 0)])
+def test_many_steps_of_first_order_are_noted(
+    integrator: str, notes: int, comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stepping_of_scenes, "FIRST_ORDER_STEPS", 3)
+    time = {"end": END, "step": "auto", "integrator": integrator}
+    with simulated(comm, time=time) as simulation:
+        for _ in range(5):
+            simulation.step()
+        assert sum("bdf2 or alpha2 take fewer steps" in note for note in simulation.notes) == notes
 
 
 def test_a_large_error_shortens_the_step_and_a_small_one_lengthens_it() -> None:
