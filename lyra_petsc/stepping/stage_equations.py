@@ -956,9 +956,8 @@ class StageEquations:
         ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one.
         """
         x, vs = self.evaluate_at(v)
+        # may have other ghosts than x, but of contact only: those of fixed stencils are the first
         rows, predicted = self.discretisation.rows, self._predicted
-        if predicted is not None and len(predicted[0]) != len(x):
-            predicted = None  # the iterate had other ghosts
         lagged = self.integrator.lagged_loads
         for remembered in self._evaluated_once:  # the linear solve needs the memory
             remembered.forget()

@@ -307,6 +307,34 @@ def test_only_the_start_of_increments_through_many_parts_is_searched(
         assert 0.01 < known.searched_fraction(x, results) < 0.5
 
 
+@pytest.mark.parallel(alone=False)
+def test_predicted_stress_does_not_depend_on_ghosts_that_contact_adds(comm: MPI.Comm) -> None:
+    """The iterate of the prediction had other ghosts, on some ranks."""
+    layers = [grid(0.3, 0.3, 5, 5) | {"transform": {"translate": [0.0, 0.0, 0.06 * n]}} for n in range(6)]
+    numbers, rng = 6 * 36, np.random.default_rng(1)
+    small, probe = rng.uniform(-2e-3, 2e-3, (numbers, 3)), rng.uniform(-1.0, 1.0, (numbers, 3))
+    near = -small - np.repeat(np.arange(6), 36)[:, None] * [0.0, 0.0, 0.05]
+    products = []
+    for ranks in (MPI.COMM_SELF, comm):
+        with Simulation({"mesh": layers, "contact": {"gap": 0.015}}, ranks) as simulation:
+            system, points = simulation.problem.system, simulation.problem.points
+            order, ghosts = points.mesh_vertices, len(points.ghosts)
+            system.begin_step(0.0, 0.01)
+            for displacement in (small, near):
+                system.set_iterate(displacement[order] / system.stage.c)
+            assert any(system.points.global_max(len(system.points.ghosts) > ghosts)) == (ranks.size > 1)
+            linear = simulation.stepper.linear
+            linear.update_pattern()
+            linear.assemble_operator(near[order] / system.stage.c, 0.0)
+            given, product = linear.operator.mat.createVecs()
+            given.setArray(probe[order].ravel())
+            linear.operator.mat.mult(given, product)
+            products.append(gathered(points, product.getArray().reshape(-1, 3)))
+            given.destroy()
+            product.destroy()
+    np.testing.assert_allclose(products[1], products[0], rtol=0.0, atol=1e-9 * np.abs(products[0]).max())
+
+
 def test_ranks_share_the_pairs_of_a_stack(comm: MPI.Comm) -> None:
     one, gap = grid(1.0, 1.0, 12, 12), 0.02
     content = {
