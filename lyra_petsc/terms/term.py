@@ -240,7 +240,7 @@ class FrictionCorrections(NamedTuple):
     obstacle : (m,)
         Number of the obstacle, −1 between sheets.
     moved : (m, 3)
-        Displacement of the obstacle in the step, times Σ β_i of the sheet's points [m].
+        Displacement of the obstacle in a step at its last velocity, times Σ β_i of the sheet's points [m].
     """
 
     points: Ints

@@ -130,3 +130,38 @@ def test_contacts_reached_after_the_stage_are_noticed_in_the_same_step(integrato
     assert steps < 150
     assert (x[:, 2] > 0.0).all()
     assert (x[:, 2] < 0.003).all()
+
+
+@pytest.mark.parametrize(
+    ("integrator", "step", "largest"),
+    [
+        *((name, 0.002, 0.05) for name in ("midpoint", "alpha2")),
+        ("bdf2", 0.001, 0.05),
+        *((name, 0.0002, 0.01) for name in ("midpoint", "beuler")),
+        ("midpoint", 0.02, 0.05),
+    ],
+)
+def test_a_sheet_that_lands_obliquely_is_not_thrown_back(
+    comm: MPI.Comm, integrator: str, step: float, largest: float
+) -> None:
+    """Friction stops it, as the impulse of the floor is large enough; its springs would reverse its speed."""
+    content = {
+        "mesh": grid(0.1, 0.1, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.02]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -9.81],
+        "initial": {"velocity": [SPEED, 0.0, -3.8]},
+        "contact": {"gap": 0.005, "friction": 0.5, "self": False},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}},
+        "time": {"end": 0.05 + 10.0 * step, "step": step, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    back = 0.0
+    while not simulation.finished:
+        simulation.step()
+        mean = float(system.points.global_sum(float(system.v[:n, 0].sum()))[0]) / 16
+        back = max(back, -mean)
+    stays = comm.allreduce(float(np.abs(system.v[:n, 0]).max(initial=0.0)), MPI.MAX)
+    simulation.destroy()
+    assert back < largest * SPEED
+    assert stays < 0.01 * SPEED

@@ -53,6 +53,13 @@ OVERSHOOT = 0.3
 coefficient is lower: integrators of second order overshoot in steps longer than the period of the friction
 springs."""
 
+STILL = 1e-6
+"""Displacement in a step, over the largest elastic slip, up to which a sticking pair is not stopped: without
+the round-off in the velocities, Newton's method would start where round-off leaves it no smaller energy."""
+
+END = 1e-3
+"""Last part of a step by whose motion the velocities of obstacles at its end are measured."""
+
 SHEET_SOFTNESS = 0.25
 """Friction stiffness between sheets over that on obstacles, for lightly pressed pairs. With springs as stiff
 as the barrier halfway through the gap sheets rotate by much, and Newton's method needs up to 1.4 times as
@@ -393,22 +400,38 @@ class CoulombFriction(Elastic):
         self._next_owed = np.where(is_owed, dt * (owed - paid), 0.0)
         paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
         missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
-        # sticking pairs are stopped at once: oscillating springs would pull with twice the static force
-        sticking = np.flatnonzero((self._weakens & ~slides)[: self.n_owned])
-        elastic_force = self._stiffness[sticking] * np.linalg.norm(slip[sticking], axis=1)
-        available = (1.0 + OVERSHOOT) * self._limit[sticking] - elastic_force
+        # sticking pairs are stopped at once: their springs would throw a sheet back that lands with a sliding
+        # speed, and oscillating springs would pull with twice the static force
+        owned = slice(self.n_owned)
+        points = self.stencil[owned].astype(np.int64)
+        beta, obstacle = self._beta[owned], self._obstacle[owned]
+        # impulses act at the end of the step, when obstacles may be faster than in the mean
+        motions = contact.obstacles.rigid_motions(frozen.time - END * dt, frozen.time)
+        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions) / END
+        velocity = np.einsum("ecik,eik->ec", self._gradients[owned], v[points])
+        velocity -= self._tangential(moved / dt, owned)
+        still = STILL * MAX_ELASTIC_SLIP * contact.barrier.gap
+        sticking = np.flatnonzero(~slides[owned] & (dt * np.linalg.norm(velocity, axis=1) > still))
         rows = np.concatenate([sliding, sticking])
-        arrays = self.stencil, self._beta, self._force, self._obstacle, self._gradients
-        points, beta, weight, obstacle, gradients = (array[rows] for array in arrays)
-        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
-        tangential = np.einsum("ecik,eik->ec", gradients, v[points]) - self._tangential(moved / dt, rows)
-        tangential[: len(sliding)] = self._tangential(slip[sliding], sliding)
+        tangential = np.concatenate([self._tangential(slip[sliding], sliding), velocity[sticking]])
         length = np.linalg.norm(tangential, axis=1, keepdims=True)
         unit = np.divide(tangential, length, out=np.zeros_like(tangential), where=length > 0.0)
-        direction = np.einsum("ec,eck->ek", unit, self._tangents[rows])
-        gradient = np.einsum("ec,ecim->eim", unit, gradients)
-        change = np.concatenate([missing, available])
-        return FrictionCorrections(points, beta, weight, direction, gradient, change, obstacle, moved)
+        # friction reaches its limit with what is available against the motion
+        limit = np.where(self._weakens[sticking], 1.0 + OVERSHOOT, 1.0) * self._limit[sticking]
+        elastic = -self._stiffness[sticking, None] * self._tangential(slip[sticking], sticking)
+        along = (elastic * unit[len(sliding) :]).sum(axis=1)
+        rest = along * along + limit * limit - (elastic * elastic).sum(axis=1)
+        available = along + np.sqrt(np.maximum(rest, 0.0))
+        return FrictionCorrections(
+            points[rows],
+            beta[rows],
+            self._force[rows],
+            np.einsum("ec,eck->ek", unit, self._tangents[rows]),
+            np.einsum("ec,ecim->eim", unit, self._gradients[rows]),
+            np.concatenate([missing, available]),
+            obstacle[rows],
+            moved[rows],
+        )
 
     def moments(self, x: Array, frozen: ObstacleMotion) -> tuple[Ints, Array]:
         rows = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
