@@ -39,6 +39,10 @@ from lyra_petsc.terms.term import Elastic
 DAMPING = 0.5
 """Damping of the distances in contact, over the critical damping."""
 
+MAX_SWEEPS, SETTLED = 30, 1e-4
+"""Largest number of sweeps over the friction at the start of a step, and change of it in a sweep over the
+largest one below which they end."""
+
 
 class ContactImpulses(NamedTuple):
     """Effects of the impulses at the end of a step, on this rank.
@@ -170,10 +174,9 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
         return before
     impulse = np.zeros_like(x)
     size = np.linalg.norm(gradient, axis=2)
-    inverse = _inverse_masses(system, [(points, size, weight, missing != 0.0)])
+    stopped = _stoppable_masses(system, points, size, weight, missing != 0.0)
     speed = np.einsum("eik,eik->e", system.v[points], gradient) - np.einsum("ek,ek->e", moved, direction) / dt
-    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0) / weight
-    stopping = np.divide(np.maximum(speed, 0.0), dt * largest, out=np.zeros_like(speed), where=largest > 0.0)
+    stopping = stopped * np.maximum(speed, 0.0) / dt
     push = -np.clip(missing, -stopping, stopping)
     force, impulses = push[:, None] * direction, (dt * push)[:, None, None] * gradient
     np.add.at(impulse, points, impulses)
@@ -190,9 +193,59 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     return ContactImpulses(before.damping, *sums, *on_obstacles)
 
 
+def hold_by_friction(system: StageEquations, term: Elastic, v: Array, acceleration: Array) -> Array:
+    """The accelerations (n_owned, 3) [m/s²] at the start of a step with the friction that opposes motion.
+
+    ``acceleration`` has the friction of the elastic slip, which the forces that begin to act have not yet
+    changed. Friction as a constraint stops the relative displacements in a step with velocities v
+    (n_local, 3) [m/s], as far as its limit allows; collective. (Projected gradients with momentum: Nesterov,
+    Soviet Mathematics Doklady 27 (1983) 372-376.)
+    """
+    points, gradients, size, weight, limit, elastic, moved = term.starting_friction(
+        system.active.frozen[term]
+    )
+    layout, dt, mass = system.points, system.dt, system.mass[:, None]
+    largest = layout.global_max(float(limit.max(initial=0.0)))[0]
+    if not largest > 0.0:
+        return acceleration
+    stopped = _stoppable_masses(system, points, size, weight, np.ones(len(points), dtype=np.bool_))
+    moves = system.prescribed.free & (mass > 0.0)
+
+    def with_friction(friction: Array) -> Array:
+        pull = np.zeros_like(v)
+        np.add.at(pull, points, np.einsum("ec,ecik->eik", friction - elastic, gradients))
+        layout.add_to_owners(pull)
+        change = pull[: layout.n_owned]
+        return acceleration + np.divide(change, mass, out=np.zeros_like(change), where=moves)
+
+    a, friction, tried = np.zeros_like(v), elastic, elastic
+    for sweep in range(MAX_SWEEPS):
+        a[: layout.n_owned] = with_friction(tried)
+        layout.update_ghosts(a)
+        rate = np.einsum("ecik,eik->ec", gradients, (v + 0.5 * dt * a)[points]) + moved / dt
+        after = tried - 2.0 / dt * stopped[:, None] * rate
+        after *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(after, axis=1), 1e-300))[:, None]
+        change = float(np.abs(after - tried).max(initial=0.0))
+        friction, tried = after, after + sweep / (sweep + 3.0) * (after - friction)
+        if layout.global_max(change)[0] <= SETTLED * largest:
+            break
+    return with_friction(friction)
+
+
 def _corrects_sheets(system: StageEquations) -> bool:
     """Whether friction between sheets is corrected, too: if the stage is not the end of the step."""
     return system.stage.offset < system.dt
+
+
+def _stoppable_masses(
+    system: StageEquations, points: Ints, size: Array, weight: Array, own: NDArray[np.bool_]
+) -> Array:
+    """The m (m,) [kg] of `_inverse_masses` of pairs whose gradients have the norms ``size`` (m, 4);
+    collective.
+    """
+    inverse = _inverse_masses(system, [(points, size, weight, own)])
+    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
+    return np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0.0)
 
 
 def _inverse_masses(

@@ -273,7 +273,14 @@ class StageEquations:
         if turns:
             self.active.move_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         force, mass = np.where(self.prescribed.free, -total, 0.0), self.mass[:, None]
-        return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
+        acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
+        if self.discretisation.has_near_elements:
+            from lyra_petsc.stepping import impacts  # needed only if something is near
+
+            for term in self.active.changing:
+                if term.slips:
+                    acceleration = impacts.hold_by_friction(self, term, v, acceleration)
+        return acceleration
 
     def _freeze(self, at: float) -> None:
         """Freeze geometry, targets and loads at the time ``at`` [s] of the stage."""

@@ -253,6 +253,34 @@ class FrictionCorrections(NamedTuple):
     moved: Array
 
 
+class StartingFriction(NamedTuple):
+    """Friction of the counted pairs at the start of a step, in two tangential components.
+
+    Attributes
+    ----------
+    points : (m, 4)
+        Local rows of the vertices.
+    gradients : (m, 2, 4, 3)
+        Gradients of the relative displacement's components with respect to the points' positions.
+    size : (m, 4)
+        Largest norms of the gradients over all tangential directions.
+    weight, limit : (m,)
+        Normal forces, in proportion to which masses are divided, and largest friction [N].
+    force : (m, 2)
+        Friction of the elastic slip, opposite to it [N].
+    moved : (m, 2)
+        Relative displacement in the step by the motion of the obstacle alone [m].
+    """
+
+    points: Ints
+    gradients: Array
+    size: Array
+    weight: Array
+    limit: Array
+    force: Array
+    moved: Array
+
+
 class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
@@ -566,6 +594,10 @@ class Elastic(Term):
         The step led over a ``stage`` to positions x, with velocities v (n_local, 3); dashpots added normal
         forces ``damping`` (n_owned,) [N]. Friction on obstacles, and with ``sheets`` also between sheets.
         """
+        raise NotImplementedError
+
+    def starting_friction(self, frozen: Any) -> StartingFriction:
+        """Friction at the start of the step; of a term that `slips`."""
         raise NotImplementedError
 
     def moments(self, x: Array, frozen: Any) -> tuple[Ints, Array]:

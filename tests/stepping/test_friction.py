@@ -137,7 +137,9 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
     """Springs of sticking contact must not oscillate beyond their limit, or the sheet would slide."""
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
 
-    def let_go(above: float, static: float, kinetic: float, end: float) -> tuple[float, float]:
+    def let_go(
+        above: float, static: float, kinetic: float, end: float, step: float = 0.01
+    ) -> tuple[float, float]:
         """Its distance over the gap at the end, and its way [m]."""
         place = [above * GAP * component for component in NORMAL]
         content = {
@@ -146,7 +148,7 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": {"static": static, "kinetic": kinetic}, "self": False},
             "obstacles": {"slope": PLANE},
-            "time": {"end": end, "step": 0.01, "integrator": integrator},
+            "time": {"end": end, "step": step, "integrator": integrator},
         }
         simulation = SteppedScene(comm, scene_of(content))
         system = simulation.problem.system
@@ -159,8 +161,76 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
 
     lies, _ = let_go(0.95, 3.0, 3.0, 1.0)
     limit = math.tan(SLOPE)
-    assert let_go(lies, 1.01 * limit, 0.6 * limit, 0.3)[1] < 1.5e-2 * GAP
+    for step in (0.01, 0.04):
+        assert let_go(lies, 1.01 * limit, 0.6 * limit, 0.3, step)[1] < 1.5e-2 * GAP
     assert let_go(lies, 0.99 * limit, 0.6 * limit, 0.3)[1] > 5.0 * GAP
+
+
+def first_accelerations(comm: MPI.Comm, content: dict[str, Any]) -> Array:
+    """Accelerations [m/s²] of all vertices with which generalised-α starts."""
+    content = content | {"time": {"end": 0.02, "step": 0.02, "integrator": "alpha2"}}
+    simulation = SteppedScene(comm, scene_of(content))
+    integrator, found = simulation.problem.system.integrator, []
+    keep = integrator.set_acceleration
+
+    def set_acceleration(acceleration: Array) -> None:
+        found.append(acceleration)
+        keep(acceleration)
+
+    integrator.set_acceleration = set_acceleration  # type: ignore[method-assign]
+    simulation.step()
+    a = gathered(simulation.problem.points, found[0])
+    simulation.destroy()
+    return a
+
+
+def test_accelerations_at_the_start_are_those_with_friction(comm: MPI.Comm) -> None:
+    """Friction stops a slow sheet within the step, brakes a fast one, and takes it along with an obstacle."""
+    mu, step, place = 0.5, 0.02, {"transform": {"translate": [0.0, 0.0, 0.985 * 0.005]}}
+    content = {
+        "mesh": grid(0.1, 0.1, 3, 3) | place,
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": 0.005, "friction": {"static": mu, "kinetic": 0.3}, "self": False},
+        "obstacles": {"floor": {"plane": FLAT}},
+    }
+    rest = first_accelerations(comm, content)
+    friction = mu * (G + rest[:, 2].mean())
+    assert friction > 0.1
+    np.testing.assert_allclose(rest[:, :2], 0.0, atol=1e-6)
+    pull = {"gravity": [0.3 * friction, 0.4 * friction, -G]}
+    np.testing.assert_allclose(first_accelerations(comm, content | pull)[:, :2], 0.0, atol=1e-6)
+    pull = {"gravity": [1.2 * friction, 1.6 * friction, -G]}
+    slides = first_accelerations(comm, content | pull)
+    np.testing.assert_allclose(slides[:, :2], friction * np.tile([0.6, 0.8], (16, 1)), rtol=1e-6)
+    fast = first_accelerations(comm, content | {"initial": {"velocity": [-1.0, 0.0, 0.0]}})
+    np.testing.assert_allclose(fast[:, 0], friction, rtol=1e-6)
+    drift = {"initial": {"velocity": [0.2 * friction * step, 0.0, 0.0]}}
+    slow = first_accelerations(comm, content | drift)
+    np.testing.assert_allclose(slow[:, 0], -0.4 * friction, rtol=1e-6)
+    away = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 2.0, 0.0]}]
+    belt = {"floor": {"plane": FLAT, "motion": away, "interpolation": "linear"}}
+    carried = first_accelerations(comm, content | {"obstacles": belt})
+    np.testing.assert_allclose(carried[:, 1], friction, rtol=1e-6)
+    rides = {"obstacles": belt, "initial": {"velocity": [0.0, 2.0, 0.0]}}
+    np.testing.assert_allclose(first_accelerations(comm, content | rides)[:, :2], 0.0, atol=1e-6)
+
+
+def test_a_stack_is_held_by_friction_from_the_start(comm: MPI.Comm) -> None:
+    """The friction between all sheets is found together."""
+    gap, push = 0.002, 0.1
+    sheets = [
+        grid(0.1, 0.1, 4, 4) | {"transform": {"translate": [0.0, 0.0, (k + 1) * 0.96 * gap]}}
+        for k in range(3)
+    ]
+    content = {
+        "mesh": sheets,
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [push, 0.0, -G],
+        "contact": {"gap": gap, "friction": 0.5},
+        "obstacles": {"floor": {"plane": FLAT}},
+    }
+    np.testing.assert_allclose(first_accelerations(comm, content)[:, :2], 0.0, atol=0.15 * push)
 
 
 def test_friction_on_a_tilting_plane_has_a_potential(comm: MPI.Comm) -> None:
@@ -234,11 +304,15 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2", "semi-implicit"])
 def test_friction_uses_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:
-    """A sheet dropped on the slope: friction that is one step late would lack g sin α Δt permanently."""
+    """A sheet dropped on the slope: friction that is one step late would lack g sin α Δt permanently.
+
+    The first step of ``bdf2`` and ``alpha2``, of another form than the others, leaves some percent of that.
+    """
+    accuracy = 0.05 if integrator in ("bdf2", "alpha2") else 0.01
     for part in (0.5, 1.01):
         _, speed, *_ = on_slope(comm, part * math.tan(SLOPE), 0.5, integrator=integrator, above=0.97)
         expected = max(1.0 - part, 0.0) * G * math.sin(SLOPE) * 0.5
-        assert speed == pytest.approx(expected, abs=0.01 * G * math.sin(SLOPE) * 0.01)
+        assert speed == pytest.approx(expected, abs=accuracy * G * math.sin(SLOPE) * 0.01)
 
 
 INTEGRATORS = [

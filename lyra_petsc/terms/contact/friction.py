@@ -30,7 +30,7 @@ from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, UpcomingStep
+from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, StartingFriction, UpcomingStep
 
 WORK, OWED = 0, 1
 """Columns of the data of vertices: work of friction [J]; impulse of normal forces [N s] whose friction is
@@ -432,6 +432,17 @@ class CoulombFriction(Elastic):
             obstacle[rows],
             moved[rows],
         )
+
+    def starting_friction(self, frozen: ObstacleMotion) -> StartingFriction:
+        owned = slice(self.n_owned)
+        gradients, beta = self._gradients[owned], self._beta[owned]
+        # a gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d
+        size = np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
+        (_, _, constant, stiffness, limit), _ = self._kernel_data(frozen.end_motions)
+        elastic = -(stiffness[:, None] * self._tangential(self._slip))[owned]
+        moved, force = (constant - self._constant)[owned], self._force[owned]
+        points = self.stencil[owned].astype(np.int64)
+        return StartingFriction(points, gradients, size, force, limit[owned], elastic, moved)
 
     def moments(self, x: Array, frozen: ObstacleMotion) -> tuple[Ints, Array]:
         rows = np.flatnonzero(self._obstacle[: self.n_owned] < 0)

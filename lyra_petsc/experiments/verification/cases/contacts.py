@@ -730,7 +730,9 @@ def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tup
     source="Coulomb's law",
     resolutions=(8, 12),
     claim=Exact(5e-3),
-    claims={f"creep, {name}": Exact(1e-6) for name in SLIDERS},
+    claims={f"creep, {name}": Exact(1e-6) for name in SLIDERS}
+    # it vibrates most, and is off by 0 to 7e-3 at starts that differ by a fiftieth of the gap
+    | {"acceleration, alpha2": Exact(1e-2)},
     counts="cells a side",
     quick=1,
 )
