@@ -1,4 +1,4 @@
-"""Impulses on velocities at the end of a step with contact.
+"""Impulses on velocities at the end of a step with contact, and friction at the start of one.
 
 **All integrators**: a barrier stores the energy of an impact and would return it as a bounce. `damp_impacts`
 damps the rates of change of the distances in contact, by dashpots of half the critical damping of barrier and
