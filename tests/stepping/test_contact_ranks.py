@@ -198,6 +198,29 @@ def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.parallel(alone=False)
+def test_ranks_agree_on_a_table(comm: MPI.Comm) -> None:
+    """Errors of a step's last linear solve are magnified after the cloth has met the table's edges."""
+    content = {
+        "mesh": grid(1.2, 1.2, 32, 32, "alternating") | {"transform": {"translate": [-0.6, -0.6, 0.02]}},
+        "gravity": [0.0, 0.0, -9.81],
+        "material": {"cloth": "gray-interlock", "damping": 0.02},
+        "contact": {"friction": 0.3},
+        "obstacles": {"table": {"box": {"min": [-0.4, -0.4, -0.05], "max": [0.4, 0.4, 0.0]}}},
+        "time": {"end": 1.0, "step": 0.005},
+        "solver": {},
+    }
+    results = []
+    for ranks in (MPI.COMM_SELF, comm):
+        simulation = SteppedScene(ranks, scene_of(content))
+        for _ in range(35):
+            simulation.step()
+        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        size = simulation.problem.whole.size
+        simulation.destroy()
+    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-7 * size)
+
+
 def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
     """Sheets buckle in one of many ways.
 

@@ -107,7 +107,7 @@ class Convergence:
     @property
     def balanced(self) -> bool:
         """Whether the last residual is below the force tolerance or the round-off floor."""
-        return self.norm <= max(self._floor, self._force_tolerance())
+        return self.norm <= max(self._floor, self.force_tolerance())
 
     def test(self, snes: PETSc.SNES, iteration: int, residual: float, linear_iterations: int) -> int | None:
         """SNES's converged reason after so many linear iterations of the solve, or None; collective."""
@@ -147,7 +147,7 @@ class Convergence:
         if residual > atol and iteration == 0:
             self._first_norm = residual
             return None
-        balanced = residual <= self._force_tolerance()
+        balanced = residual <= self.force_tolerance()
         if residual <= atol:
             self.stopped_by = "" if balanced else "-snes_atol"
             return int(Reason.CONVERGED_FNORM_ABS if balanced else Reason.DIVERGED_INNER)
@@ -173,10 +173,10 @@ class Convergence:
         self._met_tolerances = True
         if was_good or not (system.discretisation.limits_motion and system.integrator.dynamic):
             return False
-        enough, part = self._force_tolerance(), FINER_IN_CONTACT
+        enough, part = self.force_tolerance(), FINER_IN_CONTACT
         return (self.norm > part * enough or self.remaining > part * tolerance) and system.may_impact
 
-    def _force_tolerance(self) -> float:
+    def force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""
         return float(self._tolerances.force_tolerance * self._system.largest_force())
 
@@ -191,7 +191,7 @@ class Convergence:
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
         self._after_correction = expected * self._system.stage.c
         tolerance = self._tolerances.step_tolerance * self.spacing
-        return self._after_correction <= tolerance and residual <= self._force_tolerance()
+        return self._after_correction <= tolerance and residual <= self.force_tolerance()
 
     def _estimate_remaining(self, increment: float) -> None:
         """Estimate the remaining correction from the ratio of the last two increments [m].

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+from lyra_petsc.stepping.newton.convergence import Convergence
+
 LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
@@ -34,6 +36,15 @@ iteration in three, and takes a third more linear iterations."""
 COLLISION = 1.0
 """Approach of parts in a step, over the mean edge length, from which on they count as colliding: sheets then
 buckle into one of many shapes, and the first Newton steps decide into which."""
+
+LAST, LAST_FAR = 1e-3, 1e-2
+"""Linear residual of the solve that is expected to be a step's last one, over the residual that the step may
+leave, in scenes with contact; the second while no parts are near. Motions in contact magnify errors of
+solves, which depend on the number of ranks. Solves take a tenth more iterations, but there are fewer."""
+
+BUCKLING = 1e-5
+"""Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of
+several shapes, and the error of looser solves decides into which."""
 
 SLOW = 0.3
 """After an iteration that leaves more than this fraction of the residual, the tolerance is tightened."""
@@ -62,33 +73,50 @@ class Forcing:
     def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool, contact: bool = False) -> None:
         self._ksp, self._fixed, self._cycles, self._contact = ksp, fixed, cycles, contact
         self.tolerance = LOOSEST
-        self.begin_solve(near=False, collides=False)
+        self.begin_solve(near=False, collides=False, buckles=False)
 
-    def begin_solve(self, *, near: bool, collides: bool) -> None:
+    def begin_solve(self, *, near: bool, collides: bool, buckles: bool) -> None:
         """Prepare for a new solve, with ten times the tolerance at which the last one ended.
 
-        Says whether parts are near in the step, and whether they collide.
+        Says whether parts are near in the step, whether they collide, and whether the Hessian may be
+        indefinite at its start.
         """
         self._slow = SLOW_IN_CONTACT if near else SLOW
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
         self._collides, self._nothing_near = collides, self._contact and not near
+        self._near, self._buckles = near, buckles
 
     @property
     def effective_tolerance(self) -> float:
         """The tolerance of the present solves, with the limits of contact."""
-        if self._collides and not self._fixed:
+        if self._fixed:
+            return self.tolerance
+        if self._collides:
             return ONCE_IN_CONTACT
-        return min(self.tolerance, NOTHING_NEAR) if self._nothing_near and not self._fixed else self.tolerance
+        if self._nothing_near:
+            return min(self.tolerance, NOTHING_NEAR)
+        return min(self.tolerance, BUCKLING) if self._near and self._buckles else self.tolerance
 
-    def before_solve(self, norm: float) -> None:
-        """Set the tolerance for the next linear solve; ``norm`` [N] is that of the present residual."""
+    def meet_negative_curvature(self) -> None:
+        """Tighten the tolerance in the rest of the step, as its Hessian is indefinite."""
+        self._buckles = True
+        if not self._fixed:
+            self._ksp.setTolerances(rtol=self.effective_tolerance)
+
+    def before_solve(self, convergence: Convergence) -> None:
+        """Set the tolerance for the next linear solve; collective."""
         if self._fixed:
             return
+        norm = convergence.norm
         if self._norm > 0.0 and norm > self._slow * self._norm:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm = norm
-        self._ksp.setTolerances(rtol=self.effective_tolerance)
+        self._norm, tolerance = norm, self.effective_tolerance
+        if self._contact:
+            enough = convergence.force_tolerance()
+            if 0.0 < tolerance * norm <= enough:
+                tolerance = min(tolerance, (LAST if self._near else LAST_FAR) * enough / norm)
+        self._ksp.setTolerances(rtol=tolerance)

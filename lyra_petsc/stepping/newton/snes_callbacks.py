@@ -137,7 +137,8 @@ class Newton:
         self._linear.shift.decrease()
         self.convergence.begin_solve()
         self.globalisation.begin_solve()
-        self.forcing.begin_solve(near=self._system.discretisation.has_near_elements, collides=collides)
+        near = self._system.discretisation.has_near_elements
+        self.forcing.begin_solve(near=near, collides=collides, buckles=not self._convex_at_start)
 
     @property
     def _corrects(self) -> bool:
@@ -150,7 +151,7 @@ class Newton:
         v = self._array(u)
         if self._iterates:
             self._system.set_iterate(v)
-            self.forcing.before_solve(self.convergence.norm)
+            self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
@@ -183,6 +184,8 @@ class Newton:
         residual = self._snes.getFunction()[0]
         failed = self._lacks_descent(residual, y)
         self._convex = not failed
+        if failed:
+            self.forcing.meet_negative_curvature()
         if self._snes.getIterationNumber() == 0:
             self._convex_at_start = self._convex
         while failed:
