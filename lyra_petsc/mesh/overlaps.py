@@ -241,9 +241,14 @@ MAX_LISTED = 3
 
 
 def refuse_crossings(
-    scene: Scene, mesh: Mesh, positions: Array, obstacles: Sequence[Solid | Container]
+    scene: Scene,
+    mesh: Mesh,
+    positions: Array,
+    obstacles: Sequence[Solid | Container],
+    time: float = 0.0,
+    when: str = "at the start",
 ) -> None:
-    """Refuse start positions in which triangles cross, or overlap an obstacle.
+    """Refuse positions at which a run begins or is resumed if triangles cross, or overlap an obstacle.
 
     Parameters
     ----------
@@ -251,8 +256,10 @@ def refuse_crossings(
         A scene with ``contact``.
     mesh : Mesh
     positions : (V, 3) float64
-        Positions at t = 0 [m].
+        Positions [m].
     obstacles : sequence of Solid or Container
+    time : float
+        Time [s] at which the obstacles are where they are, described by ``when``.
 
     Raises
     ------
@@ -264,7 +271,7 @@ def refuse_crossings(
 
     def refuse(key: str, count: str, listed: Iterable[str], remedy: str) -> None:
         first = ", ".join(listed)
-        message = f"at the start {count} (counted from 0, the first: {first}); {remedy}"
+        message = f"{when} {count} (counted from 0, the first: {first}); {remedy}"
         raise InputError(message, file=scene.source, key=key)
 
     def around(*numbers: int) -> str:
@@ -289,13 +296,14 @@ def refuse_crossings(
     for obstacle in obstacles:
         key, shape = f"obstacles.{obstacle.name}", (scene.obstacles or {})[obstacle.name]
         if shape.mesh is not None and isinstance(obstacle, Solid):
-            pairs = mutual_crossings(positions, triangles, obstacle.points, obstacle.triangles)
+            surface = obstacle.positions(time), obstacle.triangles
+            pairs = mutual_crossings(positions, triangles, *surface)
             if len(pairs):
                 listed = (f"{a} and {b} {around(a)}" for a, b in pairs[:MAX_LISTED].tolist())
                 count = _counted(len(pairs), "pair", "of triangles of sheet and obstacle", "cross")
                 refuse(key, count, listed, remedy)
             continue
-        inside = find_overlaps(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles
+        inside = find_overlaps(obstacle, positions, triangles, time, is_box=shape.box is not None).triangles
         if len(inside):
             where = "into it" if isinstance(obstacle, Solid) else "beyond it"
             listed = (f"{a} {around(a)}" for a in inside[:MAX_LISTED].tolist())

@@ -35,6 +35,7 @@ from lyra_petsc.scene.dump import Change, dump_scene, scene_changes
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+from lyra_petsc.terms.handles.motion import Motion
 
 MAX_LISTED_CHANGES = 12
 """Maximum number of a resumed scene's changes that are listed one by one."""
@@ -122,6 +123,7 @@ class Recorder:
                 "run without --resume",
                 file=checkpoint.file,
             ) from error
+        on_root(self._comm, lambda: self._refuse_crossings(checkpoint))
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
         self._note_changes(folder / "scene.yaml")
@@ -198,6 +200,19 @@ class Recorder:
             )
         for name, columns in self._table_columns().items():
             check_columns(folder / name, columns)
+
+    def _refuse_crossings(self, checkpoint: Checkpoint) -> None:
+        """Refuse a scene that is changed so that sheets cross each other or obstacles now (rank 0)."""
+        simulation = self._simulation
+        scene, mesh = simulation.scene, simulation.problem.mesh
+        if scene.contact is None or mesh is None:
+            return
+        from lyra_petsc.mesh.obstacles import build_obstacles
+        from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
+
+        positions = read_stored(checkpoint.file, "vertices/position", (mesh.n_vertices, 3), kinds="f")
+        obstacles = build_obstacles(scene, mesh.obstacles, Motion)
+        refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
 
     def _note_changes(self, before: Path) -> None:
         """Add notes for the user on the keys in which the scene differs from the one in the folder."""

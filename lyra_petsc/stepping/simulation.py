@@ -335,7 +335,7 @@ class SteppedScene:
         with self.phases("balance"):
             if self.guard is None:
                 self.energy_balance.record(x_before[:n])
-            when = f"step {self.step_number} ({self._time_text()})"
+            when = f"step {self.step_number} ({self.time_text()})"
             note = self.compression.check(when, reported="compression" in self._reported)
         if note:
             self._note_once("compression", note)
@@ -373,11 +373,11 @@ class SteppedScene:
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
             self._note_once(
                 "roundoff",
-                f"step {self.step_number} ({self._time_text()}) ended at round-off: double precision leaves "
+                f"step {self.step_number} ({self.time_text()}) ended at round-off: double precision leaves "
                 f"a residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads",
             )
 
-    def _time_text(self) -> str:
+    def time_text(self) -> str:
         """Text of the present time, or load factor."""
         moves = self.problem.system.integrator.dynamic
         return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
@@ -489,7 +489,7 @@ class SteppedScene:
 
     def _note_impact(self, why: str, by: str) -> None:
         """Note once which integrator repeats steps that fail in contact."""
-        where = f"step {self.step_number + 1} ({self._time_text()}): {self._scene_integrator.name} {why}"
+        where = f"step {self.step_number + 1} ({self.time_text()}): {self._scene_integrator.name} {why}"
         self._note_once(
             "impact" if by == "backward Euler" else f"impact {by}",
             f"{where} in contact; such steps are repeated by {by}",
@@ -504,11 +504,11 @@ class SteppedScene:
             If Δt is as small as it may be.
         """
         assert self.guard is not None
-        where, scheme = f"step {self.step_number + 1} ({self._time_text()})", self.scene.time.scheme
+        where, scheme = f"step {self.step_number + 1} ({self.time_text()})", self.scene.time.scheme
         if halvings >= HALVINGS or not self.control.shorten(dt, first=halvings == 0):
             raise SolverError(
                 f"{where}: {scheme} {self.guard.message}, even with Δt = {dt:.3g} s; "
-                f"the state at {self._time_text()} is kept; try {self.guard.remedy}",
+                f"the state at {self.time_text()} is kept; try {self.guard.remedy}",
                 collective=True,
             )
         if self.guard.gains.repeated == 1:
@@ -662,7 +662,7 @@ class SteppedScene:
         # loads and handles that only the changed scene starts earlier start now; the others have started
         system.set_references(self.time)
         system.hold_targets(self.time)
-        refuse_contact(system, self.scene, f"at {self._time_text()}")
+        refuse_contact(system, self.scene, f"at {self.time_text()}")
         self.energy_balance.restore(arrays, scalars["budget"])
         self.control.restore(scalars)
         if self._equilibrium is not None:

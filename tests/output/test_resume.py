@@ -20,7 +20,7 @@ from physics import CLOTH, direct_solver, grid, options, scene_of
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.arrays import Array
-from lyra_petsc.errors import Interrupted
+from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.states import stored_states
@@ -110,6 +110,10 @@ def table(folder: Path, name: str) -> dict[str, Array]:
         header, *rows = csv.reader(file)
     columns = np.array(rows, dtype=float).T
     return {column: values for column, values in zip(header, columns, strict=True) if "wall" not in column}
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 OF_THE_SOLVER = ("newton_iterations", "linear_iterations", "residual")
@@ -258,3 +262,36 @@ def test_displacement_is_relative_to_the_first_state_after_resuming(comm: MPI.Co
         np.testing.assert_array_equal(run.field("displacement"), moved)
         assert run.field_units("displacement") == "m"
     comm.Barrier()
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("changed", ["motion", "self"])
+def test_a_scene_changed_to_cross_its_sheets_is_refused(
+    comm: MPI.Comm, shared_tmp: Path, changed: str
+) -> None:
+    """By a lid that is around the sheet now, or since sheets that have crossed may not any longer."""
+    lid = {"box": {"min": [-1.0, -1.0, 0.1], "max": [1.0, 1.0, 0.5]}}
+    upper = grid(0.3, 0.3, 4, 3) | {"transform": {"translate": [0.0, 0.0, 0.05]}}
+    down = {"time": 0.01, "translate": [0.0, 0.0, -0.2]}
+    scene = {
+        "mesh": [grid(0.2, 0.2, 3, 3), upper],
+        "material": CLOTH | {"bending": 1e-4},
+        "time": {"end": 0.02, "step": 0.005},
+    }
+    if changed == "motion":
+        before = scene | {"contact": {}, "obstacles": {"lid": lid | {"motion": [{"time": 0.0}]}}}
+        after = before | {"obstacles": {"lid": lid | {"motion": [{"time": 0.0}, down]}}}
+        words = r"obstacles\.lid: at t = 0\.01 s \d+ triangles of the sheet reach into it"
+    else:
+        before = scene | {"contact": {"self": False}, "handles": [{"nodes": [16, 17], "motion": "down"}]}
+        before["motions"] = {"down": [{"time": 0.0}, down]}
+        after = before | {"contact": {}}
+        words = r"contact: at t = 0\.01 s \d+ pairs? of triangles cross"
+    folder = shared_tmp / "run"
+    assert simulate_until(comm, before, folder, 2)[0] == 2
+    kept = files_of(folder)
+    comm.Barrier()
+    with pytest.raises(InputError, match=words):
+        simulate_until(comm, after, folder, None, resume=True)
+    comm.Barrier()
+    assert files_of(folder) == kept
