@@ -116,7 +116,8 @@ class _RunLoop:
             earlier = self._earlier_summary()
             changes = [{"key": c.key, "old": c.old, "new": c.new} for c in recorder.changes]
             start = {"step": simulation.step_number, "time": simulation.time, "ranks": self._comm.size}
-            self._resumed = [*earlier.get("resumed", []), start | {"changes": changes}]
+            motions = {"earlier_motions": recorder.earlier_motions} if recorder.earlier_motions else {}
+            self._resumed = [*earlier.get("resumed", []), start | {"changes": changes} | motions]
 
     def _earlier_summary(self) -> dict[str, Any]:
         """The summary of the run that is resumed, empty if it cannot be read."""

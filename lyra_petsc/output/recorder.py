@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -31,7 +32,8 @@ from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.tensors import plane_components
 from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.dump import Change, dump_scene, scene_changes
+from lyra_petsc.scene.dump import Change, dump_scene, obstacle_motions, scene_changes
+from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -59,6 +61,8 @@ class Recorder:
     ----------
     changes : list of Change
         After ``resume``: differences between the scene and the one that the run was begun with.
+    earlier_motions : dict of str to dict
+        After ``resume``: by name, how the run moved obstacles until then, if it does so otherwise now.
 
     Raises
     ------
@@ -87,6 +91,7 @@ class Recorder:
         self._last_state = -1
         self._checkpoint_seconds = 0.0
         self.changes: list[Change] = []
+        self.earlier_motions: dict[str, Any] = {}
 
     # -- opening -------------------------------------------------------------------------------------
 
@@ -222,6 +227,13 @@ class Recorder:
         except InputError as error:
             notes.append(f"{error}; what has changed since the run was begun is not known")
             return
+        if any(change.key.startswith(("obstacles", "motions")) for change in self.changes):
+            with suppress(InputError):  # scenes of other versions are compared as text only
+                earlier = on_root(
+                    self._comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False))
+                )
+                now = obstacle_motions(scene)
+                self.earlier_motions = {n: each for n, each in earlier.items() if n in now and each != now[n]}
         for change in self.changes[:MAX_LISTED_CHANGES]:
             if change.key == "time.end":
                 notes.append(str(change))

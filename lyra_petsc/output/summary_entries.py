@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import BaseModel
 
 
@@ -9,11 +11,17 @@ class _Key(BaseModel):
     key: str = ""
 
 
+class _Motion(BaseModel):
+    motion: list[dict[str, Any]] = []
+    interpolation: str = "hermite"
+
+
 class _Resumption(BaseModel):
     step: int = 0
     time: float = 0.0
     ranks: int = 1
     changes: list[_Key] = []
+    earlier_motions: dict[str, _Motion] = {}
 
 
 class _Failure(BaseModel):

@@ -112,6 +112,17 @@ def scene_changes(before: Path, scene: Scene) -> list[Change]:
     return _compare("", old, new)
 
 
+def obstacle_motions(scene: Scene) -> dict[str, Any]:
+    """``motion``, a list of keyframes as plain values, and ``interpolation`` of each obstacle, by name."""
+    return {
+        name: {
+            "motion": [_plain_value(keyframe) for keyframe in scene.keyframes(obstacle)],
+            "interpolation": obstacle.interpolation,
+        }
+        for name, obstacle in (scene.obstacles or {}).items()
+    }
+
+
 def _compare(key: str, old: Any, new: Any) -> list[Change]:
     if isinstance(old, dict) and isinstance(new, dict):
         names = [*old, *(name for name in new if name not in old)]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +22,14 @@ from lyra_petsc.mesh.obstacles import (
 )
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
-from lyra_petsc.scene.schema import Obstacle
+from lyra_petsc.scene.schema import Keyframe, Obstacle
 from lyra_petsc.terms.handles.motion import Motion
 
 
 def run_obstacles(run: StoredRun) -> list[Solid | Container]:
-    """The obstacles of a run, in the order of its scene.
+    """The obstacles of a run, in the order of its scene, moved as the run moved them.
+
+    If a run was resumed with another motion, the earlier one counts until then.
 
     Raises
     ------
@@ -38,7 +41,35 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     stored = run.mesh.obstacles if meshes else {}
     if missing := meshes - stored.keys():
         raise InputError(f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE)
-    return build_obstacles(run.scene, stored, Motion)
+    found = build_obstacles(run.scene, stored, Motion)
+    for resumption in reversed(run.summary.get("resumed", [])):
+        earlier, until = resumption.get("earlier_motions", {}), resumption.get("time", 0.0)
+        found = [
+            _moved_otherwise(run, each, earlier[each.name], until) if each.name in earlier else each
+            for each in found
+        ]
+    return found
+
+
+def _moved_otherwise(
+    run: StoredRun, obstacle: Solid | Container, earlier: Mapping[str, Any], until: float
+) -> Solid | Container:
+    """An obstacle that has another motion, of an entry of summary.json, until a time [s]."""
+    file, motion = run.folder / "summary.json", None
+    if earlier.get("motion"):
+        try:
+            keyframes = [Keyframe.model_validate(keyframe) for keyframe in earlier["motion"]]
+        except ValueError:
+            raise InputError("is damaged, holds what no run writes", file=file, key="resumed") from None
+        motion = Motion(
+            keyframes, earlier.get("interpolation", "hermite"), key="resumed", file=file
+        ).transform
+    before = replace(obstacle, motion=motion)
+
+    def moved(time: float) -> tuple[Array, Array]:
+        return (before if time <= until else obstacle).rigid_motion(time)
+
+    return replace(obstacle, motion=moved)
 
 
 CIRCLE_POINTS = 48

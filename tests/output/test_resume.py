@@ -25,6 +25,7 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import import_h5py
+from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
@@ -295,3 +296,39 @@ def test_a_scene_changed_to_cross_its_sheets_is_refused(
         simulate_until(comm, after, folder, None, resume=True)
     comm.Barrier()
     assert files_of(folder) == kept
+
+
+@pytest.mark.parallel
+def test_obstacles_are_shown_where_they_were_before_their_motion_changed(
+    comm: MPI.Comm, shared_tmp: Path
+) -> None:
+    """After two resumptions; one of the obstacles had no motion at first."""
+
+    def scene(fast: float, slow: float) -> dict[str, Any]:
+        ball = {"sphere": {"center": [0.0, 0.0, -1.0], "radius": 0.1}}
+        motions = {"fast": [{"time": 0.0}, {"time": 0.1, "translate": [fast, 0.0, 0.0]}]}
+        along = [{"time": -0.1, "translate": [1.0, 0.0, 0.0]}, {"time": 0.1, "translate": [slow, 0.0, 0.0]}]
+        second = ball | ({"motion": along, "interpolation": "linear"} if slow else {})
+        return {
+            "mesh": grid(0.2, 0.2, 2, 2),
+            "material": CLOTH | {"bending": 1e-4},
+            "contact": {},
+            "obstacles": {"first": ball | {"motion": "fast"}, "second": second, "third": ball},
+            "motions": motions,
+            "time": {"end": 0.05, "step": 0.01},
+            "output": {"every": 0.01},
+        }
+
+    folder, scenes = shared_tmp / "run", (scene(1.0, 0.0), scene(2.0, 4.0), scene(3.0, 4.0))
+    for stop, content in zip((1, 3, None), scenes, strict=True):
+        simulate_until(comm, content, folder, stop, resume=stop != 1)
+    run = StoredRun(folder)
+    first, second, third = run_obstacles(run)
+    for time, fast, slow in zip(
+        run.times, [1.0, 1.0, 2.0, 2.0, 3.0, 3.0], [0.0, 0.0, 1.0, 1.0, 1.0, 1.0], strict=True
+    ):
+        s = 10.0 * time
+        assert first.positions(time)[0, 0] == pytest.approx(fast * s * s * (3.0 - 2.0 * s))
+        assert second.positions(time)[0, 0] == pytest.approx(slow * 1.5 * s)
+        assert third.motion is None
+    comm.Barrier()
