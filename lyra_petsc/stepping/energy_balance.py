@@ -182,8 +182,8 @@ class EnergyBalance:
         return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
-        """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs and loads without a
-        potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
+        """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
+        without a potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
         """
         system = self._system
         self._at = at = system.prescribed.indices
@@ -198,7 +198,7 @@ class EnergyBalance:
         external *= -system.applied.factor
         for name, part in parts:
             self._reactions += part.take(at)
-            if name in ("loads", "springs", "wind"):
+            if name in ("loads", "springs", "friction", "wind"):
                 external -= part
             elif name == "damping":
                 damping = part.take(at)

@@ -813,8 +813,9 @@ class StageEquations:
         yield self._with_square("inertia", self.mass[:, None] * vdot)
         del vdot
         constraints = self._present(self.active.constraints)
-        if constraints:
-            yield self._with_square("springs", self._sum(constraints, x))
+        for name, slips in (("springs", False), ("friction", True)):
+            if terms := [term for term in constraints if term.slips is slips]:
+                yield self._with_square(name, self._sum(terms, x))
         yield self._with_square("loads", -self.applied.force_at(x))
         if self.damping.active:
             yield self._with_square("damping", self.damping.product(vs))

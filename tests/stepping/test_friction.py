@@ -75,6 +75,27 @@ def test_a_sheet_slides_by_coulombs_law(comm: MPI.Comm) -> None:
     assert work == pytest.approx(friction * pressed * slip, rel=0.05)
 
 
+def test_friction_is_a_part_of_the_residual_by_its_own_name(comm: MPI.Comm) -> None:
+    """Messages on failed steps list the parts; a scene without handles has no springs."""
+    content = {
+        "mesh": grid(0.4, 0.4, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.9 * GAP]}},
+        "gravity": [2.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": 0.1},
+        "obstacles": {"floor": {"plane": FLAT}},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    for _ in range(3):
+        simulation.step()
+    parts = {name: part.sum(axis=0) for name, part in system.forces_at_stage()}
+    assert "springs" not in parts
+    friction, internal = (comm.allreduce(parts[name]) for name in ("friction", "internal"))
+    weight = G * comm.allreduce(float(system.mass[:n].sum()))
+    assert 0.05 * weight < friction[0] < 0.2 * weight
+    assert -internal[2] > 0.5 * weight
+    simulation.destroy()
+
+
 def test_a_slope_of_triangles_acts_as_a_plane(comm: MPI.Comm, shared_tmp: Path) -> None:
     """The sheet's vertices, edges and triangles slide over the slope's edges."""
     if comm.rank == 0:

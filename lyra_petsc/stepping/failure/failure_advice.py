@@ -47,6 +47,7 @@ KEYS = {
     "inertia": "initial.velocity, motions and time.step",
     "internal": "material and the units of the mesh (mesh.transform.scale)",
     "springs": "handles[].stiffness",
+    "friction": "contact.friction",
     "loads": "gravity and loads",
     "damping": "material.damping",
     "wind": "wind.velocity and wind.density",
