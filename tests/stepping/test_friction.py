@@ -300,7 +300,10 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
 
 @pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
 def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrator: str) -> None:
-    """A plane starts to move by many times the limit of elastic slip in a step."""
+    """A plane starts to move by many times the limit of elastic slip in a step.
+
+    The sheet bounces by some per cent of the gap and slips meanwhile, under alpha2 0.05 mm with this Δt.
+    """
     end, far, gap = 0.1, 0.6, 0.003
     away = {"time": 1.0, "translate": [far, 0.0, 0.0]}
     content = {
@@ -318,8 +321,33 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
     slip = (gathered(simulation.problem.points, simulation.problem.system.x) - start)[:, 0]
     rejected = simulation.totals["rejected"]
     simulation.destroy()
-    np.testing.assert_allclose(slip, far * (3.0 * end**2 - 2.0 * end**3), rtol=1e-3)
-    assert rejected <= 8
+    np.testing.assert_allclose(slip, far * (3.0 * end**2 - 2.0 * end**3), rtol=4e-3)
+    assert rejected <= 4
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
+def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm, integrator: str) -> None:
+    """Friction, zero at the start, reaches its limit early in the first step: all steps balance energy."""
+    speed, friction, end = 1.0, 0.5, 0.1
+    away = {"time": 1.0, "translate": [speed, 0.0, 0.0]}
+    content = {
+        "mesh": grid(0.06, 0.06, 2, 2) | {"transform": {"translate": [0.0, 0.0, 0.985 * GAP]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0, "density": 40.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": friction, "self": False},
+        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away], "interpolation": "linear"}},
+        "time": {"end": end, "step": 0.01, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    while not simulation.finished:
+        simulation.step()
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    sums = np.append(system.mass @ system.v[:n], system.mass.sum())
+    momentum = comm.allreduce(sums)
+    rejected = simulation.totals["rejected"]
+    simulation.destroy()
+    assert momentum[0] / momentum[3] == pytest.approx(friction * G * end, rel=0.05)  # the sheet bounces
+    assert rejected <= 2
 
 
 @pytest.mark.parallel(1)

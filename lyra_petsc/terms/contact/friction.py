@@ -307,16 +307,22 @@ class CoulombFriction(Elastic):
         self, ends: tuple[Array, Array], frozen: tuple[ObstacleMotion, ObstacleMotion]
     ) -> float:
         # by forces: an obstacle moves by many times the elastic slip, so that energies would not do
-        work = 0.0
-        if self._contact.obstacles.moving and self.n_elements:
-            (_, _, before, *_), (_, _, after, *_) = (self._stage_data(each) for each in frozen)
-            for x, each in zip(ends, frozen, strict=True):
-                stencil, gradients, constant, stiffness, limit = self._stage_data(each)
-                u = np.einsum("ecik,eik->ec", gradients, x[stencil]) + constant
-                secant = np.minimum(stiffness, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))
-                force = secant[:, None] * u
-                work += 0.5 * float(np.vdot(force[: self.n_owned], (after - before)[: self.n_owned]))
-        return work
+        if not (self._contact.obstacles.moving and self.n_elements):
+            return 0.0
+        n, data = self.n_owned, [self._stage_data(each) for each in frozen]
+        slips, forces, energies = [], [], []
+        for x, each, (stencil, gradients, constant, stiffness, limit) in zip(ends, frozen, data, strict=True):
+            u = np.einsum("ecik,eik->ec", gradients, x[stencil]) + constant
+            secant = np.minimum(stiffness, limit / np.maximum(np.linalg.norm(u, axis=1), 1e-300))
+            slips.append(u[:n])
+            forces.append((secant[:, None] * u)[:n])
+            energies.append(self.energies(x, each)[:n])
+        # the mean of the forces, with that part along the slip by which they do the work that is stored or
+        # lost: from rest, friction reaches its limit long before the end of the step
+        mean, slip = 0.5 * (forces[0] + forces[1]), slips[1] - slips[0]
+        missing = energies[1] - energies[0] - np.einsum("ec,ec->e", mean, slip)
+        mean += (missing / np.maximum(np.einsum("ec,ec->e", slip, slip), 1e-300))[:, None] * slip
+        return float(np.vdot(mean, (data[1][2] - data[0][2])[:n]))
 
     def add_gradient(self, x: Array, frozen: ObstacleMotion, out: Array) -> None:
         if self.n_elements:
