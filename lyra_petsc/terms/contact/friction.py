@@ -321,7 +321,9 @@ class CoulombFriction(Elastic):
         # lost: from rest, friction reaches its limit long before the end of the step
         mean, slip = 0.5 * (forces[0] + forces[1]), slips[1] - slips[0]
         missing = energies[1] - energies[0] - np.einsum("ec,ec->e", mean, slip)
-        mean += (missing / np.maximum(np.einsum("ec,ec->e", slip, slip), 1e-300))[:, None] * slip
+        square, of_both = (slip * slip).sum(axis=1), sum((u * u).sum(axis=1) for u in slips)
+        # shorter slip is round-off
+        mean += (missing / np.maximum(square, np.maximum(1e-16 * of_both, 1e-300)))[:, None] * slip
         return float(np.vdot(mean, (data[1][2] - data[0][2])[:n]))
 
     def add_gradient(self, x: Array, frozen: ObstacleMotion, out: Array) -> None:
