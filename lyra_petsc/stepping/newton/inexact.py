@@ -90,20 +90,22 @@ class Forcing:
 
     @property
     def effective_tolerance(self) -> float:
-        """The tolerance of the present solves, with the limits of contact."""
+        """The tolerance of the present solves, with the limits of contact but not that of buckling."""
         if self._fixed:
             return self.tolerance
         if self._collides:
             return ONCE_IN_CONTACT
-        if self._nothing_near:
-            return min(self.tolerance, NOTHING_NEAR)
-        return min(self.tolerance, BUCKLING) if self._near and self._buckles else self.tolerance
+        return min(self.tolerance, NOTHING_NEAR) if self._nothing_near else self.tolerance
 
     def meet_negative_curvature(self) -> None:
         """Tighten the tolerance in the rest of the step, as its Hessian is indefinite."""
         self._buckles = True
         if not self._fixed:
-            self._ksp.setTolerances(rtol=self.effective_tolerance)
+            self._ksp.setTolerances(rtol=self._limited())
+
+    def _limited(self) -> float:
+        limit = BUCKLING if self._near and self._buckles else LOOSEST
+        return min(self.effective_tolerance, limit)
 
     def before_solve(self, convergence: Convergence) -> None:
         """Set the tolerance for the next linear solve; collective."""
@@ -114,7 +116,7 @@ class Forcing:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm, tolerance = norm, self.effective_tolerance
+        self._norm, tolerance = norm, self._limited()
         if self._contact:
             enough = convergence.force_tolerance()
             if 0.0 < tolerance * norm <= enough:
