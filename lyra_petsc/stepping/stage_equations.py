@@ -639,7 +639,9 @@ class StageEquations:
         """
         x, displacement, _ = self._known_displacement(v, increment, 1.0)
         frozen = self.active.frozen
-        found = {term: term.springs(x, displacement, frozen[term]) for term in self.active.limiting}
+        moved = np.linalg.norm(displacement[: self.points.n_vertices], axis=1).max(initial=0.0)
+        approach = 2.0 * self.points.global_max(float(moved))[0]
+        found = {term: term.springs(x, approach, frozen[term]) for term in self.active.limiting}
         return {term: springs for term, springs in found.items() if springs is not None}
 
     def add_contact_springs(

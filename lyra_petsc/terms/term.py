@@ -401,9 +401,10 @@ class Elastic(Term):
         """Largest fraction, up to 1, of Newton's increment dx (n_local, 3) [m] of x that may be applied."""
         return 1.0
 
-    def springs(self, x: Array, dx: Array, frozen: Any) -> Springs | None:
-        """One-sided springs for the pairs that are in contact at x, or may be after an increment dx (n_local,
-        3) [m]. Their elements count as active until `release_springs`. None: the term has no such springs.
+    def springs(self, x: Array, approach: float, frozen: Any) -> Springs | None:
+        """One-sided springs for the pairs that are in contact at x (n_local, 3), or may be after points have
+        approached each other by ``approach`` [m], the same on all ranks. Their elements count as active until
+        `release_springs`. None: the term has no such springs.
         """
         return None
 

@@ -686,14 +686,14 @@ class ContactBarrier(Elastic):
         pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
         return float(contact_pairs.free_fraction(x, frozen.stage, dx, at_rest, *pairs))
 
-    def springs(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Springs:
+    def springs(self, x: Array, approach: float, frozen: ObstaclePositions) -> Springs:
         active, capacity = self.active_pairs(x, frozen.stage), self._capacity
         given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
             integers = np.empty(capacity, dtype=np.int64)
             found = integers, np.empty((capacity, 4)), np.empty((capacity, 3)), *np.empty((3, capacity))
             pairs = *self._pair_data, given, self.n_owned
-            n_active, n = contact_pairs.find_springs(x, frozen.stage, dx, *pairs, found)
+            n_active, n = contact_pairs.find_springs(x, frozen.stage, approach, *pairs, found)
             if n <= capacity:
                 break
             capacity = n
