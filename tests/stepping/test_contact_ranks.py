@@ -359,25 +359,6 @@ def test_predicted_stress_does_not_depend_on_ghosts_that_contact_adds(comm: MPI.
 
 
 @pytest.mark.parallel(alone=False)
-def test_corrections_of_long_increments_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
-    """Which of the pairs that stay apart a search returns does."""
-    gap, rng = 0.01, np.random.default_rng(3)
-    moves = rng.uniform(-4.0 * gap, 4.0 * gap, (3, 15 * 15, 3))
-    results: list[list[Array]] = []
-    for ranks in (MPI.COMM_SELF, comm):
-        with Simulation({"mesh": grid(0.3, 0.3, 14, 14), "contact": {"gap": gap}}, ranks) as simulation:
-            system, points = simulation.problem.system, simulation.problem.points
-            system.begin_step(0.0, 0.01)
-            results.append([])
-            for displacement in moves:
-                increment = displacement[points.mesh_vertices] / system.stage.c
-                corrected = system.second_order_correction(system.stationary_velocity(), increment)
-                assert corrected is not None
-                results[-1].append(system.stage.c * gathered(points, corrected - increment))
-    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-9 * gap)
-
-
-@pytest.mark.parallel(alone=False)
 def test_springs_of_parts_at_rest_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     """What moves may be on another rank."""
     gap, heights = 0.01, (0.0, 0.012, 0.3)

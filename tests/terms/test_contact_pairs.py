@@ -444,23 +444,6 @@ def test_corrections_lead_to_the_force_of_the_linear_model(name: str) -> None:
         assert not loaded[e] or pairs.distances(x + moved)[e] - pairs.offset[e] < GAP
 
 
-def test_only_pairs_that_come_near_in_an_increment_are_corrected() -> None:
-    """The vector between the nearest points turns round in both, but one vertex passes far beside."""
-    triangle = 4.0 * GAP * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    through, beside = GAP * np.array([[1.0, 1.0, 2.0], [-2.0, -2.0, 4.0]])
-    x = np.stack([[through, *triangle], [beside, *triangle]]).reshape(-1, 3)
-    pairs = replace(among_sheets(VERTEX_TRIANGLE, 2), x=x)
-    dx, n = np.zeros_like(x), len(pairs)
-    dx[[0, 4], 2] = -2.0 * x[[0, 4], 2]
-    numbers = pairs.kind, pairs.points, pairs.offset, np.full(n, GAP)
-    targets = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    contact_pairs.target_distances(pairs.x, pairs.obstacle_x, dx, *numbers, 0.7, np.full(n, np.nan), *targets)
-    out, weight = np.zeros_like(x), np.zeros((len(x), 1))
-    assert contact_pairs.add_corrections(x, pairs.obstacle_x, dx, *numbers, *targets, 0.05, out, weight) == 1
-    assert out[0, 2] > 0.0
-    assert not out[4:].any()
-
-
 def test_a_common_motion_of_both_is_free() -> None:
     for make in (lambda: among_sheets(VERTEX_TRIANGLE, 50), lambda: planes(50), lambda: balls(50)):
         pairs = make()

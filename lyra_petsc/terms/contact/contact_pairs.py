@@ -67,9 +67,6 @@ MAX_ADVANCES = 1000
 """Advances of continuous collision detection for one pair, at most: they are short where long displacements
 lead past each other."""
 
-NEAR = 0.7
-"""Part of the gap to which pairs beyond it must approach in an increment to count as possible contacts."""
-
 BISECTIONS = 30
 """Bisections in the search for the distance at which the barrier has a given force."""
 
@@ -915,18 +912,6 @@ def _distance_of_force(force, gap):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _stays_apart(x, x_obs, dx, still, approach, kind, points, offset, gap, e):  # type: ignore[no-untyped-def]
-    """Whether pair e, which is beyond the gap, keeps more than `NEAR` of it all along dx (n_local, 3) [m].
-
-    Distances at the end, or linear in dx, do not show this: edges that turn far from each other seem to have
-    passed through each other. All pairs that do come near have been found, on any number of ranks.
-    """
-    one = slice(e, e + 1)
-    pair = kind[one], points[one], offset[one], gap[one]
-    return _pairs_free_fraction(x, x_obs, dx, still, approach, *pair, NEAR, 1.0) == 1.0
-
-
-@kernel()
 def target_distances(x, x_obs, dx, kind, points, offset, gap, maximum, expected, target, side, loaded):  # type: ignore[no-untyped-def]  # fmt: skip
     """Distances less offset [m] that pairs shall have after Newton's increment dx (n_local, 3) [m].
 
@@ -944,17 +929,16 @@ def target_distances(x, x_obs, dx, kind, points, offset, gap, maximum, expected,
     loaded : (E,)
         Output: whether the pair has a force in the linear model.
     """
-    p, n, beta, no_side, still = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3), np.zeros_like(x_obs)
-    approach = largest_approach(dx, still)
+    p, n, beta, no_side = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3)
+    approach = 2.0 * _largest_norm(dx)
     for e in range(len(kind)):
         target[e], loaded[e] = -math.inf, False
         _load_points(x, x_obs, points, e, p)
         if box_distance(p, kind[e]) - offset[e] - approach >= gap[e]:
             continue
-        delta = _signed_distance(p, kind[e], no_side, beta, n) - offset[e]
-        if not delta > 0.0:
-            continue
-        if delta >= gap[e] and _stays_apart(x, x_obs, dx, still, approach, kind, points, offset, gap, e):
+        d = _signed_distance(p, kind[e], no_side, beta, n)
+        delta = d - offset[e]
+        if not 0.0 < delta < gap[e] + approach:
             continue
         target[e] = maximum * gap[e]
         if kind[e] <= EDGE_EDGE:
