@@ -85,8 +85,7 @@ class Forcing:
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
-        self._collides, self._nothing_near = collides, self._contact and not near
-        self._near, self._buckles = near, buckles
+        self._near, self._collides, self._buckles = near, collides, buckles
 
     @property
     def effective_tolerance(self) -> float:
@@ -95,17 +94,13 @@ class Forcing:
             return self.tolerance
         if self._collides:
             return ONCE_IN_CONTACT
-        return min(self.tolerance, NOTHING_NEAR) if self._nothing_near else self.tolerance
+        return min(self.tolerance, NOTHING_NEAR) if self._contact and not self._near else self.tolerance
 
     def meet_negative_curvature(self) -> None:
         """Tighten the tolerance in the rest of the step, as its Hessian is indefinite."""
         self._buckles = True
-        if not self._fixed:
-            self._ksp.setTolerances(rtol=self._limited())
-
-    def _limited(self) -> float:
-        limit = BUCKLING if self._near and self._buckles else LOOSEST
-        return min(self.effective_tolerance, limit)
+        if self._near and not self._fixed:
+            self._ksp.setTolerances(rtol=min(self._ksp.getTolerances()[0], BUCKLING))
 
     def before_solve(self, convergence: Convergence) -> None:
         """Set the tolerance for the next linear solve; collective."""
@@ -116,7 +111,9 @@ class Forcing:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm, tolerance = norm, self._limited()
+        self._norm, tolerance = norm, self.effective_tolerance
+        if self._near and self._buckles:
+            tolerance = min(tolerance, BUCKLING)
         if self._contact:
             enough = convergence.force_tolerance()
             if 0.0 < tolerance * norm <= enough:
