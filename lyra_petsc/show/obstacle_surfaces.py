@@ -45,16 +45,16 @@ def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     for resumption in reversed(run.summary.get("resumed", [])):
         earlier, until = resumption.get("earlier_motions", {}), resumption.get("time", 0.0)
         found = [
-            _moved_otherwise(run, each, earlier[each.name], until) if each.name in earlier else each
+            _with_earlier_motion(run, each, earlier[each.name], until) if each.name in earlier else each
             for each in found
         ]
     return found
 
 
-def _moved_otherwise(
+def _with_earlier_motion(
     run: StoredRun, obstacle: Solid | Container, earlier: Mapping[str, Any], until: float
 ) -> Solid | Container:
-    """An obstacle that has another motion, of an entry of summary.json, until a time [s]."""
+    """The obstacle with an earlier motion, an entry of summary.json, until a time [s]."""
     file, motion = run.folder / "summary.json", None
     if earlier.get("motion"):
         try:

@@ -149,6 +149,17 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
 
 
+def positions_after(comm: MPI.Comm, content: dict[str, Any], steps: int) -> tuple[Array, float, float]:
+    """Positions (V, 3) in mesh order, the size of the mesh [m], and the most contacts after a step."""
+    simulation, contacts = SteppedScene(comm, scene_of(content)), 0.0
+    for _ in range(steps):
+        simulation.step()
+        contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
+    x, size = gathered(simulation.problem.points, simulation.problem.system.x), simulation.problem.whole.size
+    simulation.destroy()
+    return x, size, contacts
+
+
 @pytest.mark.parametrize("integrator", [on("semi-implicit", 2), on("beuler"), on("bdf2", 3)])
 def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) -> None:
     """An impact magnifies the error that a step leaves, which depends on the number of ranks."""
@@ -162,17 +173,11 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
         "time": {"end": 1.0, "step": 0.004, "integrator": integrator},
         "solver": {},
     }
-    results, contacts = [], 0.0
-    for ranks in (MPI.COMM_SELF, comm):
-        simulation = SteppedScene(ranks, scene_of(content))
-        for _ in range(20):
-            simulation.step()
-            contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
-        size = simulation.problem.whole.size
-        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
-        simulation.destroy()
+    (alone, size, contacts), (together, *_) = (
+        positions_after(ranks, content, 20) for ranks in (MPI.COMM_SELF, comm)
+    )
     assert contacts > 10.0
-    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-8 * size)
 
 
 @pytest.mark.parallel(2, alone=False)
@@ -188,14 +193,8 @@ def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
         "time": {"end": 1.0, "step": 0.004},
         "solver": {},
     }
-    results = []
-    for ranks in (MPI.COMM_SELF, comm):
-        simulation = SteppedScene(ranks, scene_of(content))
-        for _ in range(10):
-            simulation.step()
-        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
-        simulation.destroy()
-    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-9)
+    (alone, *_), (together, *_) = (positions_after(ranks, content, 10) for ranks in (MPI.COMM_SELF, comm))
+    np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parallel(alone=False)
@@ -210,15 +209,10 @@ def test_ranks_agree_on_a_table(comm: MPI.Comm) -> None:
         "time": {"end": 1.0, "step": 0.005},
         "solver": {},
     }
-    results = []
-    for ranks in (MPI.COMM_SELF, comm):
-        simulation = SteppedScene(ranks, scene_of(content))
-        for _ in range(35):
-            simulation.step()
-        results.append(gathered(simulation.problem.points, simulation.problem.system.x))
-        size = simulation.problem.whole.size
-        simulation.destroy()
-    np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-7 * size)
+    (alone, size, _), (together, *_) = (
+        positions_after(ranks, content, 35) for ranks in (MPI.COMM_SELF, comm)
+    )
+    np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-7 * size)
 
 
 def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:

@@ -40,7 +40,7 @@ buckle into one of many shapes, and the first Newton steps decide into which."""
 LAST, LAST_FAR = 1e-3, 1e-2
 """Linear residual of the solve that is expected to be a step's last one, over the residual that the step may
 leave, in scenes with contact; the second while no parts are near. Motions in contact magnify errors of
-solves, which depend on the number of ranks. Solves take a tenth more iterations, but there are fewer."""
+solves, which depend on the number of ranks. It takes up to a quarter more linear iterations."""
 
 BUCKLING = 1e-5
 """Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of
