@@ -11,7 +11,8 @@ pytestmark = pytest.mark.parallel(3)
 
 
 def written(comm, path):
-    """Text of the file, read before any rank continues."""
+    """Text of the file, read when every rank has come here and before any continues."""
+    comm.Barrier()
     text = path.read_text()
     comm.Barrier()
     return text
