@@ -1149,6 +1149,8 @@ class Time(Block):
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Defaults that depend on the analysis and on the integrator."""
+        if data.get("integrator") == "static":
+            raise problem("static is no integrator; write analysis: static instead", "integrator")
         if data.get("analysis") == "static":
             return {"end": 1.0, "step": LOAD_STEP, **data}
         data = {"integrator": "beuler", **data}

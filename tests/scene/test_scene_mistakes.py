@@ -169,6 +169,7 @@ CASES = [
         "time.spectral_radius",
         "must be from 0 to 1",
     ),
+    ("time: {step: 0.1, integrator: static}", "time.integrator", "write analysis: static"),
     ("time: {end: 1, step: 0.1, integrator: euler}", "time.integrator", "one of beuler, semi-implicit"),
     ("time: {end: 1, step: 0.1, integrator: [euler]}", "time.integrator", "must be one of"),
     ("time: {analysis: statics}", "time.analysis", "must be one of dynamic, static"),

@@ -40,7 +40,8 @@ buckle into one of many shapes, and the first Newton steps decide into which."""
 LAST, LAST_FAR = 1e-3, 1e-2
 """Linear residual of the solve that is expected to be a step's last one, over the residual that the step may
 leave, in scenes with contact; the second while no parts are near. Motions in contact magnify errors of
-solves, which depend on the number of ranks. It takes up to a quarter more linear iterations."""
+solves, which depend on the number of ranks; those with cycles do so only while parts are near. It takes up to
+a quarter more linear iterations."""
 
 BUCKLING = 1e-5
 """Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of
@@ -114,7 +115,7 @@ class Forcing:
         self._norm, tolerance = norm, self.effective_tolerance
         if self._near and self._buckles:
             tolerance = min(tolerance, BUCKLING)
-        if self._contact:
+        if self._contact and (self._near or not self._cycles):
             enough = convergence.force_tolerance()
             if 0.0 < tolerance * norm <= enough:
                 tolerance = min(tolerance, (LAST if self._near else LAST_FAR) * enough / norm)
