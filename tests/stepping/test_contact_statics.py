@@ -161,7 +161,6 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     assert 0.0 < torque < 1.01 * allowed
 
 
-@pytest.mark.parallel
 def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
     """It slides, with the friction of Eytelwein's formula: not with that of the normal forces before it slid.
 
