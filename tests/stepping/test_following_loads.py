@@ -14,6 +14,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.cases.shells import symmetric
+from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.experiments.verification.verification_case import STATIC, scene
 from lyra_petsc.phases import Phases
@@ -102,6 +103,28 @@ def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
 def test_a_round_ring_leaves_its_unstable_equilibrium() -> None:
     """Between 3 D/R³ and 4 D/R³, the critical value of forces that keep their directions."""
     assert abs(ring(MPI.COMM_SELF, 1.1, start=0.0)[0]) > 0.1
+
+
+def test_forces_on_the_way_to_an_equilibrium_do_not_loosen_the_tolerance() -> None:
+    """Nothing holds this ring along its axis, and iterations that shear it have large forces."""
+    flat, faces = rectangle(16, 1, 1.0, 0.1, alternating=True)
+    angle = 0.5 * math.pi * flat[:, 0]
+    vertices = np.column_stack([np.sin(angle), flat[:, 1], np.cos(angle)])
+    bench, worst = Bench(MPI.COMM_SELF), 0.0
+    content = scene(
+        bench.mesh(vertices, faces),
+        plate_material(1e6),
+        STATIC | {"step": 0.1},
+        handles=symmetric("xz", 2.0),
+        loads=[{"pressure": -2.5}, {"nodes": [0, 17], "force": [0.0, 0.0, -1e-3]}],
+        solver={},
+    )
+    with bench.simulation(content) as trial:
+        while not trial.simulation.finished:
+            trial.step()
+            force, largest = trial.simulation.problem.system.out_of_balance()
+            worst = max(worst, float(np.linalg.norm(force)) / largest)
+    assert worst <= 1e-6  # the force tolerance; it was 0.3
 
 
 def test_systems_with_skew_stiffness_are_solved() -> None:

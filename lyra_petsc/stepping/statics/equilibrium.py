@@ -186,7 +186,8 @@ class Equilibrium:
         guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
         found = self._pressures.find(before, factor, guess)
         if found is not None:
-            self._in_vain, self._last_factor, self._tangent = 0, factor, None
+            self._record(factor)
+            self._tangent = None
         return found
 
     def _by_proximal_steps(self, before: float, factor: float) -> Attempt:
@@ -217,7 +218,7 @@ class Equilibrium:
             if balanced and self._friction.is_settled():
                 self._friction.record_success(factor - before)
                 system.moving_energy_before = moving_energy
-                self._in_vain, self._last_factor = 0, factor
+                self._record(factor)
                 self._pseudo_time.sufficed = self._integrator.pseudo_dt
                 linear += self._compute_tangent(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
@@ -521,11 +522,10 @@ class Equilibrium:
         """Norm [N] of the out-of-balance force, and the largest acceleration [m/s²] by it; collective."""
         system = self._system
         system.begin_step(before, factor)
-        force, largest = system.out_of_balance()
+        force, _ = system.out_of_balance()
         norm = self._norm(force)
         if not np.isfinite(norm):  # an obstacle has moved into the sheet
             return norm, 0.0
-        self._scale = max(self._scale, largest)
         n = system.points.n_vertices
         fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
         if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
@@ -533,12 +533,23 @@ class Equilibrium:
             fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
         return norm, system.points.comm.allreduce(fastest, MPI.MAX)
 
+    def _largest_force(self) -> float:
+        """Norm [N] of the largest part of the forces here and in all equilibria found; collective.
+
+        Not that on the way to them: in a snap it may be 1e5 times as large.
+        """
+        return max(self._scale, self._system.largest_force())
+
+    def _record(self, factor: float) -> None:
+        """Record that the present state is the equilibrium at load factor ``factor``; collective."""
+        self._in_vain, self._last_factor, self._scale = 0, factor, self._largest_force()
+
     def _balanced(self, force: float, last: float) -> bool:
         """Whether a force of this norm [N] counts as zero; ``last`` [N] is that one proximal step before.
 
         Below the round-off floor proximal steps are taken as long as they reduce the force.
         """
-        if force <= self._tolerances.force_tolerance * self._scale:
+        if force <= self._tolerances.force_tolerance * self._largest_force():
             return True
         return PROGRESS * last <= force <= self._floor
 
