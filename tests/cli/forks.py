@@ -1,5 +1,7 @@
 """The program with half of its imports done, forked for each command line of ``rank.py`` or of a test.
 
+A command line that begins with a ``.py`` file runs this file instead, with the words after it.
+
 The process listens on the socket that is its standard input. A message has arguments, folder and environment,
 and descriptors for stdout and stderr; the answer is the exit code, negative for a signal. If a client closes
 its connection before, the forked process is killed. MPI and PETSc are not loaded here: each forked process
@@ -13,6 +15,7 @@ import gc
 import importlib
 import json
 import os
+import runpy
 import select
 import signal
 import socket
@@ -126,6 +129,11 @@ compile_once()
 assert not {"mpi4py.MPI", "petsc4py.PETSc"} & set(sys.modules)
 serve()
 
-from lyra_petsc.__main__ import main  # noqa: E402
+if sys.argv[1:] and sys.argv[1].endswith(".py"):
+    del sys.argv[0]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+    gc.freeze()  # as in `main`
+else:
+    from lyra_petsc.__main__ import main
 
-main()
+    main()

@@ -13,8 +13,10 @@ from typing import NamedTuple
 
 import measures
 import numpy as np
+import processes
 import pytest
 from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
+from launch import FORKS, RANK
 from module_of import module_of
 from peers import write_files, write_scene
 from processes import Failed, Limits, run
@@ -75,6 +77,15 @@ def tables_of(markdown: str) -> list[list[list[str]]]:
     return [[lines[0], *lines[2:]] for lines in found if lines]
 
 
+def forked_worker(folder: Path) -> Path:
+    """A program that lets the tests' forks run the worker: imports take longer than its measurements here."""
+    program = folder / "worker.py"
+    worker = str(SCRIPTS / "benchmarks" / "worker.py")
+    words = f"[sys.executable, '-IS', {str(RANK)!r}, {FORKS.name!r}, {worker!r}, *sys.argv[1:]]"
+    program.write_text(f"import os, sys\nos.execv(sys.executable, {words})\n", encoding="utf-8")
+    return program
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
@@ -82,6 +93,8 @@ def measured(tmp_path_factory):
     few = pytest.MonkeyPatch()
     few.setitem(program.QUICK, "output", 400)
     few.setattr(measures, "REPEATS", 1)
+    few.setattr(measures, "PROBLEM_CLASSES", dict(list(measures.PROBLEM_CLASSES.items())[:2]))
+    few.setattr(processes, "WORKER", forked_worker(folder))
     peers = [
         "slow=for i in $(seq {steps}); do sleep 0.2; done",
         "idle=true",
@@ -139,7 +152,7 @@ def test_json_has_every_measurement(measured):
     (apart,) = results["apart"]
     assert 2 * 2 <= len(apart["step_seconds"]) <= 2 * 3
     assert apart["vertices"] == square_number(18)
-    assert len(results["presets"]) == 3
+    assert [row["problem_class"] for row in results["presets"]] == list(measures.PROBLEM_CLASSES)[:2]
     assert not (folder / "scratch").exists()
 
 
@@ -165,7 +178,7 @@ def test_markdown_has_every_measurement(measured):
     assert [line[:2] for line in apart[1:]] == [["36", "2"]]
     assert apart[1][5] == "2 × 16"
     assert float(apart[1][4]) == pytest.approx(float(apart[1][2]) / float(apart[1][3]), rel=0.02)
-    assert len(presets) == 4
+    assert len(presets) == 3
     assert {line[0] for line in presets[1:]} == {"block-jacobi"}
     assert len(single) == 9
 
@@ -299,11 +312,27 @@ def test_two_checkouts_are_compared_in_pairs():
 
 
 def test_a_checkout_is_compared_with_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "PAIRS", 2)
+    monkeypatch.setattr(measures, "PAIRS", 1)
     limits = Limits(steps=2, seconds=0.1, process=120.0)
     found = measures.against("gmsh", 36, "beuler", 1, [], tmp_path, limits, SCRIPTS.parent)
-    assert [len(found[name]) for name in ("here", "other")] == [2, 2]
+    assert [len(found[name]) for name in ("here", "other")] == [1, 1]
     assert len(against_table([found])) == 5
+
+
+def test_the_order_within_pairs_alternates(tmp_path, monkeypatch):
+    programs = []
+
+    def measure(*_, program, **job):
+        programs.append(program)
+        return {"peak_bytes": [1], "set_up_seconds": 1.0, "steps": [], "vertices": 36}
+
+    monkeypatch.setattr(measures, "PAIRS", 3)
+    monkeypatch.setattr(measures, "measure", measure)
+    limits, other = Limits(steps=2, seconds=0.1, process=120.0), tmp_path / "other"
+    found = measures.against("diagonal", 36, "beuler", 1, [], tmp_path, limits, other)
+    here = processes.HERE
+    assert programs == [here, other, other, here, here, other]
+    assert [len(found[name]) for name in ("here", "other")] == [3, 3]
 
 
 def row(vertices: int, seconds: float) -> dict:
