@@ -139,11 +139,15 @@ class Seen:
         ]
 
 
-def test_the_page_loads_plays_and_reacts_to_controls(serve, browser, tmp_path):
+def test_the_page_refuses_a_wrong_token_loads_plays_and_reacts_to_controls(serve, browser, tmp_path):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.keys import Keys
 
     page = serve(written(tmp_path / "run", states=9))  # 0.1 s apart; unfinished: begins at the newest
+    browser.get(page.url.partition("?")[0] + "?token=guess")
+    assert "403" in browser.page_source
+    assert "canvas" not in browser.page_source
+
     seen = Seen(browser, page.url)
     assert seen.text("title") == "run"
     assert "8 vertices · 9 states" in seen.text("status")
@@ -296,37 +300,7 @@ def test_keys_picking_colours_handles_and_pictures(serve, browser, tmp_path):
     assert seen.complaints() == []
 
 
-def test_a_running_simulation_is_followed(serve, browser, tmp_path):
-    writer = Writer(tmp_path / "run")
-    writer.write()
-    page = serve(tmp_path / "run")
-    seen = Seen(browser, page.url)
-    assert "1 states" in seen.text("status")
-    before = seen.picture()
-    for _ in range(3):
-        writer.write()
-    seen.until(lambda: "4 states" in seen.text("status"))
-    seen.until(lambda: seen.time() == pytest.approx(0.3))
-    seen.until_drawn(before)
-
-    for file in (tmp_path / "run").iterdir():
-        file.unlink()
-    seen.until(lambda: "is not the folder of a run" in seen.text("notice"))
-
-    # another run takes its place, with fewer states and without velocities
-    writer = Writer(tmp_path / "run", fields=False)
-    writer.write()
-    writer.write()
-    seen.until(lambda: "2 states" in seen.text("status"))
-    seen.until(lambda: not seen.elements("#notice"))
-    seen.until(lambda: not seen.elements("#colours"))
-    seen.element("first").click()
-    seen.until(lambda: seen.time() == 0.0)
-    seen.until(lambda: seen.has_cloth(seen.picture()))
-    assert seen.complaints() == []
-
-
-def test_open_pages_report_the_end_of_the_run_and_stay(browser, tmp_path):
+def test_a_running_simulation_is_followed_and_its_end_reported_by_open_pages(browser, tmp_path):
     from lyra_petsc.show.view.live import LivePage
 
     writer = Writer(tmp_path / "run")
@@ -338,19 +312,32 @@ def test_open_pages_report_the_end_of_the_run_and_stay(browser, tmp_path):
         while not messages:
             time.sleep(0.1)
         seen = Seen(browser, messages[0])
+        assert "1 states" in seen.text("status")
+        before = seen.picture()
+        for _ in range(3):
+            writer.write()
+        seen.until(lambda: "4 states" in seen.text("status"))
+        seen.until(lambda: seen.time() == pytest.approx(0.3))
+        seen.until_drawn(before)
+
+        for file in (tmp_path / "run").iterdir():
+            file.unlink()
+        seen.until(lambda: "is not the folder of a run" in seen.text("notice"))
+
+        # another run takes its place, with fewer states and without velocities
+        writer = Writer(tmp_path / "run", fields=False)
+        writer.write()
+        writer.write()
+        seen.until(lambda: "2 states" in seen.text("status"))
+        seen.until(lambda: not seen.elements("#notice"))
+        seen.until(lambda: not seen.elements("#colours"))
         writer.write()
     finally:
         page.end()
     seen.until(lambda: f"later: lyra-petsc view {tmp_path / 'run'}" in seen.text("notice"))
-    assert seen.time() == pytest.approx(0.1)
+    assert seen.time() == pytest.approx(0.2)
     seen.element("first").click()
     seen.until(lambda: seen.time() == 0.0)
+    seen.until(lambda: seen.has_cloth(seen.picture()))
     assert "The run has ended" in seen.text("notice")
     assert seen.complaints() == []
-
-
-def test_a_browser_without_the_token_is_refused(serve, browser, tmp_path):
-    page = serve(written(tmp_path / "run"))
-    browser.get(page.url.partition("?")[0] + "?token=guess")
-    assert "403" in browser.page_source
-    assert "canvas" not in browser.page_source
