@@ -131,6 +131,7 @@ serve()
 
 if sys.argv[1:] and sys.argv[1].endswith(".py"):
     del sys.argv[0]
+    sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
     runpy.run_path(sys.argv[0], run_name="__main__")
     gc.freeze()  # as in `main`
 else:

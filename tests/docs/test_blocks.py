@@ -48,6 +48,7 @@ os.execv(sys.executable, [sys.executable, "-IS", {str(RANK)!r}, os.environ["TEST
 PYTHON = f"""\
 #!/bin/sh
 [ "$1 $2" = "-m lyra_petsc" ] && {{ shift 2; exec lyra-petsc "$@"; }}
+case $1 in *.py) exec {sys.executable} -IS {RANK} "$TEST_FORKS" "$@";; esac
 exec {sys.executable} "$@"
 """
 RUN_SH = 'exec ${RANKS:+mpirun -n "$RANKS"} lyra-petsc run "$@"\n'
@@ -110,7 +111,8 @@ def test_commands_run(page: Path, checkout: tuple[Path, dict[str, str]]) -> None
             continue
         command = ["bash", "-euo", "pipefail", "-c", block.text]
         if block.language == "python":
-            command = [sys.executable, "-c", block.text]
+            (folder / "block.py").write_text(block.text, encoding="utf-8")
+            command = ["python", "block.py"]
         process = subprocess.run(
             command, cwd=folder, env=variables, capture_output=True, text=True, timeout=PATIENCE
         )
