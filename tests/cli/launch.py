@@ -61,6 +61,22 @@ DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
 REDUNDANT = ("-ksp_type", "preonly", "-pc_type", "redundant")
 """Options of a direct solver on any number of ranks, which communicates less often than iterative ones."""
 
+UNHURRIED = """
+import sys, time
+import lyra_petsc.stepping.simulation as simulation
+from lyra_petsc.cli.app import run_command_line
+
+step = simulation.SteppedScene.step
+
+def unhurried(self):
+    time.sleep(0.01)
+    return step(self)
+
+simulation.SteppedScene.step = unhurried
+sys.exit(run_command_line(sys.argv))
+"""
+"""The program, for runs beside others: between its steps it leaves the processor to them."""
+
 PICTURES = ("matplotlib", "jinja2")
 """Packages without which reports have no pictures."""
 

@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 import lyra_petsc.{module} as module
+import lyra_petsc.parallel as parallel
 from lyra_petsc.cli.app import run_command_line
 
+parallel.GRACE = 1.0  # the other ranks do not fail, however long they are waited for
 right = module.{name}
 calls = 0
 
@@ -80,7 +82,7 @@ def job(folder: Path, place: str, what: str, rank: int, ranks: int) -> Left:
     [
         ("meshing", 0, 2),
         ("assembly", 2, 3),
-        ("jacobian", 1, 3),
+        ("jacobian", 1, 2),
         ("writing a state", 1, 2),
         ("a row of the history", 1, 2),
     ],
@@ -127,9 +129,9 @@ def test_a_rank_is_killed_during_the_set_up(tmp_path: Path) -> None:
     done(["run", "scene.yaml", "--out", "out", "-ts_max_steps", "2"], tmp_path)
 
 
-@pytest.mark.parametrize("rank", [0, 2])
-def test_a_rank_is_killed_during_the_steps(tmp_path: Path, rank: int) -> None:
-    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 3)
+@pytest.mark.parametrize(("rank", "ranks"), [(0, 3), (1, 2)])
+def test_a_rank_is_killed_during_the_steps(tmp_path: Path, rank: int, ranks: int) -> None:
+    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, ranks)
     wait_for_states(tmp_path / "out", 3)
     began = time.monotonic()
     os.kill(sorted(ranks_in(tmp_path))[rank], signal.SIGKILL)

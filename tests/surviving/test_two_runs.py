@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from launch import done, finish, lyra, start, wait_until, write_scene
+from launch import UNHURRIED, done, finish, lyra, start, wait_until, write_scene
 from leftovers import ENDLESS, SHEET, announced, wait_for_states
 
 from lyra_petsc.output.states import stored_states
@@ -34,7 +34,7 @@ sys.exit(run_command_line(sys.argv))
 
 def test_a_second_run_is_refused_while_the_first_steps(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, ENDLESS)
-    first = start(["run", scene, "--out", "out"], tmp_path, 2)
+    first = start(["run", scene, "--out", "out"], tmp_path, 2, program=("-c", UNHURRIED))
     wait_for_states(tmp_path / "out", 3)
     for words, ranks in ((["--force"], 1), (["--resume"], 2), ([], 1)):
         left = lyra(["run", scene, "--out", "out", *words], tmp_path, ranks)

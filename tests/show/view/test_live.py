@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from launch import SCENE, done, finish, lyra, start, write_scene
+from launch import SCENE, UNHURRIED, done, finish, lyra, start, write_scene
 from written_run import Writer
 
 from lyra_petsc.output.read_run import StoredRun
@@ -57,16 +57,18 @@ def in_its_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL)])
-def test_the_page_ends_with_the_run(tmp_path, ranks, number):
+def test_the_page_ends_with_a_run_that_is_killed(tmp_path):
     write_scene(tmp_path, SLOW)
     process = start(
-        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path, ranks
+        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"],
+        tmp_path,
+        2,
+        program=("-c", UNHURRIED),
     )
     try:
         address(process)
         assert len(pages(tmp_path)) == 1
-        os.killpg(process.pid, number)
+        os.killpg(process.pid, signal.SIGKILL)
         until(lambda: not pages(tmp_path), "the page outlives its run")
     finally:
         finish(process)
@@ -74,40 +76,36 @@ def test_the_page_ends_with_the_run(tmp_path, ranks, number):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_has_a_page(tmp_path):
+def test_a_resumed_run_has_a_page_until_it_is_stopped(tmp_path):
     write_scene(tmp_path)
     done(["run", "scene.yaml", "--out", tmp_path / "out"], tmp_path)
+    before = len(StoredRun(tmp_path / "out"))
     settings = ["--set", "time.end=500", "--resume", "--live", "--no-browser"]
     process = start(["run", "scene.yaml", "--out", tmp_path / "out", *settings], tmp_path)
     try:
         assert "token=" in address(process)
+        assert len(pages(tmp_path)) == 1
     finally:
         os.killpg(process.pid, signal.SIGINT)
         assert finish(process).code == 130
     until(lambda: not pages(tmp_path), "the page outlives its run")
+    assert len(StoredRun(tmp_path / "out")) > before
 
 
 @pytest.mark.slow
-def test_a_run_that_fails_leaves_no_page(tmp_path):
+def test_a_run_that_ends_or_fails_leaves_no_page(tmp_path):
     # the launcher must not wait for the page, nor the page for ever
-    write_scene(tmp_path, SCENE)
-    options = ["-snes_max_it", "1", "-snes_rtol", "1e-15", "-snes_stol", "0", "-ts_adapt_dt_min", "0.01"]
-    left = lyra(
-        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser", *options], tmp_path
-    )
-    assert left.code == 3
-    until(lambda: not pages(tmp_path), "the page outlives its run")
-
-
-def test_a_run_ends_as_it_does_without_a_page(tmp_path):
     write_scene(tmp_path)
-    left = done(["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path)
+    live = ["run", "scene.yaml", "--live", "--no-browser", "--out"]
+    left = done([*live, tmp_path / "out"], tmp_path)
+    options = ["-snes_max_it", "1", "-snes_rtol", "1e-15", "-snes_stol", "0", "-ts_adapt_dt_min", "0.01"]
+    assert lyra([*live, tmp_path / "failed", *options], tmp_path).code == 3
 
     assert len(StoredRun(tmp_path / "out")) == 4
     assert StoredRun(tmp_path / "out").finished
     assert "note: no page" not in left.err
     assert f"lyra-petsc view {tmp_path / 'out'}" in left.out
-    until(lambda: not pages(tmp_path), "the page outlives its run")
+    until(lambda: not pages(tmp_path), "a page outlives its run")
 
 
 def test_a_port_in_use_is_refused_before_files_are_written(tmp_path):
