@@ -71,11 +71,11 @@ def maps(pid: int) -> list[str]:
     return ["lyra_petsc"] if caught >> (signal.SIGUSR1 - 1) & 1 else []
 
 
-@pytest.mark.parametrize(("number", "code"), [CODES[0], CODES[2]])
+@pytest.mark.parametrize(("number", "code", "ranks"), [(*CODES[0], 3), (*CODES[2], 2)])
 def test_one_rank_that_gets_a_signal_has_all_finish_the_step(
-    tmp_path: Path, number: signal.Signals, code: int
+    tmp_path: Path, number: signal.Signals, code: int, ranks: int
 ) -> None:
-    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 3)
+    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, ranks)
     wait_for_states(tmp_path / "out", 3)
     os.kill(ranks_in(tmp_path)[-1], number)
     left = finish(process)

@@ -24,15 +24,19 @@ from launch import PICTURES, SCENE, done, finish, lyra, read_json, start, wait_u
 
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.show.report.run_page import OPTIONS, Facts, advice, write_page
+from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.show.report.run_page import OPTIONS, Facts, advice, run_page, write_page
 
 FAILING = SCENE.replace("c11: 800, c22: 800", "c11: 8.0e+9, c22: 8.0e+9") + "solver: {max_iterations: 2}\n"
 
 
-def page_of(folder: Path) -> str:
-    """Text of the page without tags and pictures."""
-    write_page(folder, None)
-    page = (folder / "report.html").read_text(encoding="utf-8")
+def page_of(folder: Path, *, drawn: bool = True) -> str:
+    """Text of the page without tags and pictures, of which those of the sheet need not be drawn."""
+    if drawn:
+        write_page(folder, None)
+        page = (folder / "report.html").read_text(encoding="utf-8")
+    else:
+        page = run_page(StoredRun(folder), []).html()
     assert not re.search(r"https?://|<script|<link|url\(", page)
     text = re.sub(r'src="data:[^"]*"', 'src=""', page)
     return html.unescape(re.sub(r"<[^>]*>", " ", text.split("</style>")[1]))
@@ -81,8 +85,6 @@ def test_the_page_needs_no_packages_for_films(
 
 
 def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> None:
-    from lyra_petsc.output.read_run import StoredRun
-
     facts = Facts.of(StoredRun(finished))
     table = np.loadtxt(finished / "history.csv", delimiter=",", skiprows=1)
     column = {name: table[:, i] for i, name in enumerate(HISTORY_COLUMNS)}
@@ -90,7 +92,7 @@ def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> No
     loss = energy[0] - energy + column["external_work"] - column["dissipation"]
     np.testing.assert_allclose(facts.scheme_loss, loss, atol=1e-14)
     assert facts.scheme_loss[-1] > 0  # backward Euler takes energy
-    assert f"taken away by the time scheme {facts.scheme_loss[-1]:.3g}"[:38] in page_of(finished)
+    assert f"taken away by the time scheme {facts.scheme_loss[-1]:.3g}"[:38] in page_of(finished, drawn=False)
 
 
 def test_a_failed_run_has_its_cause_and_advice(tmp_path: Path) -> None:
@@ -114,9 +116,9 @@ def test_a_killed_run_is_distinguished_from_an_unfinished_one(finished: Path, tm
     assert f"lyra-petsc run --resume --out {run}" in text
     with open(run / "run.lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert "The run goes on: t = 0.05 of 0.05 s" in page_of(run)
+        assert "The run goes on: t = 0.05 of 0.05 s" in page_of(run, drawn=False)
     (run / "summary.json").unlink()
-    assert "How the run ended is not known" in page_of(run)
+    assert "How the run ended is not known" in page_of(run, drawn=False)
 
 
 def test_a_stopped_run_says_how_to_continue(tmp_path: Path) -> None:
@@ -127,7 +129,7 @@ def test_a_stopped_run_says_how_to_continue(tmp_path: Path) -> None:
     process.send_signal(signal.SIGTERM)
     assert finish(process).code == 143
     assert "The run goes on" in running
-    text = page_of(tmp_path / "long")
+    text = page_of(tmp_path / "long", drawn=False)
     assert "stopped by SIGTERM after step" in text
     assert "It goes on with: mpirun -n 1 lyra-petsc run --resume --out " in text
 
@@ -169,8 +171,6 @@ def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
 
 def advice_of(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
     """Advice for the finished run with a changed summary or history."""
-    from lyra_petsc.output.read_run import StoredRun
-
     run = StoredRun(finished)
     facts = Facts.of(run)
     for name, value in columns.items():
