@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from launch import FORKS, RANK
 from module_of import module_of
 from PIL import Image
 
@@ -45,5 +46,9 @@ def test_the_script_makes_pictures_and_films(gallery, tmp_path, monkeypatch):
     monkeypatch.setattr(gallery, "GALLERY", tmp_path / "gallery")
     monkeypatch.setattr(sys, "argv", ["gallery.py", "--runs", str(tmp_path / "runs")])
     monkeypatch.setattr(gallery, "GIF", "paper")
+    program = tmp_path / "python"  # python -m lyra_petsc, started by the tests' forks
+    program.write_text(f'#!/bin/sh\nshift 2\nexec {sys.executable} -IS {RANK} {FORKS.name} "$@"\n')
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
     gallery.main()
     assert {path.name for path in (tmp_path / "gallery").iterdir()} == {"paper.png", "paper.mp4", "paper.gif"}
