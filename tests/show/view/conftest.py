@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,27 +51,51 @@ class Served:
 Serve = Callable[..., Served]
 
 
-@pytest.fixture
-def serve(tmp_path: Path) -> Iterator[Serve]:
-    """Start ``view`` for a folder; it ends with the test."""
+@contextmanager
+def serving(place: Path) -> Iterator[Serve]:
+    """Start ``view`` for folders, in the folder ``place``; it ends with the context."""
     from launch import start
 
     pytest.importorskip("trame")
     started = []
 
     def work(folder: Path, *options: str, ranks: int = 1) -> Served:
-        process = start(["view", folder, "--no-browser", *options], tmp_path, ranks)
+        process = start(["view", folder, "--no-browser", *options], place, ranks)
         started.append(process)
         line = process.stdout.readline()
         found = re.fullmatch(r"view: (http://\S+)\n", line)
         assert found, line + process.communicate(timeout=30)[1]
         return Served(process, found[1])
 
-    yield work
-    for process in started:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+    try:
+        yield work
+    finally:
+        for process in started:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Serve]:
+    """Start ``view`` for a folder; it ends with the test."""
+    with serving(tmp_path) as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def quiet_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A page for several tests, which must write nothing to stderr."""
+    from launch import finish
+    from written_run import written
+
+    place = tmp_path_factory.mktemp("page")
+    with serving(place) as start:
+        page = start(written(place / "run"))
+        yield page
+        page.process.send_signal(signal.SIGINT)
+        left = finish(page.process)
+        assert (left.code, left.err) == (0, "")
 
 
 @pytest.fixture(scope="module")

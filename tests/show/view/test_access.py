@@ -18,16 +18,8 @@ SOCKET = {
 }
 
 
-def words_at_the_end(page):
-    """Of a page that is stopped, on stderr."""
-    page.process.send_signal(signal.SIGINT)
-    left = finish(page.process)
-    assert left.code == 0
-    return left.err
-
-
-def test_everything_is_refused_without_the_token(serve, tmp_path):
-    page = serve(written(tmp_path / "run"))
+def test_everything_is_refused_without_the_token(quiet_page):
+    page = quiet_page
     wrong = page.token[:-1] + ("A" if page.token[-1] != "A" else "B")
 
     for path in ("/", "/index.html", "/vue.global.js", "/ws", "/paraview/", "/nothing"):
@@ -41,9 +33,8 @@ def test_everything_is_refused_without_the_token(serve, tmp_path):
     assert page.token.encode() not in page.get("/")[2]
 
 
-def test_the_token_gives_access_to_the_page_and_its_cookie_to_the_rest(serve, tmp_path):
-    page = serve(written(tmp_path / "run"))
-
+def test_the_token_gives_access_to_the_page_and_its_cookie_to_the_rest(quiet_page):
+    page = quiet_page
     code, headers, _ = page.get(f"/?token={page.token}")
     assert code == 302
     assert "HttpOnly" in headers["Set-Cookie"]
@@ -59,8 +50,8 @@ def test_the_token_gives_access_to_the_page_and_its_cookie_to_the_rest(serve, tm
     assert page.get("/nothing", Cookie=page.cookie())[0] == 404
 
 
-def test_requests_that_open_no_web_socket_are_answered(serve, tmp_path):
-    page = serve(written(tmp_path / "run"))
+def test_requests_that_open_no_web_socket_are_answered(quiet_page):
+    page = quiet_page
     for change in (
         dict.fromkeys(SOCKET),
         {"Sec_WebSocket_Key": None},
@@ -72,11 +63,10 @@ def test_requests_that_open_no_web_socket_are_answered(serve, tmp_path):
         for method in ("GET", "HEAD", "POST"):
             assert page.get(f"/ws?token={page.token}", method, **headers)[0] == 426
     assert page.get(f"/index.html?token={page.token}")[0] == 200
-    assert words_at_the_end(page) == ""
 
 
-def test_malformed_requests_are_answered_without_a_traceback(serve, tmp_path):
-    page = serve(written(tmp_path / "run"))
+def test_malformed_requests_are_answered_without_a_traceback(quiet_page):
+    page = quiet_page
     for origin in ("http://[", "null", "http://[::1", "://", "\x80"):
         assert page.get(f"/index.html?token={page.token}", Origin=origin)[0] == 403, origin
     for request in (
@@ -89,7 +79,6 @@ def test_malformed_requests_are_answered_without_a_traceback(serve, tmp_path):
         with socket.create_connection(("127.0.0.1", page.port), PATIENCE) as connection:
             connection.sendall(request + b"\r\n\r\n")
             assert connection.recv(12).endswith(b" 400"), request
-    assert words_at_the_end(page) == ""
 
 
 def test_unknown_messages_end_their_web_socket_only(serve, tmp_path):
@@ -107,11 +96,14 @@ def test_unknown_messages_end_their_web_socket_only(serve, tmp_path):
 
     asyncio.run(send())
     assert page.get(f"/index.html?token={page.token}")[0] == 200
-    assert "Traceback" not in words_at_the_end(page)
+    page.process.send_signal(signal.SIGINT)
+    left = finish(page.process)
+    assert left.code == 0
+    assert "Traceback" not in left.err
 
 
-def test_other_host_names_and_sites_are_refused_despite_the_token(serve, tmp_path):
-    page = serve(written(tmp_path / "run"))
+def test_other_host_names_and_sites_are_refused_despite_the_token(quiet_page):
+    page = quiet_page
     cookie, path = page.cookie(), "/vue.global.js"
 
     for host in (
