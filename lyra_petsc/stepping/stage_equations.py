@@ -951,6 +951,12 @@ class StageEquations:
             self._internal.forget()
         self.objective.forget()
 
+    def transport_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
+        """Transport the frames of directors, those in use or in ``frozen``, to the present positions."""
+        if self.active.with_edges:
+            self.active.transport_frames(self.x, frozen)
+            self.forget_forces()  # where directors are loaded, those on vertices depend on the frames
+
     def forget_directors(self) -> None:
         """Discard the remembered directors, whose memory the linear solve needs."""
         for term in self.active.with_edges:

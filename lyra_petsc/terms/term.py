@@ -683,7 +683,7 @@ class Load(Term):
     """A force that is constant during a step."""
 
     is_follower: ClassVar[bool] = False
-    """Whether the force depends on the positions at the start of the step."""
+    """Whether the force depends on the positions."""
 
     def connect(self, terms: Iterable[Term]) -> None:
         """Look up the other terms of the scene that this one needs; called before all other methods."""
@@ -691,6 +691,10 @@ class Load(Term):
     @abstractmethod
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
         """Add the force [N] during the step from t0 to t1 [s], which starts at positions x, to ``out``."""
+
+    def add_force_on_vertices(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        """As `add_force`, without generalised forces on edges, which do not depend on the positions."""
+        self.add_force(x, t0, t1, out)
 
     def potential(self, x: Array) -> float:
         """Potential energy [J] of this rank's elements; 0 for a load without a potential."""

@@ -1035,6 +1035,25 @@ def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tm
 
 
 @pytest.mark.parallel
+def test_moments_are_balanced_where_edges_turn(comm: MPI.Comm) -> None:
+    """The side with the moment turns in a load step, and with it the axis of the moment."""
+    scene = CANTILEVER | {
+        "handles": [{"group": "left", "clamp": True}],
+        "loads": [{"group": "top", "moment": 3.0}],
+        "output": {"every": None},
+    }
+    with Bench(comm).simulation(scene) as trial:
+        balance = trial.run().simulation.energy_balance
+        (force,) = np.array(balance.handle_forces(1))[:, :3]
+        reaction = balance.handle_moments()[0] + np.cross([0.0, 0.1, 0.0], force)
+        top = np.flatnonzero(np.isclose(trial.start[:, 1], 0.2))
+        tangent = unit(np.diff(trial.x[top], axis=0))  # clockwise
+    load = 3.0 * 0.05 * tangent.sum(axis=0)
+    assert np.abs(tangent[-1, 2]) > 0.1
+    np.testing.assert_allclose(reaction, -load, rtol=0.0, atol=1e-8 * np.linalg.norm(load))  # was 0.24
+
+
+@pytest.mark.parallel
 def test_the_moment_of_a_clamp_that_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
     """Rate of the angular momentum of a stiff sheet that is rotated about its edge."""
     turn = [{"time": 0.0}, {"time": 2.0, "rotate": {"axis": [0, 1, 0], "degrees": 720}}]

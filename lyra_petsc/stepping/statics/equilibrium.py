@@ -4,8 +4,8 @@ A load step starts from the polynomial extrapolation of the last equilibria, wit
 Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), whose Hessian is positive definite where
 that of the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton's method
 converges in few iterations, until the out-of-balance force is small without the last term. Loads that follow
-the shape (pressure, wind) are updated before every solve, under-relaxed; pressures also change during a solve
-with their own stiffness. Friction takes the normal forces of the solve before. If points slip far while these
+the shape (pressure, moments, wind) are updated before every solve, under-relaxed; all but wind also change
+during a solve with their own stiffness. Friction takes the normal forces of the solve before. If points slip far while these
 change, the solve is repeated with a shorter Δτ; and solves are repeated until they are close to the normal
 forces in the equilibrium.
 
@@ -64,7 +64,8 @@ HARD_STEP = 14
 """After a load step with more Newton iterations, the next one begins with `WholeStiffness`."""
 
 NO_POTENTIAL = (
-    "pressure beside free edges has no potential, and the symmetric part of the stiffness is indefinite"
+    "pressure beside free edges, or a moment on edges that turn, has no potential, and the symmetric part of "
+    "the stiffness is indefinite"
 )
 
 HANDLE_STEP = 1e-6
@@ -120,13 +121,13 @@ class Equilibrium:
         self._whole_first = False  # whether the next load step begins with it
         self._in_vain = 0
         self._friction = FrictionBalance(system, spacing)
-        self._pressures: WholeStiffness | None = None
+        self._whole_stiffness: WholeStiffness | None = None
         if system.active.following:
             from lyra_petsc.stepping.statics.whole_stiffness import (
-                WholeStiffness,  # needed with pressures only
+                WholeStiffness,  # needed with loads that follow the shape only
             )
 
-            self._pressures = WholeStiffness(system, stepper.tangent, self._examine, self._balanced)
+            self._whole_stiffness = WholeStiffness(system, stepper.tangent, self._examine, self._balanced)
         # load factor λ of the last equilibrium, change of the loads over that of λ [N], and tangent dx/dλ [m]
         self._last_factor, self._load_rate = 0.0, np.zeros((system.points.n_owned, 3))
         self._tangent: Array | None = None
@@ -178,13 +179,13 @@ class Equilibrium:
         )
 
     def _by_whole_stiffness(self, before: float, factor: float) -> Attempt | None:
-        """Find the equilibrium by Newton's method with the whole stiffness of pressures; collective."""
-        if self._pressures is None:
+        """Find the equilibrium by Newton's method with the whole stiffness; collective."""
+        if self._whole_stiffness is None:
             return None
         system = self._system
         system.applied.factor = factor
         guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
-        found = self._pressures.find(before, factor, guess)
+        found = self._whole_stiffness.find(before, factor, guess)
         if found is not None:
             self._record(factor)
             self._tangent = None
@@ -257,7 +258,7 @@ class Equilibrium:
                 if not solved_once:  # the force before is smaller if handles move
                     progress.restart()
                 solved_once = True
-                system.active.transport_frames(system.x)  # edges may turn far until they are in equilibrium
+                system.transport_frames()  # edges may turn far until they are in equilibrium
                 self._pseudo_time.record_success(attempt.newton_iterations)
             elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
                 resumed += 1
@@ -277,7 +278,7 @@ class Equilibrium:
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        system.active.transport_frames(system.x, frozen)
+        system.transport_frames(frozen)
         system.active.restore_contacts(contacts)
         return dataclasses.replace(
             attempt,
@@ -319,36 +320,36 @@ class Equilibrium:
             rate = rate + (system.out_of_balance()[0] - here) / (part * step)
             system.x[:] = x
             system.forget_forces()
-        if self._pressures is None:
+        if self._whole_stiffness is None:
             self._tangent, iterations = self._stepper.tangent(rate)
         else:
-            loads = self._pressures.linearise_loads(before, factor)
-            self._tangent, iterations = self._pressures.tangent(rate, loads)
+            loads = self._whole_stiffness.linearise_loads(before, factor)
+            self._tangent, iterations = self._whole_stiffness.tangent(rate, loads)
         if self._tangent is not None:
             self._tangent += moved / step
         return iterations
 
     def _update_loads(self, relaxation: Relaxation, before: float, factor: float, *, first: bool) -> int:
-        """Set the loads of the next solve to those of the present shape, pressures with their stiffness.
+        """Set the loads of the next solve to those of the present shape, with their stiffness.
 
         Returns linear iterations; collective.
         """
         system, now = self._system, self._system.applied.force.copy()
-        if self._pressures is None:
+        if self._whole_stiffness is None:
             system.applied.override = relaxation.relax(now)
             return 0
-        loads = system.applied.following = self._pressures.linearise_loads(before, factor)
+        loads = system.applied.following = self._whole_stiffness.linearise_loads(before, factor)
         displacement, iterations = None, 0
         if system.active.viscous:  # the wind's stiffness is not known
             pass
         elif not first:
-            displacement, iterations = self._pressures.tangent(system.out_of_balance()[0], loads)
+            displacement, iterations = self._whole_stiffness.tangent(system.out_of_balance()[0], loads)
         elif self._integrator.alternatives and self._tangent is not None:
             displacement = (factor - before) * self._tangent
         if displacement is None:
             system.applied.override = relaxation.relax(now)
         else:
-            system.applied.override = now + self._pressures.skew_force(loads, displacement)
+            system.applied.override = now + self._whole_stiffness.skew_force(loads, displacement)
         return iterations
 
     def _is_held(self) -> bool:
@@ -391,7 +392,7 @@ class Equilibrium:
         if lowest is None:
             return False
         system.state.set(lowest, np.zeros_like(lowest))
-        system.active.transport_frames(system.x)
+        system.transport_frames()
         return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:
@@ -409,7 +410,7 @@ class Equilibrium:
                 mode, displacement = examination.lowest_mode(), None
                 if mode is None:
                     message = "its lowest mode was not found"
-                elif self._pressures is not None and self._pressures.skew_part_stabilises(
+                elif self._whole_stiffness is not None and self._whole_stiffness.skew_part_stabilises(
                     found, mode, factor
                 ):
                     found = Stability(reason=NO_POTENTIAL)

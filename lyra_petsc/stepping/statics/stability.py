@@ -81,7 +81,7 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
         if isinstance(term, Load):
-            term.add_force(x, system.t0, system.t1, out)
+            term.add_force_on_vertices(x, system.t0, system.t1, out)
         else:
             against = np.zeros_like(out)
             step = UpcomingStep(system.t0, system.t1, system.t1, x, system.reference.at)

@@ -1,4 +1,4 @@
-"""Equilibria under pressure by Newton's method with the whole stiffness, also where it is not symmetric.
+"""Equilibria under loads that follow the shape by Newton's method, also where the stiffness is not symmetric.
 
 Beside free edges the symmetric part of the stiffness, and with it the potential that solves minimise, may be
 indefinite at a stable equilibrium. Newton's method with the whole stiffness finds it.
@@ -22,7 +22,7 @@ MAX_ITERATIONS, MAX_GROWTH = 20, 1e6
 
 
 class WholeStiffness:
-    """Newton's method with the whole stiffness of pressures; collective.
+    """Newton's method with the whole stiffness, that of loads included; collective.
 
     Parameters
     ----------
@@ -73,12 +73,12 @@ class WholeStiffness:
             last = force
             self._set_positions(system.x[:n] + displacement)
         system.state.set(x, np.zeros_like(x))
-        system.active.transport_frames(system.x, frozen)
+        system.transport_frames(frozen)
         return None
 
     def _set_positions(self, x: Array) -> None:
         self._system.state.set(x, np.zeros_like(x))
-        self._system.active.transport_frames(self._system.x)
+        self._system.transport_frames()
 
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""
@@ -123,10 +123,10 @@ class WholeStiffness:
         return newton_displacement(force, solve, lambda u: self.skew_force(loads, u), comm)
 
     def linearise_loads(self, before: float, factor: float) -> FollowingLoads:
-        """The pressures, linear in the displacement from the present shape."""
+        """The loads that follow the shape, linear in the displacement from it."""
 
         def force_of(load: Load, x: Array, out: Array) -> None:
-            load.add_force(x, before, factor, out)
+            load.add_force_on_vertices(x, before, factor, out)
 
         return FollowingLoads(self._system.active.following, self._system.x, force_of, factor)
 

@@ -31,6 +31,8 @@ class Moment(WindowedLoad):
     A moment is about its edge, directed from the smaller vertex number.
     """
 
+    is_follower = True
+
     def connect(self, terms: Iterable[Term]) -> None:
         assert self.edges is not None
         self._term = term = next(term for term in terms if isinstance(term, MidEdge))
@@ -40,6 +42,13 @@ class Moment(WindowedLoad):
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
         moment = self.elements.data["moment"] * self.strength(t0, t1)
         np.add.at(out.reshape(-1), self._indices, moment)
+        self._add_couples(x, moment, out)
+
+    def add_force_on_vertices(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        self._add_couples(x, self.elements.data["moment"] * self.strength(t0, t1), out)
+
+    def _add_couples(self, x: Array, moment: Array, out: Array) -> None:
+        """Add the forces ± M L γ [N] to out."""
         tail, head = self.stencil.T
         edge, direction = x[head] - x[tail], self._term.frames.direction[self._numbers]
         tangent = unit(edge)
