@@ -5,9 +5,9 @@ Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²),
 that of the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton's method
 converges in few iterations, until the out-of-balance force is small without the last term. Loads that follow
 the shape (pressure, moments, wind) are updated before every solve, under-relaxed; all but wind also change
-during a solve with their own stiffness. Friction takes the normal forces of the solve before. If points slip far while these
-change, the solve is repeated with a shorter Δτ; and solves are repeated until they are close to the normal
-forces in the equilibrium.
+during a solve with their own stiffness. Friction takes the normal forces of the solve before. If points slip
+far while these change, the solve is repeated with a shorter Δτ; and solves are repeated until they are close
+to the normal forces in the equilibrium.
 
 A snap takes many solves in which the out-of-balance force grows, while the potential energy falls. If a solve
 in contact runs out of iterations, the next one starts from its iterate of least energy. With friction neither

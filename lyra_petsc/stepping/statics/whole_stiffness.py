@@ -1,4 +1,4 @@
-"""Equilibria under loads that follow the shape by Newton's method, also where the stiffness is not symmetric.
+"""Equilibria under loads that follow the shape by Newton's method, also with an unsymmetric stiffness.
 
 Beside free edges the symmetric part of the stiffness, and with it the potential that solves minimise, may be
 indefinite at a stable equilibrium. Newton's method with the whole stiffness finds it.
