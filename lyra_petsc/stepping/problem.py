@@ -37,6 +37,7 @@ from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
 from lyra_petsc.terms.handles.prescribed_handles import (
     ExactHandles,
     Selection,
+    clamps_without_edges,
     conflicts,
     is_exact,
     select_exact,
@@ -247,7 +248,12 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         terms=names,
         sources=mesh.sources,
         barrier=_barrier(rest),
-        notes=[*mesh.notes, *rest.notes, *conflicts(scene, mesh, held)],
+        notes=[
+            *mesh.notes,
+            *rest.notes,
+            *conflicts(scene, mesh, held),
+            *clamps_without_edges(scene, mesh, held),
+        ],
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None

@@ -405,3 +405,14 @@ def test_handles_that_hold_the_same_vertices_elsewhere_are_noted(
         notes = [note for note in simulation.problem.whole.notes if "different places" in note]
     assert len(notes) == noted
     assert all("hold 1 vertices (first: 1)" in note and "handles[1], the later" in note for note in notes)
+
+
+@pytest.mark.parametrize(("nodes", "noted"), [([0], True), ([0, 1], False)])
+def test_clamps_without_edges_are_noted(nodes: list[int], noted: bool) -> None:
+    content = {"mesh": MESH, "handles": [{"nodes": nodes, "clamp": True}]}
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        notes = [note for note in simulation.problem.whole.notes if "clamp" in note]
+    assert (
+        notes
+        == ["handles[0]: clamp keeps the slope of edges whose two ends are held, and there are none"] * noted
+    )

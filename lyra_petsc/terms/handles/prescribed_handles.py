@@ -92,6 +92,15 @@ def conflicts(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
     return notes
 
 
+def clamps_without_edges(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
+    """A note for each exact handle with ``clamp`` that does not hold both ends of any edge."""
+    return [
+        f"handles[{number}]: clamp keeps the slope of edges whose two ends are held, and there are none"
+        for number, vertices in held.items()
+        if scene.handles[number].clamp and np.isin(mesh.triangles, vertices).sum(axis=1).max() < 2
+    ]
+
+
 class ExactHandles:
     """The exact handles of a scene on one rank.
 
