@@ -108,8 +108,3 @@ class ActiveTerms:
         """Return to a `contact_state`."""
         for term, state in states.items():
             term.restore_contacts(state)
-
-    def transport_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
-        """Transport the frames of directors, those in use or in ``frozen``, to positions x."""
-        for term in self.with_edges:
-            term.accept(x, (frozen or self.frozen)[term])

@@ -39,6 +39,7 @@ from lyra_petsc.terms.handles.prescribed_handles import (
     Selection,
     clamps_without_edges,
     conflicts,
+    has_edge_in,
     is_exact,
     select_exact,
 )
@@ -276,7 +277,7 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
                 f"vertex {vertices[distance.argmax()]} lies {distance.max():.2g} m beside the plane {axis} = "
                 f"{np.median(coordinate):.6g} m; choose only vertices in one plane, or hold axes instead"
             )
-        elif (np.isin(mesh.triangles[rest.bends_with("hinge")], vertices).sum(axis=1) > 1).any():
+        elif (has_edge_in(mesh, vertices) & rest.bends_with("hinge")).any():
             problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
         if problem:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
@@ -295,7 +296,7 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
             continue
         from lyra_petsc.terms.bending.midedge import normals_of  # only clamps need its kernels
 
-        at_clamp = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
+        at_clamp = has_edge_in(mesh, vertices)
         slope = np.abs(normals_of(mesh.positions, mesh.triangles[at_clamp])[:, free]).max(initial=0.0)
         keyframes = scene.motions[handle.motion] if handle.motion is not None else ()
         names = ", ".join(AXES[axis] for axis in free)

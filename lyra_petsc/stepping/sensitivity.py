@@ -219,7 +219,7 @@ class Sensitivities:
                 system.applied.factor = 0.0
                 system.begin_step(0.0, 0.0)
                 if self._system.applied.unbalanced is not None:
-                    system.applied.unbalanced = -system.out_of_balance()[0]
+                    system.applied.unbalanced = -system.out_of_balance()
             if reactions:
                 neighbour.energy_balance = EnergyBalance(system)
         self.tangents.append(tangent)
@@ -457,7 +457,7 @@ class Sensitivities:
                 term.frames = frames
             system.applied.factor = self._system.applied.factor
             system.begin_step(now.before, now.factor)
-            return -system.out_of_balance()[0]
+            return -system.out_of_balance()
 
         return self._free(_difference(neighbours, delta, residual))
 

@@ -330,10 +330,10 @@ class StageEquations:
             self.prescribed.set_velocity_to_goal(self._xh[:n], stage.c)
         self.points.update_ghosts(self._xh)
 
-    def out_of_balance(self) -> tuple[Array, float]:
-        """Force (n_owned, 3) [N] on the free unknowns, and the norm [N] of its largest part; collective."""
+    def out_of_balance(self) -> Array:
+        """Force (n_owned, 3) [N] on the free unknowns."""
         total = self._total(self.x, self.v, np.zeros_like(self.history), np.empty_like(self.history))
-        return np.where(self.prescribed.free, -total, 0.0), self.largest_force()
+        return np.where(self.prescribed.free, -total, 0.0)
 
     def forces_now(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the start of the step without inertia, each (n_owned, 3) [N]."""
@@ -953,8 +953,9 @@ class StageEquations:
 
     def transport_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
         """Transport the frames of directors, those in use or in ``frozen``, to the present positions."""
+        for term in self.active.with_edges:
+            term.accept(self.x, (frozen or self.active.frozen)[term])
         if self.active.with_edges:
-            self.active.transport_frames(self.x, frozen)
             self.forget_forces()  # where directors are loaded, those on vertices depend on the frames
 
     def forget_directors(self) -> None:

@@ -215,6 +215,11 @@ class Forks:
             self._name = name
         return self._name
 
+    @property
+    def program(self) -> tuple[str, ...]:
+        """Arguments of python before those of a command line, which then runs in a forked process."""
+        return "-IS", str(RANK), self.name
+
     def run(
         self, arguments: Sequence[object], folder: Path, extra: Mapping[str, str] | None, patience: float
     ) -> Left:
@@ -274,7 +279,7 @@ def lyra(
     if not keywords:
         if ranks == 1:
             return FORKS.run(arguments, folder, extra, patience)
-        keywords = {"program": ("-IS", str(RANK), FORKS.name)}
+        keywords = {"program": FORKS.program}
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import processes
 import pytest
 from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
-from launch import FORKS, RANK
+from launch import FORKS
 from module_of import module_of
 from peers import write_files, write_scene
 from processes import Failed, Limits, run
@@ -80,9 +80,9 @@ def tables_of(markdown: str) -> list[list[list[str]]]:
 def forked_worker(folder: Path) -> Path:
     """A program that lets the tests' forks run the worker: imports take longer than its measurements here."""
     program = folder / "worker.py"
-    worker = str(SCRIPTS / "benchmarks" / "worker.py")
-    words = f"[sys.executable, '-IS', {str(RANK)!r}, {FORKS.name!r}, {worker!r}, *sys.argv[1:]]"
-    program.write_text(f"import os, sys\nos.execv(sys.executable, {words})\n", encoding="utf-8")
+    words = [sys.executable, *FORKS.program, str(SCRIPTS / "benchmarks" / "worker.py")]
+    lines = f"import os, sys\nos.execv({sys.executable!r}, {words} + sys.argv[1:])\n"
+    program.write_text(lines, encoding="utf-8")
     return program
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from launch import FORKS, RANK
+from launch import FORKS
 from module_of import module_of
 from PIL import Image
 
@@ -47,7 +48,7 @@ def test_the_script_makes_pictures_and_films(gallery, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["gallery.py", "--runs", str(tmp_path / "runs")])
     monkeypatch.setattr(gallery, "GIF", "paper")
     program = tmp_path / "python"  # python -m lyra_petsc, started by the tests' forks
-    program.write_text(f'#!/bin/sh\nshift 2\nexec {sys.executable} -IS {RANK} {FORKS.name} "$@"\n')
+    program.write_text(f'#!/bin/sh\nshift 2\nexec {shlex.join([sys.executable, *FORKS.program])} "$@"\n')
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     gallery.main()

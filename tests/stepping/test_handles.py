@@ -412,7 +412,5 @@ def test_clamps_without_edges_are_noted(nodes: list[int], noted: bool) -> None:
     content = {"mesh": MESH, "handles": [{"nodes": nodes, "clamp": True}]}
     with Simulation(content, MPI.COMM_SELF) as simulation:
         notes = [note for note in simulation.problem.whole.notes if "clamp" in note]
-    assert (
-        notes
-        == ["handles[0]: clamp keeps the slope of edges whose two ends are held, and there are none"] * noted
-    )
+    words = "handles[0]: clamp keeps the slope of edges whose two ends are held, and there are none"
+    assert notes == [words] * noted

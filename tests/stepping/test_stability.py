@@ -53,7 +53,7 @@ def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.C
         tip = shape(simulation)[-1]
         assert np.abs(tip[1]) > 0.3 * LENGTH
         system = simulation.problem.system
-        free = system.out_of_balance()[0]
+        free = system.out_of_balance()
         assert comm.allreduce(np.abs(free).max(initial=0.0), MPI.MAX) < 1e-6 * weight * CRITICAL
 
 
@@ -156,7 +156,7 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
                 system.x.ravel()[:] = here.ravel()
                 system.x.ravel()[place] += sign * 1e-6
                 system.begin_step(0.3, 0.7)
-                force.append(system.out_of_balance()[0].ravel()[free])
+                force.append(system.out_of_balance().ravel()[free])
             slopes[:, column] = (force[1] - force[0]) / 2e-6
         symmetric = 0.5 * (slopes + slopes.T)
         np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())

@@ -40,8 +40,8 @@ buckle into one of many shapes, and the first Newton steps decide into which."""
 LAST, LAST_FAR = 1e-3, 1e-2
 """Linear residual of the solve that is expected to be a step's last one, over the residual that the step may
 leave, in scenes with contact; the second while no parts are near. Motions in contact magnify errors of
-solves, which depend on the number of ranks; those with cycles do so only while parts are near. It takes up to
-a quarter more linear iterations."""
+solves, which depend on the number of ranks. It takes up to a quarter more linear iterations. Solves with
+multigrid hardly depend on the ranks, and have no such limit while no parts are near."""
 
 BUCKLING = 1e-5
 """Tolerance in steps in which the Hessian is indefinite while parts are near: the sheet buckles into one of

@@ -142,7 +142,7 @@ class Equilibrium:
         self._follows = bool(system.active.viscous or system.active.following)
         system.applied.factor = 0.0
         system.begin_step(0.0, 0.0)
-        force, _ = system.out_of_balance()
+        force = system.out_of_balance()
         self._scale = self._norm(force)
         # if the sheet slides, forces that hold its start shape would push it along
         held = not system.discretisation.has_near_elements
@@ -293,7 +293,7 @@ class Equilibrium:
         """Set the predictions along the tangent of the last equilibrium; collective."""
         if before != self._last_factor:
             return
-        self._load_rate = self._system.out_of_balance()[0] / (factor - before)
+        self._load_rate = self._system.out_of_balance() / (factor - before)
         if self._tangent is not None:
             self._integrator.alternatives = self._extrapolation.tangent_predictions(factor, self._tangent)
 
@@ -313,11 +313,11 @@ class Equilibrium:
             return 0
         if largest > 0.0:
             x, part = system.x.copy(), HANDLE_STEP * self._spacing / largest
-            here = system.out_of_balance()[0]
+            here = system.out_of_balance()
             system.x[:n] += part * moved
             system.points.update_ghosts(system.x)
             system.forget_forces()
-            rate = rate + (system.out_of_balance()[0] - here) / (part * step)
+            rate = rate + (system.out_of_balance() - here) / (part * step)
             system.x[:] = x
             system.forget_forces()
         if self._whole_stiffness is None:
@@ -343,7 +343,7 @@ class Equilibrium:
         if system.active.viscous:  # the wind's stiffness is not known
             pass
         elif not first:
-            displacement, iterations = self._whole_stiffness.tangent(system.out_of_balance()[0], loads)
+            displacement, iterations = self._whole_stiffness.tangent(system.out_of_balance(), loads)
         elif self._integrator.alternatives and self._tangent is not None:
             displacement = (factor - before) * self._tangent
         if displacement is None:
@@ -500,7 +500,7 @@ class Equilibrium:
         """The state that the proximal steps from positions x (n_owned, 3) [m] have reached; collective."""
         system, n = self._system, self._system.points.n_owned
         system.begin_step(before, factor)
-        force, _ = system.out_of_balance()
+        force = system.out_of_balance()
         goal = x.copy()
         if system.held:
             system.prescribed.targets(before, factor, factor, goal)
@@ -523,7 +523,7 @@ class Equilibrium:
         """Norm [N] of the out-of-balance force, and the largest acceleration [m/s²] by it; collective."""
         system = self._system
         system.begin_step(before, factor)
-        force, _ = system.out_of_balance()
+        force = system.out_of_balance()
         norm = self._norm(force)
         if not np.isfinite(norm):  # an obstacle has moved into the sheet
             return norm, 0.0

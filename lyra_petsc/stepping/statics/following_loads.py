@@ -6,8 +6,8 @@ takes it as linear in the displacement u from its initial shape, f + K u with th
 has the potential −fᵀu − ½ uᵀK u for line searches. Where K is symmetric, as for an even pressure on a closed
 sheet or one with a fixed rim, that is Newton's method for the load. Beside free edges K is not symmetric:
 ``newton_displacement`` finds the displacement with all of K, and the force of its skew part is given to the
-solve. So is a moment on an edge that turns: its K, of the forces ± M L γ on the ends (`terms.loads.moment`),
-is skew.
+solve. The K of a moment on an edge is skew: it is that of the forces ± M L γ on the ends
+(`terms.loads.moment`), by which the moment turns with its edge.
 
 Source: Schweizerhof & Ramm, Displacement dependent pressure loads in nonlinear finite element analyses,
 Computers & Structures 18 (1984) 1099-1114.

@@ -59,7 +59,7 @@ class WholeStiffness:
         self._set_positions(guess)
         for iteration in range(MAX_ITERATIONS):
             system.begin_step(before, factor)
-            unbalanced, _ = system.out_of_balance()
+            unbalanced = system.out_of_balance()
             force = float(np.sqrt(system.points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]))
             if iteration > 0 and self._balanced(force, last):
                 if not self._is_stable(factor):

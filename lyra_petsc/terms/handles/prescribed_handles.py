@@ -92,12 +92,18 @@ def conflicts(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
     return notes
 
 
+def has_edge_in(mesh: Mesh, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether both ends of an edge of each triangle, (n_triangles,), are among ``vertices``."""
+    found: NDArray[np.bool_] = np.isin(mesh.triangles, vertices).sum(axis=1) > 1
+    return found
+
+
 def clamps_without_edges(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
     """A note for each exact handle with ``clamp`` that does not hold both ends of any edge."""
     return [
         f"handles[{number}]: clamp keeps the slope of edges whose two ends are held, and there are none"
         for number, vertices in held.items()
-        if scene.handles[number].clamp and np.isin(mesh.triangles, vertices).sum(axis=1).max() < 2
+        if scene.handles[number].clamp and not has_edge_in(mesh, vertices).any()
     ]
 
 
