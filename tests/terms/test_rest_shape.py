@@ -59,6 +59,25 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
         assert float(bending.energies(x).sum()) < 1e-6 * flat
 
 
+def test_rest_curvature_does_not_depend_on_the_numbering(tmp_path: Path) -> None:
+    # a curved rest shape: the material axes of neighbours differ
+    random = np.random.default_rng(4)
+    columns, rows = np.meshgrid(np.arange(5), np.arange(4))
+    flat = np.column_stack([columns.ravel(), rows.ravel()]) / 4.0
+    vertices = np.column_stack([flat, 0.1 * np.sin(5.0 * flat[:, 0]) * np.cos(3.0 * flat[:, 1])])
+    corner = np.array([5 * row + column for row in range(3) for column in range(4)])
+    triangles = np.concatenate([corner[:, None] + [0, 1, 6], corner[:, None] + [0, 6, 5]])
+    order = random.permutation(len(vertices))
+    found = []
+    for name, numbers in (("as it is", np.arange(len(vertices))), ("permuted", order)):
+        mesh = obj_file(tmp_path / f"{name}.obj", vertices[np.argsort(numbers)], numbers[triangles[:: 1 - 2 * len(found)]])
+        material = CLOTH | {"bending": 1e-3, "rest_curvature": [0.5, -1.0, 0.7]}
+        with Simulation({"mesh": mesh, "material": material}, MPI.COMM_SELF) as simulation:
+            found.append(simulation.energy("bending"))
+    assert found[0] > 1e-6
+    assert found[1] == pytest.approx(found[0], rel=1e-12)
+
+
 def test_positive_curvature_raises_the_sheet_towards_its_normal() -> None:
     material = CLOTH | {"bending": 1e-3, "rest_curvature": [0.1, 0.1, 0.0]}
     with Simulation({"mesh": grid(1, 1, 2, 2), "material": material}, MPI.COMM_SELF) as simulation:

@@ -225,17 +225,19 @@ def _foot_and_height(
 def _angles_from_curvature(rest: RestShape, quad: NDArray[np.int64], triangles: NDArray[np.int64]) -> Array:
     """Dihedral angles (E,) [rad] of the piecewise linear interpolant of z = ½ rᵀ κ r.
 
-    κ is the materials' rest curvature. Positive curvature raises the sheet towards its normal, which makes
-    the angles negative.
+    κ is the rest curvature of each triangle's material. Positive curvature raises the sheet towards its
+    normal, which makes the angles negative.
     """
-    ee, nn, en = _rest_curvature(rest, triangles[:, 0], quad)
-    edge, _ = edge_in_material(rest, triangles[:, 0], quad[:, 0], quad[:, 1])
-    length = np.linalg.norm(edge, axis=1)
     angle = np.zeros(len(quad))
     for side, column, sign in ((0, 2, 1.0), (1, 3, -1.0)):
-        along, height = _foot_and_height(rest, triangles[:, side], quad[:, [0, 1, column]])
-        z = 0.5 * (ee * along**2 + 2 * sign * en * along * height + nn * height**2)
-        angle -= (z - 0.5 * ee * along * length) / height
+        corners = quad[:, [0, 1, column]]
+        ee, nn, en = _rest_curvature(rest, triangles[:, side], corners)
+        edge, _ = edge_in_material(rest, triangles[:, side], corners[:, 0], corners[:, 1])
+        along, height = _foot_and_height(rest, triangles[:, side], corners)
+        length = np.linalg.norm(edge, axis=1)
+        # the twist is relative to the middle of the edge, where the slopes of both triangles agree
+        z = ee * along * (along - length) + sign * en * (2.0 * along - length) * height + nn * height**2
+        angle -= 0.5 * z / height
     return angle
 
 
