@@ -276,6 +276,7 @@ class SteppedScene:
         newton = linear = rejected = halvings = 0
         self._failed_attempts = []
         system.integrator = self._scene_integrator
+        starts = False
         if not self._scene_integrator.iterates and system.has_friction_pairs:
             system.integrator = LaggedBackwardEuler()
         while True:
@@ -285,6 +286,7 @@ class SteppedScene:
             with self.phases("solve"):
                 self.stepper.follow_integrator()
                 attempt = (self._equilibrium or self.stepper).attempt(self.time, end)
+            starts |= system.starts_anew and system.damping.active
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
@@ -302,12 +304,7 @@ class SteppedScene:
                     if self.local_error is not None and past_slope is not None:
                         self.local_error.restore(*past_slope)
                     assert self.guard is not None
-                    # not under the midpoint rule, which conserves angular momentum
-                    last = halvings == HALVINGS - 1
-                    impact = not system.integrator.exact_work and self._switch_to_backward_euler(
-                        end - self.time, self.guard.message, last=last
-                    )
-                    if not impact:
+                    if not self._switch_after_gain(end - self.time, starts=starts):
                         self._halve_step(end - self.time, halvings)
                         halvings += 1
             rejected += 1
@@ -460,39 +457,55 @@ class SteppedScene:
             from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # needed at impacts only
 
             system.integrator = Bdf2()
-            self._note_impact("finds no collision-free step", "bdf2")
+            self._note_other_integrator("finds no collision-free step", "bdf2")
             return True
         if system.integrator is usual or system.integrator.order == 1:
             return False
         system.integrator = usual
         return self._switch_to_backward_euler(dt, "finds no collision-free step")
 
-    def _switch_to_backward_euler(self, dt: float, why: str, *, last: bool = False) -> bool:
-        """Let backward Euler repeat a short step that failed in contact; return whether it does.
+    def _switch_after_gain(self, dt: float, *, starts: bool = False, last: bool = False) -> bool:
+        """Let backward Euler repeat a step of dt [s] that gained energy; return whether it does.
 
-        Neither a formula for smooth motions nor one linear solve is valid over an impact. Adaptive steps are
-        short near their minimum in contact, and at the ``last`` halving.
+        Not under the midpoint rule, which conserves angular momentum.
+        """
+        assert self.guard is not None
+        if self.problem.system.integrator.exact_work:
+            return False
+        return self._switch_to_backward_euler(dt, self.guard.message, starts=starts, last=last)
+
+    def _switch_to_backward_euler(
+        self, dt: float, why: str, *, starts: bool = False, last: bool = False
+    ) -> bool:
+        """Let backward Euler repeat a damped step that ``starts`` anew, the ``last`` possible, or a short one
+        in contact; return whether it does.
+
+        Neither a formula for smooth motions nor one linear solve is valid over an impact. If damping is
+        stiff, generalised-α overshoots from the acceleration of a start or a jump. Adaptive steps are short
+        near their minimum in contact.
         """
         system, usual = self.problem.system, self._scene_integrator
         if self.scene.time.adaptive:
-            long = not last and dt > 2.0 * self._minimum_dt_in_contact()
+            long = dt > 2.0 * self._minimum_dt_in_contact()
         else:
             long = dt > (IMPACT_DT_EXACT_WORK if usual.exact_work else IMPACT_DT) * self.control.step
-        if long or usual.name == "beuler" or not usual.dynamic or not system.has_active_pairs:
+        impact = system.has_active_pairs and not long
+        if usual.name == "beuler" or not usual.dynamic or not (starts or last or impact):
             return False
         if system.integrator is not usual and system.integrator.order == 1:
             system.integrator = usual  # backward Euler failed, too
             return False
         system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
-        self._note_impact(why, "backward Euler")
+        self._note_other_integrator(why, "backward Euler", in_contact=system.has_active_pairs and not starts)
         return True
 
-    def _note_impact(self, why: str, by: str) -> None:
-        """Note once which integrator repeats steps that fail in contact."""
+    def _note_other_integrator(self, why: str, by: str, *, in_contact: bool = True) -> None:
+        """Note once which integrator repeats steps that fail."""
         where = f"step {self.step_number + 1} ({self.time_text()}): {self._scene_integrator.name} {why}"
+        subject = "impact" if by == "backward Euler" else f"impact {by}"
         self._note_once(
-            "impact" if by == "backward Euler" else f"impact {by}",
-            f"{where} in contact; such steps are repeated by {by}",
+            subject if in_contact else "energy",
+            f"{where}{' in contact' if in_contact else ''}; such steps are repeated by {by}",
         )
 
     def _halve_step(self, dt: float, halvings: int) -> None:
@@ -506,6 +519,8 @@ class SteppedScene:
         assert self.guard is not None
         where, scheme = f"step {self.step_number + 1} ({self.time_text()})", self.scene.time.scheme
         if halvings >= HALVINGS or not self.control.shorten(dt, first=halvings == 0):
+            if self._switch_after_gain(dt, last=True):
+                return
             raise SolverError(
                 f"{where}: {scheme} {self.guard.message}, even with Δt = {dt:.3g} s; "
                 f"the state at {self.time_text()} is kept; try {self.guard.remedy}",

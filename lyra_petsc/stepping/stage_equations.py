@@ -120,12 +120,14 @@ class StageEquations:
     applied : AppliedLoads
     has_active_pairs : bool
         Whether any pair of a term with changing stencils acted when the block rows were last renewed.
+    starts_anew : bool
+        Whether the integrator began the step from accelerations computed at its start.
     refused_displacement : RefusedDisplacement or None
         The displacement of the present step that was found to collide.
     """
 
     refused_displacement: RefusedDisplacement | None = None
-    has_active_pairs = False
+    has_active_pairs = starts_anew = False
     _frozen_before: Mapping[Term, Any] | None = None
     _start_velocity: Array | None = None  # found by `find_start`
     _past_velocity: Array | None = None  # (n_owned, 3) before the last step, if there is contact
@@ -232,6 +234,7 @@ class StageEquations:
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in (self.integrator, *self.followers):
                 follower.restart()
+        self.starts_anew = self.integrator.needs_acceleration
         asking = [each for each in (self.integrator, *self.followers) if each.needs_acceleration]
         acceleration = self._accelerations(t0 + after) if asking else self.history
         for follower in asking:

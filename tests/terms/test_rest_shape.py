@@ -70,7 +70,9 @@ def test_rest_curvature_does_not_depend_on_the_numbering(tmp_path: Path) -> None
     order = random.permutation(len(vertices))
     found = []
     for name, numbers in (("as it is", np.arange(len(vertices))), ("permuted", order)):
-        mesh = obj_file(tmp_path / f"{name}.obj", vertices[np.argsort(numbers)], numbers[triangles[:: 1 - 2 * len(found)]])
+        mesh = obj_file(
+            tmp_path / f"{name}.obj", vertices[np.argsort(numbers)], numbers[triangles[:: 1 - 2 * len(found)]]
+        )
         material = CLOTH | {"bending": 1e-3, "rest_curvature": [0.5, -1.0, 0.7]}
         with Simulation({"mesh": mesh, "material": material}, MPI.COMM_SELF) as simulation:
             found.append(simulation.energy("bending"))
