@@ -36,6 +36,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.energy_balance import EnergyBalance
+from lyra_petsc.stepping.integrators.integrator import Integrator
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -100,6 +101,10 @@ class Neighbour:
     problem: Problem
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
+    integrator: Integrator = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.integrator = self.system.integrator
 
     @property
     def system(self) -> StageEquations:
@@ -165,7 +170,6 @@ class Sensitivities:
         self.simulation, self.numbers = simulation, list(numbers)
         self._tolerance = tolerance
         self._system = simulation.problem.system
-        self._iterates = not self._system.integrator.lagged_loads
         self._static = isinstance(self._system.integrator, Static)
         self._semi = self._system.integrator.lagged_loads and not self._static
         relative = DELTA_STATIC if self._static else DELTA
@@ -277,11 +281,15 @@ class Sensitivities:
     def _differentiate_step(self, before: _StepStart, *, fresh: bool) -> None:
         system = self._system
         velocity, end = system.stage_velocity.copy(), self.simulation.time
+        usual, taken = system.integrator, self.simulation.last_integrator
+        semi = self._semi and taken is usual
         system.reopen(before.x)
-        with self._solver(velocity, set_up=self._iterates, keep=not fresh) as solve:
+        with self._solver(velocity, set_up=not semi, keep=not fresh) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each in neighbours:
-                    self._begin_step(each, before, tangent, delta, end)
+                    if taken is not usual:
+                        each.system.integrator = type(taken)()
+                    self._begin_step(each, before, tangent, delta, end, semi=semi)
                 for each, v in self._solve_stages(solve, neighbours, delta, velocity):
                     each.system.accept(v)
         if system.solves_edges_at_end:
@@ -290,14 +298,16 @@ class Sensitivities:
             for each in neighbours:
                 if each.energy_balance is not None:
                     each.energy_balance.record(before.x + each.offset * delta * tangent.x)
+                if taken is not usual:
+                    each.system.go_on_with(each.integrator, before.v + each.offset * delta * tangent.v)
             self._update_tangent(tangent, neighbours, delta)
             for each in neighbours:
                 each.system.set_references(end)
 
     def _begin_step(
-        self, each: Neighbour, before: _StepStart, tangent: Tangent, delta: float, end: float
+        self, each: Neighbour, before: _StepStart, tangent: Tangent, delta: float, end: float, *, semi: bool
     ) -> None:
-        """Begin the step that the simulation has taken with a neighbour."""
+        """Begin the step that the simulation has taken, ``semi``-implicit or not, with a neighbour."""
         system, change = each.system, each.offset * delta
         system.state.set(before.x + change * tangent.x, before.v + change * tangent.v)
         history = {
@@ -309,7 +319,8 @@ class Sensitivities:
             term.initialise(system.x)
         system.begin_step(before.time, end)
         self._use_frames(system, before.frames)
-        if self._semi:
+        each.jacobian = None
+        if semi:
             start = np.zeros_like(before.x)
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()

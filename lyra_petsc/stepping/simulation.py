@@ -65,6 +65,9 @@ IMPACT_SKIN_FRACTION, IMPACT_RUN_FRACTION = 0.02, 1e-4
 adaptive steps are not shortened for the error of an impact, which would lead to ever shorter ones.
 """
 
+START_HALVINGS = 2
+"""Halvings after which backward Euler takes a step of a damped sheet at the start or after a jump."""
+
 MAX_STEPS, MAX_STATES = 1e8, 1e6
 """Upper bounds of a run's numbers of steps and of states."""
 
@@ -304,18 +307,14 @@ class SteppedScene:
                     if self.local_error is not None and past_slope is not None:
                         self.local_error.restore(*past_slope)
                     assert self.guard is not None
-                    if not self._switch_after_gain(end - self.time, starts=starts):
+                    jump = starts and halvings >= START_HALVINGS
+                    if not self._switch_after_gain(end - self.time, jump=jump):
                         self._halve_step(end - self.time, halvings)
                         halvings += 1
             rejected += 1
+        self.last_integrator = system.integrator
         if system.integrator is not self._scene_integrator:
-            by_end = system.integrator.order == 1
-            system.integrator = self._scene_integrator
-            self._scene_integrator.restart()
-            if by_end:  # from stage velocities: those after the impact would give stiff damping huge forces
-                rate = (system.stage_velocity - v_before[:n]) / (end - self.time)
-                moves = system.prescribed.free & (system.mass[:, None] > 0.0)
-                self._scene_integrator.set_acceleration(np.where(moves, rate, 0.0))
+            system.go_on_with(self._scene_integrator, v_before[:n])
             if self.local_error is not None:
                 self.local_error.restart()
         if self._equilibrium is not None and self.control.is_end(end):
@@ -464,7 +463,7 @@ class SteppedScene:
         system.integrator = usual
         return self._switch_to_backward_euler(dt, "finds no collision-free step")
 
-    def _switch_after_gain(self, dt: float, *, starts: bool = False, last: bool = False) -> bool:
+    def _switch_after_gain(self, dt: float, *, jump: bool = False, last: bool = False) -> bool:
         """Let backward Euler repeat a step of dt [s] that gained energy; return whether it does.
 
         Not under the midpoint rule, which conserves angular momentum.
@@ -472,13 +471,13 @@ class SteppedScene:
         assert self.guard is not None
         if self.problem.system.integrator.exact_work:
             return False
-        return self._switch_to_backward_euler(dt, self.guard.message, starts=starts, last=last)
+        return self._switch_to_backward_euler(dt, self.guard.message, jump=jump, last=last)
 
     def _switch_to_backward_euler(
-        self, dt: float, why: str, *, starts: bool = False, last: bool = False
+        self, dt: float, why: str, *, jump: bool = False, last: bool = False
     ) -> bool:
-        """Let backward Euler repeat a damped step that ``starts`` anew, the ``last`` possible, or a short one
-        in contact; return whether it does.
+        """Let backward Euler repeat a damped step after a start or a ``jump``, the ``last`` possible step, or
+        a short one in contact; return whether it does.
 
         Neither a formula for smooth motions nor one linear solve is valid over an impact. If damping is
         stiff, generalised-α overshoots from the acceleration of a start or a jump. Adaptive steps are short
@@ -490,13 +489,13 @@ class SteppedScene:
         else:
             long = dt > (IMPACT_DT_EXACT_WORK if usual.exact_work else IMPACT_DT) * self.control.step
         impact = system.has_active_pairs and not long
-        if usual.name == "beuler" or not usual.dynamic or not (starts or last or impact):
+        if usual.name == "beuler" or not usual.dynamic or not (jump or last or impact):
             return False
         if system.integrator is not usual and system.integrator.order == 1:
             system.integrator = usual  # backward Euler failed, too
             return False
         system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
-        self._note_other_integrator(why, "backward Euler", in_contact=system.has_active_pairs and not starts)
+        self._note_other_integrator(why, "backward Euler", in_contact=system.has_active_pairs and not jump)
         return True
 
     def _note_other_integrator(self, why: str, by: str, *, in_contact: bool = True) -> None:

@@ -402,6 +402,16 @@ class StageEquations:
                 if term.slips:
                     self.contact_impulses = impacts.correct_friction(self, term, self.contact_impulses)
 
+    def go_on_with(self, integrator: Integrator, v_before: Array) -> None:
+        """Change the integrator after a step from velocities v_before (n_owned, 3) that another one took."""
+        by_end = self.integrator.order == 1
+        self.integrator = integrator
+        integrator.restart()
+        if by_end:  # from stage velocities: those after an impact would give stiff damping huge forces
+            rate = (self.stage_velocity - v_before) / self.dt
+            moves = self.prescribed.free & (self.mass[:, None] > 0.0)
+            integrator.set_acceleration(np.where(moves, rate, 0.0))
+
     def reopen(self, x_before: Array) -> None:
         """Let the equations of the step just accepted, from x_before (n_owned, 3), be evaluated again;
         collective.

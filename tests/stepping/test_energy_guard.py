@@ -161,7 +161,7 @@ def test_stiffly_damped_sheets_start_with_a_step_of_backward_euler(integrator: s
         rejected.append(one.totals["rejected"])
         one.destroy()
     errors = [np.abs(end - ends[-1]).max() for end in ends[:-1]]
-    assert rejected[0] == 1
+    assert 0 < rejected[0] <= 3
     assert errors[0] < 0.01
     assert errors[2] < errors[1] / 3.3 < errors[0] / 9.0  # of second order
 

@@ -219,6 +219,25 @@ def test_curved_sheets_with_directors(integrator: str) -> None:
     agree(scene(integrator, CURVED, **TURNED), of_integrator(integrator, OF_CURVED))
 
 
+@pytest.mark.parametrize("integrator", ["alpha2", "bdf2"])
+def test_stiff_damping_whose_first_step_is_of_backward_euler(integrator: str) -> None:
+    stiff = {"young": 6e6, "poisson": 0.3, "thickness": 0.005, "density": 0.2, "damping": 0.016}
+    pulled = lyra_petsc.load(
+        {
+            "mesh": grid(1.0, 1.0, 2, 2),
+            "material": stiff,
+            "gravity": [5.0, -3.0, -6.0],
+            "handles": [{"group": "left"}],
+            "time": {"end": 0.03, "step": 0.01, "integrator": integrator}
+            | ({"spectral_radius": 0.0} if integrator == "alpha2" else {}),
+            "solver": TIGHT,
+        }
+    )
+    with finished(MPI.COMM_WORLD, pulled) as simulation:
+        assert any("repeated by backward Euler" in note for note in simulation.notes)
+    agree(pulled, {"material.damping": 0.016, "material.young": 6e6})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint"])
 def test_each_parameter_of_curved_sheets_with_directors(integrator: str) -> None:
