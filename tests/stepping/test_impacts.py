@@ -165,3 +165,27 @@ def test_a_sheet_that_lands_obliquely_is_not_thrown_back(
     simulation.destroy()
     assert back < largest * SPEED
     assert stays < 0.01 * SPEED
+
+
+@pytest.mark.parametrize(
+    ("integrator", "step"), [(name, step) for name in ("midpoint", "alpha2") for step in (0.001, 0.004)]
+)
+def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str, step: float) -> None:
+    """By friction times the change of the normal speed, though the gap is passed within a few steps."""
+    friction = 0.3
+    content = {
+        "mesh": grid(0.2, 0.2, 8, 8, "alternating") | {"transform": {"translate": [0.0, 0.0, 0.00587]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "initial": {"velocity": [2.0, 0.0, -1.0]},
+        "contact": {"gap": 0.002, "friction": friction, "self": False},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}},
+        "time": {"end": 0.06, "step": step, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    while not simulation.finished:
+        simulation.step()
+    mass, *momentum = system.points.global_sum(float(system.mass.sum()), *(system.mass @ system.v[:n]))
+    along, _, normal = momentum / mass
+    simulation.destroy()
+    assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=0.1)

@@ -402,9 +402,12 @@ class CoulombFriction(Elastic):
             )
         )
         owed = self._vertex_data[:, OWED] / dt + acted + damping[: len(acted)] - given
-        paid = np.where(slid > 0.0, np.where(acted > 0.0, PAID_FRACTION, 1.0) * owed, 0.0)
+        # vertices may come near after the stage, or leave
+        *_, last = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        touches = np.isin(np.arange(len(acted)), contact.vertex_of(last))
+        paid = np.where(slid > 0.0, np.where(touches, PAID_FRACTION, 1.0) * owed, 0.0)
         # sticking pairs are owed nothing, new contacts get everything later
-        is_owed = (acted > 0.0) & ((slid > 0.0) | (given == 0.0))
+        is_owed = touches & ((slid > 0.0) | (given == 0.0))
         self._next_owed = np.where(is_owed, dt * (owed - paid), 0.0)
         paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
         missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
