@@ -165,7 +165,9 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _corrects_sheets(system)
-    corrections = term.friction_corrections(stage, x, system.v, frozen, before.damping, dt, sheets=sheets)
+    # the velocities of backward Euler are those of the mean of the step
+    flags = {"sheets": sheets, "at_end": system.integrator.order > 1}
+    corrections = term.friction_corrections(stage, x, system.v, frozen, before.damping, dt, **flags)
     points, beta, weight, direction, gradient, missing, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.exact_work:

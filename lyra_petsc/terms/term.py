@@ -588,12 +588,22 @@ class Elastic(Term):
         return 0
 
     def friction_corrections(
-        self, stage: Array, x: Array, v: Array, frozen: Any, damping: Array, dt: float, *, sheets: bool
+        self,
+        stage: Array,
+        x: Array,
+        v: Array,
+        frozen: Any,
+        damping: Array,
+        dt: float,
+        *,
+        sheets: bool,
+        at_end: bool,
     ) -> FrictionCorrections:
         """Corrections of friction at the end of a step of length dt [s]; of a term that `slips`.
 
-        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); dashpots added normal
-        forces ``damping`` (n_owned,) [N]. Friction on obstacles, and with ``sheets`` also between sheets.
+        The step led over a ``stage`` to positions x, with velocities v (n_local, 3), those ``at_end`` of the
+        step or its mean; dashpots added normal forces ``damping`` (n_owned,) [N]. Friction on obstacles, and
+        with ``sheets`` also between sheets.
         """
         raise NotImplementedError
 

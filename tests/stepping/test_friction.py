@@ -152,6 +152,35 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
     assert ratios[1] > 0.05
 
 
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
+def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
+    comm: MPI.Comm, integrator: str
+) -> None:
+    """The acceleration grows evenly; friction has to give the sheet its velocity in every step."""
+    static, end = 0.5, 2.0
+    fastest = 1.1 * static * G  # acceleration at the end
+    moved, speed = [fastest * end**2 / 6.0, 0.0, 0.0], [0.5 * fastest * end, 0.0, 0.0]
+    last = {"time": end, "translate": moved, "velocity": speed}
+    content = {
+        "mesh": grid(0.3, 0.3, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.95 * GAP]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": {"static": static, "kinetic": 0.6 * static}, "self": False},
+        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, last]}},
+        "time": {"end": end, "step": 0.01, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    start, slip = system.x[:n, 0].copy(), 0.0
+    while slip < 0.1 * GAP:
+        simulation.step()
+        behind = moved[0] * (simulation.time / end) ** 3 - system.x[:n, 0] + start
+        slip = comm.allreduce(float(np.abs(behind).max(initial=0.0)), MPI.MAX)
+    slips = simulation.time / end * fastest / (static * G)
+    simulation.destroy()
+    assert 0.99 < slips < 1.03
+
+
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
 def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, integrator: str) -> None:

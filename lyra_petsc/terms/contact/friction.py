@@ -384,6 +384,7 @@ class CoulombFriction(Elastic):
         dt: float,
         *,
         sheets: bool,
+        at_end: bool,
     ) -> FrictionCorrections:
         contact = self._contact
         *_, force, pair = contact.find_contacts(stage, frozen.stage_points, contact.n_owned)
@@ -417,8 +418,9 @@ class CoulombFriction(Elastic):
         points = self.stencil[owned].astype(np.int64)
         beta, obstacle = self._beta[owned], self._obstacle[owned]
         # impulses act at the end of the step, when obstacles may be faster than in the mean
-        motions = contact.obstacles.rigid_motions(frozen.time - END * dt, frozen.time)
-        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions) / END
+        part = END if at_end else 1.0
+        motions = contact.obstacles.rigid_motions(frozen.time - part * dt, frozen.time)
+        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions) / part
         velocity = np.einsum("ecik,eik->ec", self._gradients[owned], v[points])
         velocity -= self._tangential(moved / dt, owned)
         still = STILL * MAX_ELASTIC_SLIP * contact.barrier.gap
