@@ -95,7 +95,7 @@ def test_petscs_multigrid_keeps_its_levels() -> None:
     assert pc.getMGLevels() == 1
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
     if not PETSc.Sys.hasExternalPackage("mumps"):
@@ -120,7 +120,7 @@ def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
     np.testing.assert_allclose(*ends, atol=1e-9)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 def test_an_error_in_the_set_up_is_left_to_the_next_solver(
     comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch

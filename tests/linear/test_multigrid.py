@@ -71,6 +71,7 @@ def test_unknowns_on_edges_take_few_iterations(scheme: str, clamped: bool, comm:
     assert counts[1] <= 1.4 * counts[0] + 1
 
 
+@pytest.mark.parallel(2)
 def test_stiff_cloth_and_long_steps(kind: str, comm: MPI.Comm) -> None:
     content = hanging(50, step=0.04)
     content["material"]["stretching_scale"] = 1000.0
@@ -107,6 +108,7 @@ def test_a_mesh_of_a_few_triangles(kind: str, comm: MPI.Comm) -> None:
     assert np.abs(x - direct).max() < 1e-6
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize(
     "options",
     [
@@ -127,6 +129,7 @@ def test_options_are_used(options: dict[str, Any], kind: str, comm: MPI.Comm) ->
     assert 0 < max(counts) < 20
 
 
+@pytest.mark.parallel(2)
 def test_levels_visited_twice(comm: MPI.Comm) -> None:
     content = hanging(75)
     content["material"] |= {"stretching_scale": 1000.0, "bending_scale": 1000.0}

@@ -29,6 +29,7 @@ SCENE: dict[str, Any] = {
 }
 
 
+@pytest.mark.parallel(2)
 def test_forces_on_obstacles_equal_the_weight_at_rest(comm: MPI.Comm, shared_tmp: Path) -> None:
     simulate_until(comm, SCENE, shared_tmp / "run", None)
     if comm.rank > 0:

@@ -38,7 +38,7 @@ def fewer(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(textile_tests, name, value)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_cantilever_reproduces_b(comm: MPI.Comm) -> None:
     bias = Fabric("fabric", FABRIC.block | {"warp_degrees": 30.0})  # where it lies in the scene
     with Bench(comm) as bench:

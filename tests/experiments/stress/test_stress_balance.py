@@ -222,7 +222,7 @@ def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: st
     assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
 def test_stages_with_directors_are_balanced(comm: MPI.Comm, integrator: str) -> None:
     """Clamped, damped and rotating fast, with the frames of the step."""
