@@ -39,6 +39,9 @@ from lyra_petsc.terms.term import Elastic
 DAMPING = 0.5
 """Damping of the distances in contact, over the critical damping."""
 
+END = 1e-3
+"""Last part of a step by whose motion the velocities of obstacles at its end are measured."""
+
 MAX_SWEEPS, SETTLED = 30, 1e-4
 """Largest number of sweeps over the friction at the start of a step, and change of it in a sweep over the
 largest one below which they end."""
@@ -126,7 +129,8 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
     from others, and two halves of a pair are damped as the whole.
     """
     layout, n, dt, damping = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
-    all_pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
+    last = _last_times(system)
+    all_pairs = [term.dashpots(system.x, system.active.frozen[term], last) for term in system.active.limiting]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
         reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)
         return ContactImpulses(damping, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))
@@ -140,11 +144,11 @@ def damp_impacts(system: StageEquations) -> ContactImpulses:
     work, impulse, pushes = 0.0, np.zeros_like(system.x), []
     for pairs, own in both:
         push = np.empty(len(own))
-        given = *pairs[:4], pairs.pushed, own, dt, DAMPING
+        given = *pairs[:4], pairs.approach, own, dt, DAMPING
         dashpots.damp(system.v, inverse, *given, push, impulse)
         vertex = np.flatnonzero(own & (pairs.vertex >= 0) & (sheets | (pairs.obstacle >= 0)))
         damping += np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
-        work += float(push @ pairs.pushed) / dt
+        work += float(push @ pairs.approach)
         on = np.flatnonzero(own & (pairs.obstacle >= 0))
         force = (push[on] / dt)[:, None] * pairs.normal[on]
         pushes.append(_obstacle_forces(system, pairs.points[on], pairs.beta[on], pairs.obstacle[on], force))
@@ -165,9 +169,10 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
     frozen, sheets = system.active.frozen[term], _corrects_sheets(system)
-    # the velocities of backward Euler are those of the mean of the step
-    flags = {"sheets": sheets, "at_end": system.integrator.order > 1}
-    corrections = term.friction_corrections(stage, x, system.v, frozen, before.damping, dt, **flags)
+    last = _last_times(system)
+    corrections = term.friction_corrections(
+        stage, x, system.v, frozen, before.damping, dt, sheets=sheets, last=last
+    )
     points, beta, weight, direction, gradient, missing, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
     if system.integrator.exact_work:
@@ -190,7 +195,12 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     work, on = float(np.vdot(force, moved)), obstacle >= 0
     pushed = _obstacle_forces(system, points[on], beta[on], obstacle[on], force[on])
     handle_force, heat = _apply_impulse(system, impulse, work)
-    sums = before.handle_force + handle_force, before.work + work, before.heat + heat
+    # the work of friction, with the mean of the speeds before and after, is external work
+    after = np.einsum("eik,eik->e", system.v[points], gradient) - np.einsum("ek,ek->e", moved, direction) / dt
+    friction_work = -0.5 * dt * push * (speed + after)
+    term.set_impulse_work(points[:, 0], friction_work)
+    total = float(friction_work.sum())
+    sums = before.handle_force + handle_force, before.work + work - total, before.heat + heat - total
     on_obstacles = (np.concatenate(part) for part in zip(before[4:], pushed, strict=True))
     return ContactImpulses(before.damping, *sums, *on_obstacles)
 
@@ -232,6 +242,14 @@ def hold_by_friction(system: StageEquations, term: Elastic, v: Array, accelerati
         if layout.global_max(change)[0] <= SETTLED * largest:
             break
     return with_friction(friction)
+
+
+def _last_times(system: StageEquations) -> tuple[float, float]:
+    """Times [s] between which the mean velocity of obstacles is comparable with velocities after the step,
+    which are means of the step under backward Euler.
+    """
+    part = END if system.integrator.order > 1 else 1.0
+    return system.t1 - part * system.dt, system.t1
 
 
 def _corrects_sheets(system: StageEquations) -> bool:

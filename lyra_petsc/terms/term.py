@@ -205,8 +205,8 @@ class Dashpots(NamedTuple):
     vertex, obstacle : (m,)
         Vertex of a sheet that is in contact, −1 for other kinds of pairs; number of the obstacle, −1 between
         sheets.
-    pushed : (m,)
-        Distance [m] by which the obstacle's motion in the step reduced that of the pair.
+    approach : (m,)
+        Speed [m/s] with which the obstacle's motion reduces the distance of the pair.
     """
 
     points: Ints
@@ -215,7 +215,7 @@ class Dashpots(NamedTuple):
     stiffness: Array
     vertex: Ints
     obstacle: Ints
-    pushed: Array
+    approach: Array
 
 
 class FrictionCorrections(NamedTuple):
@@ -496,8 +496,11 @@ class Elastic(Term):
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
-    def dashpots(self, x: Array, frozen: Any) -> Dashpots:
-        """Pairs in contact at the end of the step, including those that other ranks count."""
+    def dashpots(self, x: Array, frozen: Any, last: tuple[float, float]) -> Dashpots:
+        """Pairs in contact at the end of the step, including those that other ranks count.
+
+        The speeds of obstacles are means between the two times ``last`` [s].
+        """
         points, beta, normal, force, vertex = Elastic.contact_points(self, x, frozen)
         return Dashpots(points, beta, normal, force, vertex, vertex, force)
 
@@ -597,14 +600,18 @@ class Elastic(Term):
         dt: float,
         *,
         sheets: bool,
-        at_end: bool,
+        last: tuple[float, float],
     ) -> FrictionCorrections:
         """Corrections of friction at the end of a step of length dt [s]; of a term that `slips`.
 
-        The step led over a ``stage`` to positions x, with velocities v (n_local, 3), those ``at_end`` of the
-        step or its mean; dashpots added normal forces ``damping`` (n_owned,) [N]. Friction on obstacles, and
-        with ``sheets`` also between sheets.
+        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); dashpots added normal
+        forces ``damping`` (n_owned,) [N]. Friction on obstacles, whose velocities are means between the two
+        times ``last`` [s], and with ``sheets`` also between sheets.
         """
+        raise NotImplementedError
+
+    def set_impulse_work(self, vertex: Ints, work: Array) -> None:
+        """Work (m,) [J] of a step's impulses of friction at owned vertices; of a term that `slips`."""
         raise NotImplementedError
 
     def starting_friction(self, frozen: Any) -> StartingFriction:

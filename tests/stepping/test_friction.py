@@ -327,6 +327,30 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     assert np.abs(crept).max() < 1e-6
 
 
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
+def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, integrator: str) -> None:
+    """A sheet falls on it and slides until it has its speed, whatever the normal force is meanwhile."""
+    speed = 0.5
+    away = {"time": 1.0, "translate": [speed, 0.0, 0.0]}
+    content = {
+        "mesh": grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.005]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": 0.002, "friction": 0.4, "self": False},
+        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away], "interpolation": "linear"}},
+        "time": {"end": 0.25, "step": 0.001, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    while not simulation.finished:
+        simulation.step()
+    mass, momentum = system.points.global_sum(float(system.mass.sum()), float(system.mass @ system.v[:n, 0]))
+    work = simulation.energy_balance.columns()["friction_work"]
+    simulation.destroy()
+    assert momentum == pytest.approx(mass * speed, rel=1e-6)
+    assert work == pytest.approx(0.5 * mass * speed**2, rel=0.04)
+
+
 @pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
 def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrator: str) -> None:
     """A plane starts to move by many times the limit of elastic slip in a step.

@@ -189,3 +189,30 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
     along, _, normal = momentum / mass
     simulation.destroy()
     assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=0.1)
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
+def test_a_sheet_at_rest_on_an_accelerating_floor_is_not_damped(comm: MPI.Comm, integrator: str) -> None:
+    """Its velocity at the end of a step differs from the mean velocity of the floor in the step."""
+    acceleration, gravity, end = 5.0, 9.81, 0.5
+    up = {"time": end, "velocity": [0.0, 0.0, acceleration * end]}
+    up["translate"] = [0.0, 0.0, 0.5 * acceleration * end**2]
+    content = {
+        "mesh": grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.00187]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "gravity": [0.0, 0.0, -gravity],
+        "contact": {"gap": 0.002, "self": False},
+        "obstacles": {
+            "floor": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}, "motion": [{"time": 0.0}, up]}
+        },
+        "time": {"end": end, "step": 0.01, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system = simulation.problem.system
+    while not simulation.finished:
+        simulation.step()
+    budget, (mass,) = simulation.budget, system.points.global_sum(float(system.mass.sum()))
+    simulation.destroy()
+    work = mass * (gravity + acceleration) * 0.5 * acceleration * end**2
+    assert budget.external_work == pytest.approx(work, rel=1e-3)
+    assert abs(budget.dissipation) < 1e-3 * work

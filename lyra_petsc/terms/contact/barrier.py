@@ -852,7 +852,7 @@ class ContactBarrier(Elastic):
         beta, normal, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
         return self.points[pair], beta, normal, force, self.vertex_of(pair)
 
-    def dashpots(self, x: Array, frozen: ObstaclePositions) -> Dashpots:
+    def dashpots(self, x: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Dashpots:
         active = self.active_pairs(x, frozen.end)
         square = active.square
         stiffness = active.weight * active.stiffness
@@ -863,9 +863,11 @@ class ContactBarrier(Elastic):
         rows, normal, stiffness = rows[kept], normal[kept], stiffness[kept]
         pair, beta = active.pair[rows], active.beta[rows]
         points, obstacle = self.points[pair], self.obstacle[pair]
-        moved = self.obstacles.contact_displacements(x, points, beta, obstacle, frozen.end_motions)
-        pushed = np.einsum("ek,ek->e", moved, normal)
-        return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, pushed)
+        moved = self.obstacles.contact_displacements(
+            x, points, beta, obstacle, self.obstacles.rigid_motions(*last)
+        )
+        approach = np.einsum("ek,ek->e", moved, normal) / (last[1] - last[0])
+        return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, approach)
 
     def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Sum of the normal forces [N] at each local vertex, (n_local,), of the pairs that this rank counts.

@@ -48,19 +48,19 @@ def share(points, beta, weight, mine, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping, push, out):  # type: ignore[no-untyped-def]
+def damp(v, inverse, points, beta, normal, stiffness, approach, mine, dt, damping, push, out):  # type: ignore[no-untyped-def]
     """Add the impulses [N s] of dashpots in dt [s] to out (n_local, 3), and write the impulse of each to push
     (m,). The weights are the stiffnesses.
 
     v (n_local, 3) [m/s] are velocities, ``inverse`` (n_local, 3) [1/kg] is 1/m for the part of the mass that
-    a pair of weight 1 may move, ``damping`` the ratio to critical damping, ``pushed`` (m,) [m] the approach
-    of obstacles.
+    a pair of weight 1 may move, ``damping`` the ratio to critical damping, ``approach`` (m,) [m/s]
+    the speeds of obstacles towards it.
     """
     for e in range(len(points)):
         push[e] = 0.0
         if not mine[e]:
             continue
-        inverse_mass, rate = 0.0, -pushed[e] / dt
+        inverse_mass, rate = 0.0, -approach[e]
         for i in range(4):
             if points[e, i] >= 0 and beta[e, i] != 0.0:
                 row = Index(points[e, i])

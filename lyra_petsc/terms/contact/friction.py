@@ -57,9 +57,6 @@ STILL = 1e-6
 """Displacement in a step, over the largest elastic slip, up to which a sticking pair is not stopped: without
 the round-off in the velocities, Newton's method would start where round-off leaves it no smaller energy."""
 
-END = 1e-3
-"""Last part of a step by whose motion the velocities of obstacles at its end are measured."""
-
 SHEET_SOFTNESS = 0.25
 """Friction stiffness between sheets over that on obstacles, for lightly pressed pairs. With springs as stiff
 as the barrier halfway through the gap sheets rotate by much, and Newton's method needs up to 1.4 times as
@@ -141,7 +138,9 @@ class CoulombFriction(Elastic):
         self._vertex_data = np.zeros((n_vertices, 3))
         self._pairs = self._element_pairs = _no_pairs()
         self._contact_time: float | None = None  # [s], of the last part of a load step
-        self._next_owed: Array | None = None  # impulses after the step, until it is accepted
+        # impulses owed after the step, and work of its impulses, until it is accepted
+        self._next_owed: Array | None = None
+        self._impulse_work: Array | float = 0.0
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -360,7 +359,8 @@ class CoulombFriction(Elastic):
     def accept(self, x: Array, frozen: ObstacleMotion) -> None:
         self._contact_time = None
         self._vertex_data[:, OWED] = 0.0 if self._next_owed is None else self._next_owed
-        self._next_owed = None
+        self._vertex_data[:, WORK] += self._impulse_work
+        self._next_owed, self._impulse_work = None, 0.0
         if not self.n_elements:
             self._obstacle_loads = np.zeros_like(self._obstacle_loads)
             self._update_pairs(x, frozen.end_points, self._element_pairs)
@@ -384,7 +384,7 @@ class CoulombFriction(Elastic):
         dt: float,
         *,
         sheets: bool,
-        at_end: bool,
+        last: tuple[float, float],
     ) -> FrictionCorrections:
         contact = self._contact
         *_, force, pair = contact.find_contacts(stage, frozen.stage_points, contact.n_owned)
@@ -404,12 +404,12 @@ class CoulombFriction(Elastic):
         )
         owed = self._vertex_data[:, OWED] / dt + acted + damping[: len(acted)] - given
         # vertices may come near after the stage, or leave
-        *_, last = contact.find_contacts(x, frozen.end_points, contact.n_owned)
-        touches = np.isin(np.arange(len(acted)), contact.vertex_of(last))
+        *_, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        touches = np.isin(np.arange(len(acted)), contact.vertex_of(pair))
         paid = np.where(slid > 0.0, np.where(touches, PAID_FRACTION, 1.0) * owed, 0.0)
         # sticking pairs are owed nothing, new contacts get everything later
         is_owed = touches & ((slid > 0.0) | (given == 0.0))
-        self._next_owed = np.where(is_owed, dt * (owed - paid), 0.0)
+        self._next_owed, self._impulse_work = np.where(is_owed, dt * (owed - paid), 0.0), 0.0
         paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
         missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
         # sticking pairs are stopped at once: their springs would throw a sheet back that lands with a sliding
@@ -418,9 +418,9 @@ class CoulombFriction(Elastic):
         points = self.stencil[owned].astype(np.int64)
         beta, obstacle = self._beta[owned], self._obstacle[owned]
         # impulses act at the end of the step, when obstacles may be faster than in the mean
-        part = END if at_end else 1.0
-        motions = contact.obstacles.rigid_motions(frozen.time - part * dt, frozen.time)
-        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions) / part
+        motions = contact.obstacles.rigid_motions(*last)
+        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions)
+        moved *= dt / (last[1] - last[0])
         velocity = np.einsum("ecik,eik->ec", self._gradients[owned], v[points])
         velocity -= self._tangential(moved / dt, owned)
         still = STILL * MAX_ELASTIC_SLIP * contact.barrier.gap
@@ -445,6 +445,10 @@ class CoulombFriction(Elastic):
             obstacle[rows],
             moved[rows],
         )
+
+    def set_impulse_work(self, vertex: Ints, work: Array) -> None:
+        self._impulse_work = np.zeros(len(self._vertex_data))
+        np.add.at(self._impulse_work, vertex, work)
 
     def starting_friction(self, frozen: ObstacleMotion) -> StartingFriction:
         owned = slice(self.n_owned)
