@@ -57,6 +57,9 @@ STILL = 1e-6
 """Displacement in a step, over the largest elastic slip, up to which a sticking pair is not stopped: without
 the round-off in the velocities, Newton's method would start where round-off leaves it no smaller energy."""
 
+NOTHING_CORRECTED = -np.inf, 0.0, 0.0
+"""Corrections of friction before any step: its end [s], impulses [N s] owed and work [J] of impulses."""
+
 SHEET_SOFTNESS = 0.25
 """Friction stiffness between sheets over that on obstacles, for lightly pressed pairs. With springs as stiff
 as the barrier halfway through the gap sheets rotate by much, and Newton's method needs up to 1.4 times as
@@ -138,9 +141,8 @@ class CoulombFriction(Elastic):
         self._vertex_data = np.zeros((n_vertices, 3))
         self._pairs = self._element_pairs = _no_pairs()
         self._contact_time: float | None = None  # [s], of the last part of a load step
-        # impulses owed after the step, and work of its impulses, until it is accepted
-        self._next_owed: Array | None = None
-        self._impulse_work: Array | float = 0.0
+        # until a step is accepted: its end, the impulses owed after it, and the work of its impulses
+        self._corrected: tuple[float, Array | float, Array | float] = NOTHING_CORRECTED
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -358,9 +360,11 @@ class CoulombFriction(Elastic):
 
     def accept(self, x: Array, frozen: ObstacleMotion) -> None:
         self._contact_time = None
-        self._vertex_data[:, OWED] = 0.0 if self._next_owed is None else self._next_owed
-        self._vertex_data[:, WORK] += self._impulse_work
-        self._next_owed, self._impulse_work = None, 0.0
+        # not those of a rejected attempt
+        _, owed, work = self._corrected if self._corrected[0] == frozen.time else NOTHING_CORRECTED
+        self._vertex_data[:, OWED] = owed
+        self._vertex_data[:, WORK] += work
+        self._corrected = NOTHING_CORRECTED
         if not self.n_elements:
             self._obstacle_loads = np.zeros_like(self._obstacle_loads)
             self._update_pairs(x, frozen.end_points, self._element_pairs)
@@ -409,7 +413,7 @@ class CoulombFriction(Elastic):
         paid = np.where(slid > 0.0, np.where(touches, PAID_FRACTION, 1.0) * owed, 0.0)
         # sticking pairs are owed nothing, new contacts get everything later
         is_owed = touches & ((slid > 0.0) | (given == 0.0))
-        self._next_owed, self._impulse_work = np.where(is_owed, dt * (owed - paid), 0.0), 0.0
+        self._corrected = frozen.time, np.where(is_owed, dt * (owed - paid), 0.0), 0.0
         paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
         missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
         # sticking pairs are stopped at once: their springs would throw a sheet back that lands with a sliding
@@ -447,8 +451,9 @@ class CoulombFriction(Elastic):
         )
 
     def set_impulse_work(self, vertex: Ints, work: Array) -> None:
-        self._impulse_work = np.zeros(len(self._vertex_data))
-        np.add.at(self._impulse_work, vertex, work)
+        at_vertices = np.zeros(len(self._vertex_data))
+        np.add.at(at_vertices, vertex, work)
+        self._corrected = *self._corrected[:2], at_vertices
 
     def starting_friction(self, frozen: ObstacleMotion) -> StartingFriction:
         owned = slice(self.n_owned)

@@ -37,14 +37,14 @@ FEWER: dict[str, dict[str, object]] = {
     "elastica-tip": {"KINDS": ("criss-cross", "gmsh")},
     "plate-vibration": {"KINDS": ("criss-cross", "gmsh")},
     "hinged-roof": {"PATTERNS": ("alternating",)},
-    "incline": {"SLOPES": (5.0, 60.0), "SLIDING": (0.99, 0.5)},
+    "incline": {"SLOPES": (5.0, 60.0)},
     "capstan": {"WRAPS": ((0.5, 0.1), (1.0, 0.3), (1.5, 0.5))},
     "sheets": {"SLIDERS": ("bdf2",)},
     "cusick": {"MESHES": ("irregular",), "STARTS": 2},
 }  # fmt: skip
 """Parameters omitted from cases that repeat others: further meshes, which `plate`, `column` and other shells
-have; the middle slope and friction; wraps between others; integrators, which
-`tests/stepping/test_friction.py` has; and starts.
+have; the middle slope; wraps between others; integrators, which `tests/stepping/test_friction.py` has; and
+starts.
 """
 
 TOGETHER = (
