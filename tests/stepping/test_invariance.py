@@ -1,0 +1,144 @@
+"""A run does not depend on the units of its numbers, on directions in space, or on numbers of vertices."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import finished, shape
+from scipy.spatial.transform import Rotation
+
+import lyra_petsc
+from lyra_petsc.arrays import Array
+
+COLUMNS, ROWS = 6, 4
+STEP, STEPS = 0.005, 6
+
+
+def written(path: Path, start: Array, flat: Array, order: Array) -> dict[str, Any]:
+    """Write a mesh whose vertex ``i`` is ``order[i]`` of the grid, its triangles in another order, too."""
+    corner = np.array([COLUMNS * row + column for row in range(ROWS - 1) for column in range(COLUMNS - 1)])
+    triangles = np.concatenate(
+        [corner[:, None] + [0, 1, 1 + COLUMNS], corner[:, None] + [0, 1 + COLUMNS, COLUMNS]]
+    )
+    if order[0] != 0:
+        triangles = np.roll(triangles[::-1], 1, axis=1)
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in start[order].tolist()]
+    lines += [f"vt {u!r} {v!r}" for u, v in flat[order].tolist()]
+    numbers = np.argsort(order)[triangles] + 1
+    lines += ["f " + " ".join(f"{i}/{i}" for i in each) for each in numbers]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return {"file": str(path)}
+
+
+def end(
+    folder: Path,
+    integrator: str,
+    model: str,
+    *,
+    units: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    turn: Array | None = None,
+    order: Array | None = None,
+) -> tuple[Array, dict[str, float]]:
+    """Positions [m] and energies [J] at the end of a bent sheet that falls on a moving ball, in SI units.
+
+    ``units`` are a metre, a second and a kilogram in those of the scene.
+    """
+    m, s, kg = units
+    rotation = np.eye(3) if turn is None else turn
+    order = np.arange(COLUMNS * ROWS) if order is None else order
+    number = np.argsort(order).tolist()
+    columns, rows = np.meshgrid(np.arange(COLUMNS) / (COLUMNS - 1), 0.6 * np.arange(ROWS) / (ROWS - 1))
+    u, v = columns.ravel(), rows.ravel()
+    start = np.column_stack([0.7 * np.sin(u / 0.7), v, 0.7 * (1.0 - np.cos(u / 0.7))])
+
+    def vector(values: list[float], unit: float) -> list[float]:
+        return (unit * (rotation @ np.array(values))).tolist()
+
+    force, stiffness = kg * m / s**2, kg / s**2
+    motion = [
+        {"time": 0.0},
+        {
+            "time": 0.02 * s,
+            "rotate": {"axis": vector([1.0, 2.0, 3.0], 1.0), "degrees": 5.0},
+            "translate": vector([0.01, 0.0, 0.005], m),
+        },
+    ]
+    bending = 1e-4 * force * m
+    content = {
+        "mesh": written(folder / "sheet.obj", m * start @ rotation.T, m * np.column_stack([u, v]), order),
+        "material": {
+            "density": 0.2 * kg / m**2,
+            "membrane": {
+                c: k * stiffness for c, k in (("c11", 60.0), ("c22", 40.0), ("c12", 15.0), ("c33", 12.0))
+            },
+            "bending_model": model,
+            "bending": [bending, 0.7 * bending, 0.4 * bending]
+            if model == "hinge"
+            else {"d11": bending, "d22": 0.5 * bending, "d12": 0.1 * bending, "d33": 0.3 * bending},
+            "warp_degrees": 25.0,
+            "damping": 0.01 * s,
+            "rest_curvature": [1.0 / m, -0.5 / m, 0.3 / m],
+        },
+        "gravity": vector([1.0, 0.5, -9.0], m / s**2),
+        "wind": {
+            "velocity": vector([1.0, 2.0, 3.0], m / s),
+            "density": 1.2 * kg / m**3,
+            "drag": 0.3 * kg / (m**2 * s),
+        },
+        "handles": [
+            {"nodes": [number[COLUMNS * row] for row in range(ROWS)], "motion": "pull"},
+            {"nodes": [number[-1]], "stiffness": 5.0 * stiffness},
+        ],
+        "loads": [
+            {"pressure": 2.0 * force / m**2},
+            {"nodes": [number[8]], "force": vector([0.0, 0.02, 0.03], force)},
+        ],
+        "motions": {"pull": motion},
+        "contact": {"friction": {"static": 0.5, "kinetic": 0.3}},
+        "obstacles": {
+            "ball": {"sphere": {"center": vector([0.45, 0.3, -0.22], m), "radius": 0.3 * m}, "motion": "pull"}
+        },
+        "initial": {
+            "velocity": vector([0.1, 0.0, -0.5], m / s),
+            "angular_velocity": vector([1.0, 0.0, 2.0], 1.0 / s),
+        },
+        "time": {"end": STEPS * STEP * s, "step": STEP * s, "integrator": integrator},
+        "output": {"every": STEPS * STEP * s},
+        "solver": {"force_tolerance": 1e-10, "step_tolerance": 1e-10},
+        "petsc": {"ksp_rtol": 1e-12},
+    }
+    with finished(MPI.COMM_WORLD, lyra_petsc.load(content)) as simulation:
+        budget = asdict(simulation.budget)
+        energies = {name: value / (force * m) for name, value in (budget | budget.pop("more")).items()}
+        return shape(simulation)[number] @ rotation / m, energies
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize(
+    ("integrator", "model"),
+    [
+        ("beuler", "hinge"),
+        ("semi-implicit", "midedge"),
+        ("midpoint", "hinge"),
+        ("bdf2", "midedge"),
+        ("alpha2", "midedge"),
+    ],
+)
+def test_units_directions_and_numbers_do_not_matter(integrator: str, model: str, tmp_path: Path) -> None:
+    positions, energies = end(tmp_path, integrator, model)
+    assert energies["contact_energy"] > 0.0
+    shuffled = np.random.default_rng(3).permutation(COLUMNS * ROWS)
+    others = (
+        {"units": (8.0, 0.25, 64.0)},
+        {"turn": Rotation.from_euler("xyz", [0.3, 1.1, 2.5]).as_matrix()},
+        {"order": shuffled},
+    )
+    for other in others:
+        found, of_found = end(tmp_path, integrator, model, **other)
+        np.testing.assert_allclose(found, positions, rtol=0.0, atol=1e-9)
+        assert of_found == pytest.approx(energies, rel=1e-8, abs=1e-12)
