@@ -155,7 +155,7 @@ def test_stiffly_damped_sheets_start_with_a_step_of_backward_euler(integrator: s
     }
     ends, rejected = [], []
     for step in (0.01, 0.005, 0.0025, 0.0003125):
-        one = simulation(comm, integrator, content, 0.16, step)
+        one = simulation(comm, integrator, content, 0.08, step)
         run(one)
         ends.append(shape(one))
         rejected.append(one.totals["rejected"])

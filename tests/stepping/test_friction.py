@@ -152,6 +152,7 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
     assert ratios[1] > 0.05
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
     comm: MPI.Comm, integrator: str
@@ -327,6 +328,7 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     assert np.abs(crept).max() < 1e-6
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
 def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, integrator: str) -> None:
     """A sheet falls on it and slides until it has its speed, whatever the normal force is meanwhile."""
