@@ -178,6 +178,18 @@ def test_rounding_does_not_decide_which_sliding_pair_is_continued() -> None:
     assert place[0] == 0
 
 
+def test_a_vertex_of_a_sheet_does_not_continue_the_contact_of_an_obstacles_vertex() -> None:
+    """Of which the first number is that of any vertex of the triangle."""
+    keys = np.zeros((2, 10), dtype=np.int64)
+    keys[:, :4], keys[:, 4] = [[7, 7, 7, 7], [7, 7, 1, 2]], VERTEX_TRIANGLE
+    keys[0, 7:], keys[1, 6] = (-4, -5, -6), -4
+    data, place = np.zeros((1, COLUMNS)), np.empty(1, dtype=np.int64)
+    data[0, SLIP] = 1e-5
+    for old in (0, 1):
+        friction_pairs.match_pairs(keys[[1 - old]], keys[[old]], data, place)
+        assert place[0] == -1
+
+
 def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, Pairs]:
     """Points (4 N, 3) and pairs of a vertex and a triangle, or of two edges, some nearest at a corner."""
     points, kind = random.normal(size=(N, 4, 3)), np.where(np.arange(N) < N // 2, VERTEX_TRIANGLE, EDGE_EDGE)

@@ -417,7 +417,7 @@ def _similarity(keys, a, old, b):  # type: ignore[no-untyped-def]
     common.
     """
     first, second = keys[a], old[b]
-    if first[4] != second[4] or first[5] != second[5]:
+    if first[4] != second[4] or first[5] != second[5] or first[6] != second[6]:
         return -1
     if first[4] != VERTEX_TRIANGLE or first[6] != 0:
         for k in range(10):
