@@ -132,6 +132,8 @@ class SteppedScene:
         Static analysis: entries of summary.json on the last equilibrium.
     failure : Failure or None
         Why the last step could not be taken.
+    last_integrator : Integrator
+        The one that took the last step: the scene's, or one in its place.
     notes : list of str
         Messages to the user: mesh repairs, changed linear solver, …
     earlier_notes : int
