@@ -68,11 +68,16 @@ def direct_solver(comm: MPI.Comm) -> dict[str, str]:
 
 
 def obj_file(
-    path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]
+    path: Path,
+    vertices: Iterable[Sequence[float]],
+    triangles: Iterable[Sequence[int]],
+    uv: Iterable[Sequence[float]] = (),
 ) -> dict[str, Any]:
-    """Write an .obj without ``vt``, so that the surface itself is the rest shape; returns its mesh block."""
+    """Write an .obj whose rest shape is the surface itself, or ``uv`` (V, 2) [m]; returns its mesh block."""
     rows = [f"v {float(x)!r} {float(y)!r} {float(z)!r}" for x, y, z in vertices]
-    rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]
+    flat = [f"vt {float(u)!r} {float(v)!r}" for u, v in uv]
+    corner = "{0}/{0}" if flat else "{0}"
+    rows += flat + ["f " + " ".join(corner.format(i + 1) for i in each) for each in triangles]
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
     return {"file": str(path)}
 

@@ -4,35 +4,20 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import finished, shape
+from physics import finished, obj_file, shape
 from scipy.spatial.transform import Rotation
 
 import lyra_petsc
 from lyra_petsc.arrays import Array
+from lyra_petsc.experiments.meshes import rectangle
 
-COLUMNS, ROWS = 6, 4
+CELLS = 5, 3
+VERTICES = 24
 STEP, STEPS = 0.005, 6
-
-
-def written(path: Path, start: Array, flat: Array, order: Array) -> dict[str, Any]:
-    """Write a mesh whose vertex ``i`` is ``order[i]`` of the grid, its triangles in another order, too."""
-    corner = np.array([COLUMNS * row + column for row in range(ROWS - 1) for column in range(COLUMNS - 1)])
-    triangles = np.concatenate(
-        [corner[:, None] + [0, 1, 1 + COLUMNS], corner[:, None] + [0, 1 + COLUMNS, COLUMNS]]
-    )
-    if order[0] != 0:
-        triangles = np.roll(triangles[::-1], 1, axis=1)
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in start[order].tolist()]
-    lines += [f"vt {u!r} {v!r}" for u, v in flat[order].tolist()]
-    numbers = np.argsort(order)[triangles] + 1
-    lines += ["f " + " ".join(f"{i}/{i}" for i in each) for each in numbers]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return {"file": str(path)}
 
 
 def end(
@@ -46,15 +31,20 @@ def end(
 ) -> tuple[Array, dict[str, float]]:
     """Positions [m] and energies [J] at the end of a bent sheet that falls on a moving ball, in SI units.
 
-    ``units`` are a metre, a second and a kilogram in those of the scene.
+    ``units`` are a metre, a second and a kilogram in those of the scene; ``order`` are the numbers in a grid
+    of the vertices of the mesh, whose triangles are then in another order, too.
     """
     m, s, kg = units
     rotation = np.eye(3) if turn is None else turn
-    order = np.arange(COLUMNS * ROWS) if order is None else order
-    number = np.argsort(order).tolist()
-    columns, rows = np.meshgrid(np.arange(COLUMNS) / (COLUMNS - 1), 0.6 * np.arange(ROWS) / (ROWS - 1))
-    u, v = columns.ravel(), rows.ravel()
+    flat, triangles = rectangle(*CELLS, 1.0, 0.6)
+    if order is None:
+        order = np.arange(VERTICES)
+    else:
+        triangles = np.roll(triangles[::-1], 1, axis=1)
+    number = np.argsort(order)
+    u, v, _ = flat.T
     start = np.column_stack([0.7 * np.sin(u / 0.7), v, 0.7 * (1.0 - np.cos(u / 0.7))])
+    left, corner, inside = number[u == 0.0].tolist(), int(number[-1]), int(number[8])
 
     def vector(values: list[float], unit: float) -> list[float]:
         return (unit * (rotation @ np.array(values))).tolist()
@@ -70,7 +60,9 @@ def end(
     ]
     bending = 1e-4 * force * m
     content = {
-        "mesh": written(folder / "sheet.obj", m * start @ rotation.T, m * np.column_stack([u, v]), order),
+        "mesh": obj_file(
+            folder / "sheet.obj", (m * start @ rotation.T)[order], number[triangles], m * flat[order, :2]
+        ),
         "material": {
             "density": 0.2 * kg / m**2,
             "membrane": {
@@ -91,12 +83,12 @@ def end(
             "drag": 0.3 * kg / (m**2 * s),
         },
         "handles": [
-            {"nodes": [number[COLUMNS * row] for row in range(ROWS)], "motion": "pull"},
-            {"nodes": [number[-1]], "stiffness": 5.0 * stiffness},
+            {"nodes": left, "motion": "pull"},
+            {"nodes": [corner], "stiffness": 5.0 * stiffness},
         ],
         "loads": [
             {"pressure": 2.0 * force / m**2},
-            {"nodes": [number[8]], "force": vector([0.0, 0.02, 0.03], force)},
+            {"nodes": [inside], "force": vector([0.0, 0.02, 0.03], force)},
         ],
         "motions": {"pull": motion},
         "contact": {"friction": {"static": 0.5, "kinetic": 0.3}},
@@ -132,7 +124,7 @@ def end(
 def test_units_directions_and_numbers_do_not_matter(integrator: str, model: str, tmp_path: Path) -> None:
     positions, energies = end(tmp_path, integrator, model)
     assert energies["contact_energy"] > 0.0
-    shuffled = np.random.default_rng(3).permutation(COLUMNS * ROWS)
+    shuffled = np.random.default_rng(3).permutation(VERTICES)
     others = (
         {"units": (8.0, 0.25, 64.0)},
         {"turn": Rotation.from_euler("xyz", [0.3, 1.1, 2.5]).as_matrix()},

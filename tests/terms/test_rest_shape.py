@@ -10,6 +10,7 @@ from examples import BENDING, curved_sheet
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid, obj_file
 
+from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.terms.bending.hinge import Bending
 
 
@@ -61,13 +62,9 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
 
 def test_rest_curvature_does_not_depend_on_the_numbering(tmp_path: Path) -> None:
     # a curved rest shape: the material axes of neighbours differ
-    random = np.random.default_rng(4)
-    columns, rows = np.meshgrid(np.arange(5), np.arange(4))
-    flat = np.column_stack([columns.ravel(), rows.ravel()]) / 4.0
-    vertices = np.column_stack([flat, 0.1 * np.sin(5.0 * flat[:, 0]) * np.cos(3.0 * flat[:, 1])])
-    corner = np.array([5 * row + column for row in range(3) for column in range(4)])
-    triangles = np.concatenate([corner[:, None] + [0, 1, 6], corner[:, None] + [0, 6, 5]])
-    order = random.permutation(len(vertices))
+    vertices, triangles = rectangle(4, 3, 1.0, 0.75)
+    vertices[:, 2] = 0.1 * np.sin(5.0 * vertices[:, 0]) * np.cos(3.0 * vertices[:, 1])
+    order = np.random.default_rng(4).permutation(len(vertices))
     found = []
     for name, numbers in (("as it is", np.arange(len(vertices))), ("permuted", order)):
         mesh = obj_file(

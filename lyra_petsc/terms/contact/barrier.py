@@ -123,15 +123,14 @@ class ObstaclePositions(NamedTuple):
     ----------
     start, stage, end : (m, 3)
         Points of all obstacles [m], and normals of planes, at the start, the stage and the end of the step.
-    stage_motions, end_motions : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle from the start to the stage, and to the end.
+    stage_motions : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle from the start to the stage.
     """
 
     start: Array
     stage: Array
     end: Array
     stage_motions: list[tuple[Array, Array]]
-    end_motions: list[tuple[Array, Array]]
 
 
 class ActivePairs(NamedTuple):
@@ -372,7 +371,8 @@ class ContactBarrier(Elastic):
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
         self._obstacle_x = self._next_obstacle_x = np.stack([self.obstacles.positions(0.0)] * 3)
-        self._at_rest = ObstaclePositions(*self._obstacle_x, *[self.obstacles.rigid_motions(0.0, 0.0)] * 2)
+        start, stage, end = self._obstacle_x
+        self._at_rest = ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(0.0, 0.0))
         self.stale = False
         self._deviations, self._obstacle_boxes = np.zeros(1), None
 
@@ -424,8 +424,8 @@ class ContactBarrier(Elastic):
         self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         self._deviations = self.obstacles.path_deviations(step.start, step.end)
         start, stage, end = self._next_obstacle_x
-        motions = (self.obstacles.rigid_motions(step.start, time) for time in times[1:])
-        return ObstaclePositions(start, stage, end, *motions)
+        motions = self.obstacles.rigid_motions(step.start, step.target_time)
+        return ObstaclePositions(start, stage, end, motions)
 
     @property
     def moving(self) -> bool:
