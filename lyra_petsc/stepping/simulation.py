@@ -282,7 +282,7 @@ class SteppedScene:
         self._failed_attempts = []
         system.integrator = self._scene_integrator
         starts = False
-        if not self._scene_integrator.iterates and system.has_friction_pairs:
+        if not self._scene_integrator.iterates and system.touches:
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
@@ -298,13 +298,16 @@ class SteppedScene:
                 if not self._switch_at_crossing(attempt, end - self.time):
                     self._recover_from_failure(attempt, end)
             else:
-                accurate = self._is_accurate(v_before[:n], end - self.time)
+                solved = system.integrator.iterates or not system.touches
+                accurate = solved and self._is_accurate(v_before[:n], end - self.time)
                 if accurate and self._conserves_energy(x_before, v_before, end):
                     break
                 system.state.set(x_before[:n], v_before[:n])
                 system.integrator.restore(*past)
                 self.stepper.start(self.time, self.step_number)
-                if accurate:
+                if not solved:
+                    system.integrator = LaggedBackwardEuler()
+                elif accurate:
                     self.estimated_error = past_error
                     if self.local_error is not None and past_slope is not None:
                         self.local_error.restore(*past_slope)
@@ -451,6 +454,9 @@ class SteppedScene:
         """
         system, usual = self.problem.system, self._scene_integrator
         if system.integrator is usual and attempt.message.startswith(WOULD_CROSS):
+            if not usual.iterates:
+                system.integrator = LaggedBackwardEuler()
+                return True
             stage_at_end = system.stage.offset == system.dt
             unresolved = dt > UNRESOLVED_SKINS * self._time_through_skin()
             if stage_at_end or self.scene.time.adaptive or not unresolved:

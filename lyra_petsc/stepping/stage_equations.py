@@ -917,6 +917,19 @@ class StageEquations:
         return any(self.points.global_max(sum(term.n_friction_pairs for term in self.active.changing)))
 
     @property
+    def touches(self) -> bool:
+        """Whether anything touches at the positions last evaluated: the forces of contact and friction change
+        too abruptly for one linear solve.
+
+        Collective.
+        """
+        if not self.discretisation.has_near_elements:
+            return False
+        x, frozen = self._xs, self.active.frozen
+        acting = (term.active_elements(x, frozen.get(term)).any() for term in self.active.changing)
+        return any(self.points.global_max(any(acting)))
+
+    @property
     def may_impact(self) -> bool:
         """Whether parts are near each other, and vertices move by a notable part of the gap in the step;
         collective.

@@ -191,9 +191,13 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
     assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=0.1)
 
 
-@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
-def test_a_sheet_at_rest_on_an_accelerating_floor_is_not_damped(comm: MPI.Comm, integrator: str) -> None:
-    """Its velocity at the end of a step differs from the mean velocity of the floor in the step."""
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
+def test_a_sheet_at_rest_on_an_accelerating_floor_is_pressed_but_not_damped(
+    comm: MPI.Comm, integrator: str
+) -> None:
+    """Its velocity at the end of a step differs from the mean velocity of the floor in the step, and its place
+    at the stage from that of the floor on its curved path.
+    """
     acceleration, gravity, end = 5.0, 9.81, 0.5
     up = {"time": end, "velocity": [0.0, 0.0, acceleration * end]}
     up["translate"] = [0.0, 0.0, 0.5 * acceleration * end**2]
@@ -212,7 +216,37 @@ def test_a_sheet_at_rest_on_an_accelerating_floor_is_not_damped(comm: MPI.Comm, 
     while not simulation.finished:
         simulation.step()
     budget, (mass,) = simulation.budget, system.points.global_sum(float(system.mass.sum()))
+    force = -float(simulation.energy_balance.obstacle_forces(1)[0, 2])
     simulation.destroy()
+    assert force == pytest.approx(mass * (gravity + acceleration), rel=1e-3)
     work = mass * (gravity + acceleration) * 0.5 * acceleration * end**2
     assert budget.external_work == pytest.approx(work, rel=1e-3)
     assert abs(budget.dissipation) < 1e-3 * work
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize("speed", [1.0, 10.0])
+@pytest.mark.parametrize("floor_moves", [False, True])
+def test_steps_of_semi_implicit_in_contact_are_those_of_backward_euler(
+    comm: MPI.Comm, speed: float, floor_moves: bool
+) -> None:
+    """One linear solve with the forces where a step starts would press the sheet far into the gap."""
+    forces = []
+    for integrator in ("semi-implicit", "beuler"):
+        content = impact(integrator, 0.01, floor_moves=False)
+        content["contact"]["gap"] = 0.002
+        if floor_moves:
+            content["obstacles"]["floor"]["motion"] = [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, speed]}]
+            content["obstacles"]["floor"]["interpolation"] = "linear"
+        else:
+            content["initial"]["velocity"] = [0.0, 0.0, -speed]
+        simulation = SteppedScene(comm, scene_of(content))
+        forces.append([])
+        while not simulation.finished:
+            simulation.step()
+            forces[-1].append(float(simulation.energy_balance.obstacle_forces(1)[0, 2]))
+        simulation.destroy()
+    once, iterated = np.array(forces)
+    largest = np.abs(iterated).max()
+    assert largest > 0.0
+    np.testing.assert_allclose(once, iterated, atol=1e-3 * largest)

@@ -248,7 +248,7 @@ class CoulombFriction(Elastic):
         elif step.target_time < step.end:
             stage_motions = obstacles.rigid_motions(start, step.target_time)
         end_points = obstacles.positions(step.end)
-        stage_points = obstacles.positions(step.target_time) if obstacles.moving else end_points
+        stage_points, _ = obstacles.stage_positions(step.start, step.target_time, step.end)
         return ObstacleMotion(step.end, fraction, stage_motions, end_motions, stage_points, end_points)
 
     def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:
