@@ -195,8 +195,8 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
 def test_a_sheet_at_rest_on_an_accelerating_floor_is_pressed_but_not_damped(
     comm: MPI.Comm, integrator: str
 ) -> None:
-    """Its velocity at the end of a step differs from the mean velocity of the floor in the step, and its place
-    at the stage from that of the floor on its curved path.
+    """Its velocity at the end of a step differs from the floor's mean velocity, its place at the stage from
+    that of the floor on its curved path.
     """
     acceleration, gravity, end = 5.0, 9.81, 0.5
     up = {"time": end, "velocity": [0.0, 0.0, acceleration * end]}
@@ -236,8 +236,8 @@ def test_steps_of_semi_implicit_in_contact_are_those_of_backward_euler(
         content = impact(integrator, 0.01, floor_moves=False)
         content["contact"]["gap"] = 0.002
         if floor_moves:
-            content["obstacles"]["floor"]["motion"] = [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, speed]}]
-            content["obstacles"]["floor"]["interpolation"] = "linear"
+            rises = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, speed]}]
+            content["obstacles"]["floor"] |= {"motion": rises, "interpolation": "linear"}
         else:
             content["initial"]["velocity"] = [0.0, 0.0, -speed]
         simulation = SteppedScene(comm, scene_of(content))

@@ -446,7 +446,7 @@ class ContactBarrier(Elastic):
         self._deviations = self.obstacles.path_deviations(step.start, step.end)
         motions = self.obstacles.rigid_motions(step.start, step.target_time)
         motions = [(rotation, t + more) for (rotation, t), more in zip(motions, moved, strict=True)]
-        return ObstaclePositions(*self._next_obstacle_x, motions)
+        return ObstaclePositions(start, stage, end, motions)
 
     @property
     def moving(self) -> bool:
