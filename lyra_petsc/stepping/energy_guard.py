@@ -85,6 +85,8 @@ class GuardState:
         Gains of the last steps, the newest last, after `_append_gain`.
     repeated : int
         Number of rejected attempts.
+    noise : float
+        Sum of the round-off of the gains.
     """
 
     start: float | None = None
@@ -98,6 +100,7 @@ class GuardState:
     bracket: float = 0.0
     recent: list[float] = field(default_factory=list)
     repeated: int = 0
+    noise: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,8 @@ class EnergyGuard:
         work += self._handle_work(x0, x1, moved, works)
         targets = self._target_energies(x0, x1)
         largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        stiff = self._stiffness_sum * largest**2
+        # rounded positions at both ends of a step differ in energy, and in velocity
+        stiff = (self._stiffness_sum + float(system.mass.sum()) / system.dt**2) * largest**2
         local = (*driven, change, work, *targets, works.target_energy, stiff, extra_heat)
         sums = [float(value) for value in layout.global_sum(*local)]
         driven0, driven1, change, work, elastic, by_targets, *springs, moving, stiff, extra_heat = sums
@@ -314,7 +318,7 @@ class EnergyGuard:
         max_gain, max_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
         accepted = of_step <= max(max_gain * new.scale, step.noise)
         # repeating a step without a gain would not reduce the sum
-        accepted &= of_steps <= max(max_sum * new.scale, step.noise) or new.recent[-1] <= 0.0
+        accepted &= of_steps <= max(max_sum * new.scale, new.noise) or new.recent[-1] <= 0.0
         accepted = bool(self._system.points.comm.bcast(accepted, root=0))
         if accepted:
             self.gains, self._pull = new, self._next_pull
@@ -351,6 +355,7 @@ class EnergyGuard:
             bracket=old.bracket + step.bracket,
             recent=_append_gain(old.recent, judged, self._system.integrator.gain_window)[-RECENT:],
             repeated=old.repeated,
+            noise=old.noise + step.noise,
         )
 
     # -- messages ----------------------------------------------------------------------------------

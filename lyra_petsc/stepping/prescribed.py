@@ -107,9 +107,15 @@ class Prescribed:
         self.velocity = (self.goal - x_h.take(self.indices)) / c
 
     def set_motion_at(self, time: float, x_h: Array, c: float) -> None:
-        """Set velocities to those of handles at ``time`` [s], and x_h (n_owned, 3) to fit their positions."""
+        """Set velocities to those of handles at ``time`` [s], and x_h (n_owned, 3) to fit positions on the
+        straight line between both ends of the step, as those of free vertices.
+
+        A handle on its curved path would stretch the elements beside it.
+        """
         self.velocity = self._rates(time)
-        self.overwrite(x_h, self._positions(time) - c * self.velocity)
+        start, (t0, t1) = self._x[: len(x_h)].take(self.indices), self._span
+        line = start + (time - t0) / (t1 - t0) * (self.goal - start)
+        self.overwrite(x_h, line - c * self.velocity)
 
     def overwrite(self, values: Array, prescribed: Array) -> None:
         """Overwrite the prescribed unknowns of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""

@@ -101,6 +101,7 @@ class Neighbour:
     problem: Problem
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
+    pull: Array | None = None
     integrator: Integrator = field(init=False)
 
     def __post_init__(self) -> None:
@@ -325,6 +326,7 @@ class Sensitivities:
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()
             system.jacobian(start, 1.0, each.jacobian)
+            each.pull = system.handle_pull
 
     def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
         """Set the frames of a neighbour's directors.
@@ -366,6 +368,8 @@ class Sensitivities:
             start = np.zeros_like(v)
             system.prescribe(start)
             system.residual(start, system.stage.sigma * (start - system.history), out)
+            if each.pull is not None:
+                out += each.pull
             return out + _product(system, each.jacobian, v - start)
 
         return self._free(_difference(neighbours, delta, residual))

@@ -124,9 +124,12 @@ class StageEquations:
         Whether the integrator began the step from accelerations computed at its start.
     refused_displacement : RefusedDisplacement or None
         The displacement of the present step that was found to collide.
+    handle_pull : (n_owned, 3) or None
+        Change [N] of F, to first order, as handles move in a step of one linear solve; set by `jacobian`.
     """
 
     refused_displacement: RefusedDisplacement | None = None
+    handle_pull: Array | None = None
     has_active_pairs = starts_anew = False
     _frozen_before: Mapping[Term, Any] | None = None
     _start_velocity: Array | None = None  # found by `find_start`
@@ -815,7 +818,11 @@ class StageEquations:
 
     def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
-        rate = self.stage.sigma * (self._vs[: self.points.n_owned] - self.history)
+        n, at = self.points.n_owned, self.prescribed.indices
+        rate = self.stage.sigma * (self._vs[:n] - self.history)
+        if self.stage.offset < self.dt and len(at):  # handles do not have the integrator's accelerations
+            mean = (self.v[:n].take(at) - self.history.take(at)) / self.dt
+            self.prescribed.overwrite(rate, mean)
         return self._parts(self._xs, self._vs, rate)
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> Iterator[tuple[str, Array]]:
@@ -861,9 +868,22 @@ class StageEquations:
             del part
         return out
 
+    def _linearised_at(self, v: Array) -> Array:
+        """Velocities (n_owned, 3) at which F and its Jacobian are evaluated for v.
+
+        One linear solve takes them where the step starts, also if handles move: elements at a handle would be
+        stretched by its whole motion.
+        """
+        return np.zeros_like(v) if self._from_start else v
+
+    @property
+    def _from_start(self) -> bool:
+        """Whether F is linear in v, from the positions where the step starts."""
+        return not (self.integrator.iterates or self._solving_edges)
+
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """Write F (n_owned, 3) [N] to ``out``, in rows of prescribed unknowns σ m (v − v*); collective."""
-        self._total(*self.evaluate_at(v), vdot, out)
+        self._total(*self.evaluate_at(self._linearised_at(v)), vdot, out)
         at, velocity = self.prescribed.indices, self.prescribed.velocity
         self.prescribed.overwrite(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
@@ -998,7 +1018,7 @@ class StageEquations:
 
         ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one.
         """
-        x, vs = self.evaluate_at(v)
+        x, vs = self.evaluate_at(self._linearised_at(v))
         # may have other ghosts than x, but of contact only: those of fixed stencils are the first
         rows, predicted = self.discretisation.rows, self._predicted
         lagged = self.integrator.lagged_loads
@@ -1019,5 +1039,22 @@ class StageEquations:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
         if self.applied.following is not None and blend < 1.0:
             self.applied.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
+        self.handle_pull = self._pull_of_handles(values) if self._from_start else None
         if len(changing):
             rows.constrain(values, self.prescribed.mask, constrained)
+
+    def _pull_of_handles(self, values: Array) -> Array | None:
+        """Change (n_owned, 3) [N] of F, 0 in prescribed rows, as prescribed unknowns move in the step.
+
+        It is the product with their columns of ``values``, before these are decoupled; None if none moves;
+        collective.
+        """
+        if not self.held:
+            return None
+        n, prescribed = self.points.n_owned, self.prescribed
+        increment = np.zeros((self.points.n_local, 3))
+        prescribed.overwrite(increment[:n], prescribed.velocity)
+        if not any(self.points.global_max(bool(increment.any()))):
+            return None
+        self.points.update_ghosts(increment)
+        return np.where(prescribed.free, self.discretisation.rows.product(values, increment), 0.0)

@@ -80,6 +80,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
         help="of simulated time before those are measured (1)",
     )
     add("--scenes", nargs="+", default=[], metavar="WORD", help="those of contact with a word in their names")
+    add("--gap", type=float, metavar="M", help="contact gap over the ball (a quarter of a mesh edge)")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
     add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
@@ -219,7 +220,7 @@ class Bench:
                 given = kind, n, method, ranks, petsc, folder, limits, asked.against
                 self._measure("against", what, measures.against, *given)
         for n, ranks in each(asked.vertices, asked.ranks) if asked.contact else ():
-            given = n, ranks, petsc, limits, asked.settle, asked.scenes
+            given = n, ranks, petsc, limits, asked.settle, asked.scenes, asked.gap
             self._measure("contact", f"{n} vertices in contact, {ranks} rank(s)", measures.contact, *given)
 
     def _scaling(self) -> None:

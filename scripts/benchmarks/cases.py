@@ -113,12 +113,13 @@ SHEETS = 5
 """Number of sheets in the stack."""
 
 
-def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
+def in_contact(vertices: int, ball_gap: float | None = None) -> dict[str, dict[str, Any]]:
     """Scenes by name, each with about ``vertices`` vertices in total.
 
     A sheet held at an edge that swings, without contact and with contact but nothing near (also with
-    ``semi-implicit`` steps); a sheet that falls over a ball; several sheets that swing, and as many in a
-    stack on a plane, with aligned and with shifted vertices; the latter also a thousand times stiffer.
+    ``semi-implicit`` steps); a sheet that falls over a ball, with ``ball_gap`` [m] if given; several sheets
+    that swing, and as many in a stack on a plane, with aligned and with shifted vertices; the latter also a
+    thousand times stiffer.
     """
 
     def sheets(number: int, distance: float, shift: float = 0.0) -> list[dict[str, Any]]:
@@ -138,14 +139,16 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     gap = 0.2 / cells_of(vertices // SHEETS)
     one, several, shifted = sheets(1, 0.0), sheets(SHEETS, gap), {"mesh": sheets(SHEETS, gap, 1.55 * gap)}
     far = {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}}
-    alone, near = {"mesh": one}, {"mesh": one, "contact": {"friction": 0.4}}
+    alone: dict[str, Any] = {"mesh": one}
+    near = alone | {"contact": {"friction": 0.4}}
     once = held | {"time": common["time"] | {"integrator": "semi-implicit"}}
+    closer = {} if ball_gap is None else {"contact": near["contact"] | {"gap": ball_gap}}
     scenes = {
         "swings, semi-implicit": common | once | alone,
         "swings, semi-implicit, nothing near": common | once | near | {"obstacles": far},
         "swings": common | held | alone,
         "swings, nothing near": common | held | near | {"obstacles": far},
-        "over a ball": common | free | ball | near,
+        "over a ball": common | free | ball | near | closer,
     }
     for factor in (1.0, 1000.0):
         stiffer = common | {"material": common["material"] | {"stretching_scale": factor}, "mesh": several}

@@ -140,15 +140,21 @@ def against(
 
 
 def contact(
-    vertices: int, ranks: int, petsc: Sequence[str], limits: Limits, settle: float, only: Sequence[str]
+    vertices: int,
+    ranks: int,
+    petsc: Sequence[str],
+    limits: Limits,
+    settle: float,
+    only: Sequence[str],
+    ball_gap: float | None = None,
 ) -> Result:
     """Measure steps of sheets in contact and of swinging sheets, by turns, after ``settle`` simulated
     seconds.
 
-    With words ``only``, those scenes whose names contain one of them.
+    With words ``only``, those scenes whose names contain one of them; over a ball with ``ball_gap`` [m].
     """
     few = {"warm_up": max(WARM_UP, round(settle / STEP)), "steps": limits.steps, "seconds": math.inf}
-    scenes = in_contact(vertices)
+    scenes = in_contact(vertices, ball_gap)
     scenes = {name: scenes[name] for name in scenes if not only or any(word in name for word in only)}
     found = measure("meshes", ranks, petsc, 100 * limits.process, scenes=scenes, **few)
     return found | {"ranks": ranks}

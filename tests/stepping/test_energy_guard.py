@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import grid, scene_of, shape
+from physics import CLOTH, finished, grid, scene_of, shape
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.energy_guard import Balance, GuardState, _append_gain
@@ -100,6 +100,20 @@ def test_heat_of_rotating_parts_is_second_order(integrator: str) -> None:
         one.destroy()
     assert max(wrong) < 1e-3
     assert abs(wrong[1]) < abs(wrong[0]) / 3.0
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
+def test_round_off_of_a_sheet_at_rest_is_no_gain(integrator: str) -> None:
+    content = {
+        "mesh": grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [1.0, 0.0, 0.0]}},
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.02},
+        "gravity": [0, 0, 0],
+        "handles": [{"group": "left", "motion": "turn"}],
+        "motions": {"turn": [{"time": time, "rotate": {"axis": [0, 0, 1], "degrees": 0}} for time in (0, 1)]},
+        "time": {"end": 0.1, "step": 0.0025, "integrator": integrator},
+    }
+    with finished(MPI.COMM_SELF, content) as simulation:
+        assert simulation.totals["rejected"] == 0
 
 
 def test_a_gain_that_compensates_a_loss_leaves_the_recent_sum_with_it() -> None:

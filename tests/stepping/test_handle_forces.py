@@ -45,6 +45,30 @@ def test_handle_forces_carry_the_weight(stiffness: float | None, comm: MPI.Comm)
     np.testing.assert_allclose(forces, handle_sums(MPI.COMM_SELF, handles), rtol=0, atol=1e-6 * WEIGHT)
 
 
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"])
+def test_a_handle_that_accelerates_pulls_with_mass_times_acceleration(
+    integrator: str, comm: MPI.Comm
+) -> None:
+    acceleration, end = 5.0, 0.4
+    there = {"translate": [0.5 * acceleration * end**2, 0, 0], "velocity": [acceleration * end, 0, 0]}
+    scene = {
+        "material": CLOTH | {"damping": 0.02},
+        "gravity": [0, 0, 0],
+        "handles": [{"group": "right", "motion": "away"}],
+        "motions": {"away": [{"time": 0}, {"time": end} | there]},
+        "time": {"end": 0.39, "step": 0.01, "integrator": integrator},
+    }
+    with done(comm, **scene) as simulation:
+        mass = WEIGHT / 9.81
+        force = simulation.energy_balance.handle_forces(1)[0]
+        np.testing.assert_allclose(
+            force, [mass * acceleration, 0, 0], rtol=0, atol=2e-3 * mass * acceleration
+        )
+        assert simulation.budget.external_work == pytest.approx(
+            0.5 * mass * (acceleration * 0.39) ** 2, rel=2e-3
+        )
+
+
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2"])
 def test_energy_of_a_turning_clamp_uses_targets_of_the_same_time(integrator: str, comm: MPI.Comm) -> None:
     """Energies of a state use the targets at its time, not those at the time of the stage."""

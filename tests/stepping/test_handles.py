@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -77,6 +78,26 @@ def test_half_of_a_rotation_is_half_the_angle(degrees: float, kind: str) -> None
         np.testing.assert_allclose(motion.moved(points, 0.0, t), expected, atol=1e-13)
     middle = motion.moved(points, 0.0, 0.7)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), np.linalg.norm(points, axis=1), rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("degrees", [(0, 50, -90), (0, 500, 300)])
+def test_velocity_is_the_derivative(degrees: tuple[float, ...], kind: str) -> None:
+    rows = [
+        {"time": i, "rotate": turn(angle, [1, 2, -1]), "scale": [1 + i, 1, 1], "translate": [0, 2 * i * i, 1]}
+        for i, angle in enumerate(degrees)
+    ]
+    motion, points, h = Motion(keyframes(*rows), kind), np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.5]]), 1e-5
+    for time in (-0.5, 0.3, 0.8, 1.6, 2.5):
+        change = motion.moved(points, 0.2, time + h) - motion.moved(points, 0.2, time - h)
+        np.testing.assert_allclose(motion.velocity(points, 0.2, time), change / (2 * h), rtol=0, atol=1e-6)
+
+
+def test_velocity_has_no_more_round_off_than_positions() -> None:
+    motion = Motion(keyframes({"time": 0}, {"time": 1, "rotate": turn(1e-6)}), "linear")
+    at = np.array([[1e3, 0.0, 0.0]])
+    expected = math.radians(1e-6) * 1e3
+    assert np.linalg.norm(motion.velocity(at, 0.0, 0.4)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_keyframe_scales_then_rotates_then_translates() -> None:

@@ -25,12 +25,15 @@ SCENE: dict[str, Any] = {
 }
 SPRINGS = {"handles": [{"nodes": [0, 2], "stiffness": 1000.0}]}
 HELD = {"handles": [{"nodes": [0, 2]}, {"nodes": [6], "axes": ["z"]}]}
+AWAY = {"translate": [2.0, 1.0, -1.0], "rotate": {"axis": [1, 2, 3], "degrees": 100}}
+MOVING = {"handles": [{"nodes": [0, 2], "motion": "away"}, HELD["handles"][1]]}
+MOVING |= {"motions": {"away": [{"time": 0.0}, {"time": 1.0} | AWAY]}}  # type: ignore[dict-item]
 
 
-def paper_step(system: StageEquations, dt: float) -> Array:
-    """Velocity (V, 3) after a step: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n)."""
+def paper_step(system: StageEquations, time: float, dt: float) -> Array:
+    """Velocity (V, 3) after a step from ``time``: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n)."""
     x, v_old = system.x, system.v
-    system.begin_step(0.0, dt)
+    system.begin_step(time, time + dt)
     mass = np.repeat(system.mass, 3)
     a, force = np.diag(mass), np.zeros_like(x)
     for term in system.active.elastic:
@@ -40,22 +43,23 @@ def paper_step(system: StageEquations, dt: float) -> Array:
         stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
         a += dt * (dt + damping) * stiffness.reshape(len(a), len(a))
     for load in system.active.loads:
-        load.add_force(x, 0.0, dt, force)
+        load.add_force(x, time, time + dt, force)
     for wind in system.active.viscous:
         force -= gradient(wind, v_old, system.active.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()
     free = ~system.prescribed.mask.ravel()
     v = np.zeros(len(b))
-    v[free] = np.linalg.solve(a[np.ix_(free, free)], b[free])
+    v[~free] = system.prescribed.velocity
+    v[free] = np.linalg.solve(a[np.ix_(free, free)], b[free] - a[np.ix_(free, ~free)] @ v[~free])
     return v.reshape(x.shape)
 
 
-@pytest.mark.parametrize("handles", [{}, SPRINGS, HELD], ids=["free", "springs", "held"])
+@pytest.mark.parametrize("handles", [{}, SPRINGS, HELD, MOVING], ids=["free", "springs", "held", "moving"])
 def test_steps_follow_the_papers_formula(handles: dict[str, Any]) -> None:
     with Simulation(SCENE | handles, MPI.COMM_SELF) as simulation:
         system = simulation.system
         for _ in range(5):
-            x, expected = system.x.copy(), paper_step(system, DT)
+            x, expected = system.x.copy(), paper_step(system, simulation.time, DT)
             attempt = simulation.step(DT)
             np.testing.assert_allclose(system.v, expected, rtol=0.0, atol=1e-11)
             np.testing.assert_allclose(system.x, x + DT * expected, rtol=0.0, atol=1e-13)

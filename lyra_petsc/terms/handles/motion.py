@@ -253,12 +253,42 @@ class Motion:
         return (points - d0) @ (a @ np.linalg.inv(a0)).T + d
 
     def velocity(self, points: Array, start: float, time: float) -> Array:
-        """Time derivative (n, 3) [m/s] of ``moved``, by differences over 1e-6 of the shortest interval."""
+        """Time derivative (n, 3) [m/s] of ``moved``; where it jumps, the mean of both sides."""
         if len(self._times) == 1:
             return np.zeros_like(points)
         step = 1e-6 * float(np.diff(self._times).min())
-        before, after = self.moved(points, start, time - step), self.moved(points, start, time + step)
-        return (after - before) / (2 * step)
+        a0, d0 = self.transform(start)
+        rates = [self._rate(each) for each in (time - step, time + step)]
+        a, d = (0.5 * (before + after) for before, after in zip(*rates, strict=True))
+        return (points - d0) @ (a @ np.linalg.inv(a0)).T + d
+
+    def _rate(self, time: float) -> tuple[Array, Array]:
+        """Time derivatives of the matrix (3, 3) [1/s] and the translation (3,) [m/s] of `transform`."""
+        value, slope = self._interpolate(time)
+        rotation = self._rotation_at(time, value[6:])
+        angular = self._angular_velocity(time, value[6:], slope[6:])
+        turning = np.cross(angular, rotation.T).T
+        matrix = np.asarray(turning * value[3:6] + rotation * slope[3:6], dtype=np.float64)
+        return matrix, slope[:3]
+
+    def _angular_velocity(self, time: float, quaternion: Array, rate: Array) -> Array:
+        """Angular velocity (3,) [rad/s] by the quaternion and its rate, or by the angle's rate."""
+        times = self._times
+        if self._rotations is None or not times[0] < time < times[-1]:
+            real, imaginary = quaternion[0], quaternion[1:]
+            turn = real * rate[1:] - rate[0] * imaginary + np.cross(imaginary, rate[1:])
+            angular: Array = 2.0 * turn / (quaternion @ quaternion)
+            return angular
+        i = int(np.searchsorted(times, time, side="right")) - 1
+        h = times[i + 1] - times[i]
+        s = (time - times[i]) / h
+        axis, angle, first, last = self._rotations[i]
+        if self._linear:
+            return axis * (angle / h)
+        part = (
+            6.0 * s * (1.0 - s) * angle / h + (1.0 - s) * (1.0 - 3.0 * s) * first + s * (3.0 * s - 2.0) * last
+        )
+        return axis * part
 
 
 @dataclass(frozen=True)
