@@ -53,7 +53,7 @@ class ContactImpulses(NamedTuple):
     Attributes
     ----------
     damping : (n_owned,)
-        Mean normal forces [N] of dashpots on vertices, for friction.
+        Mean normal forces [N] of impulses on vertices, for friction.
     handle_force : (m,)
         Mean reaction forces [N] of handles, at the prescribed unknowns.
     work, heat : float
@@ -71,11 +71,14 @@ class ContactImpulses(NamedTuple):
     force: Array
 
 
-def remove_surplus(system: StageEquations, before: float, x_before: Array, surplus_before: float) -> float:
+def remove_surplus(
+    system: StageEquations, before: float, x_before: Array, surplus_before: float
+) -> tuple[float, Array]:
     """Remove the energy that contact has added from the velocities of the present state; collective.
 
     ``before`` [J] is this rank's energy of contact at x_before (n_owned, 3), ``surplus_before`` [J] the
-    surplus of the steps before. Returns the surplus [J] that remains.
+    surplus of the steps before. Returns the surplus [J] that remains, and the mean normal forces [N] of the
+    impulses on vertices, (n_owned,), for friction.
     """
     n = system.points.n_owned
     terms, frozen = system.active.limiting, system.active.frozen
@@ -85,12 +88,12 @@ def remove_surplus(system: StageEquations, before: float, x_before: Array, surpl
         work += float(np.vdot(pull[:n], moved))
         after += float(term.energies(system.x, frozen[term]).sum())
     gain, stored = (float(value) for value in system.points.global_sum(after - before - work, after))
-    remaining = max(surplus_before + gain, -stored)
+    remaining, push = max(surplus_before + gain, -stored), np.zeros(n)
     if not remaining > 0.0:
-        return remaining
+        return remaining, push
     impulse = np.zeros_like(system.x)
     for term in terms:
-        _add_impulses(term, system, frozen[term], impulse)
+        push += _add_impulses(term, system, frozen[term], impulse)
     system.points.add_to_owners(impulse)
     impulse = np.where(system.prescribed.free, impulse[:n], 0.0)
     mass = system.mass[:, None]
@@ -98,17 +101,19 @@ def remove_surplus(system: StageEquations, before: float, x_before: Array, surpl
     local = float(np.vdot(impulse, change)), float(np.vdot(impulse, system.v[:n]))
     square, rate = (float(value) for value in system.points.global_sum(*local))
     if not square > 0.0:
-        return remaining
+        return remaining, np.zeros(n)
     # solve ½ square s² + rate s = −remaining, or minimise the left side if there is no solution
     discriminant = max(rate * rate - 2.0 * square * remaining, 0.0)
     size = (-rate + math.copysign(math.sqrt(discriminant), rate)) / square
     system.state.set(system.x[:n], system.v[:n] + size * change)
-    return remaining + (0.5 * square * size + rate) * size
+    return remaining + (0.5 * square * size + rate) * size, size / system.dt * push
 
 
-def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array) -> None:
-    """Add impulses, up to a factor, of the counted pairs in contact at the stage to out (n_local, 3)."""
-    points, beta, normal, force, _ = term.contact_points(system.stage_positions, frozen)
+def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array) -> Array:
+    """Add impulses, up to a factor, of the counted pairs in contact at the stage to out (n_local, 3); returns
+    their sums for vertices in contact, (n_owned,).
+    """
+    points, beta, normal, force, vertex = term.contact_points(system.stage_positions, frozen)
     sheet = points >= 0
     between = sheet.all(axis=1)
     beta = np.where(sheet, beta, 0.0)
@@ -118,19 +123,25 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     length = np.maximum(np.linalg.norm(separation, axis=1), np.finfo(float).tiny)
     normal[between] = separation / length[:, None]
     np.add.at(out, rows, (force[:, None] * beta)[:, :, None] * normal[:, None, :])
+    at = vertex >= 0
+    return np.bincount(vertex[at], force[at], system.points.n_owned).astype(np.float64)
 
 
-def damp_impacts(system: StageEquations) -> ContactImpulses:
+def damp_impacts(system: StageEquations, push_before: Array | float = 0.0) -> ContactImpulses:
     """Damp the rates at which distances in contact change; collective.
 
+    ``push_before`` (n_owned,) are mean normal forces [N] on vertices by impulses of the step before these.
     A pair with the rate r gets the impulse −w r of a dashpot in Δt, which keeps second order, with
     w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m). The mass m of `_inverse_masses` is such that no impulse is too large;
     the masses of vertices are divided in proportion to b″, so that a pair that hardly touches takes no mass
     from others, and two halves of a pair are damped as the whole.
     """
-    layout, n, dt, damping = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
+    layout, n, dt = system.points, system.points.n_owned, system.dt
+    damping = push_before + np.zeros(n)
     last = _last_times(system)
-    all_pairs = [term.dashpots(system.x, system.active.frozen[term], last) for term in system.active.limiting]
+    all_pairs = [
+        term.dashpots(system.x, system.v, system.active.frozen[term], last) for term in system.active.limiting
+    ]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
         reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)
         return ContactImpulses(damping, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))

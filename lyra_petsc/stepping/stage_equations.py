@@ -397,10 +397,13 @@ class StageEquations:
                 return
             from lyra_petsc.stepping import impacts  # needed only if something is near
 
+            push: Array | float = 0.0
             if self.removes_contact_surplus:
                 left = self.integrator.surplus
-                self.integrator.surplus = impacts.remove_surplus(self, self._contact_energy, before, left)
-            self.contact_impulses = impacts.damp_impacts(self)
+                self.integrator.surplus, push = impacts.remove_surplus(
+                    self, self._contact_energy, before, left
+                )
+            self.contact_impulses = impacts.damp_impacts(self, push)
             for term in self.active.changing:
                 if term.slips:
                     self.contact_impulses = impacts.correct_friction(self, term, self.contact_impulses)

@@ -496,10 +496,11 @@ class Elastic(Term):
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
-    def dashpots(self, x: Array, frozen: Any, last: tuple[float, float]) -> Dashpots:
+    def dashpots(self, x: Array, v: Array, frozen: Any, last: tuple[float, float]) -> Dashpots:
         """Pairs in contact at the end of the step, including those that other ranks count.
 
-        The speeds of obstacles are means between the two times ``last`` [s].
+        Positions x and velocities v are (n_local, 3). The speeds of obstacles are means between the two times
+        ``last`` [s].
         """
         points, beta, normal, force, vertex = Elastic.contact_points(self, x, frozen)
         return Dashpots(points, beta, normal, force, vertex, vertex, force)

@@ -167,10 +167,11 @@ def test_a_sheet_that_lands_obliquely_is_not_thrown_back(
     assert stays < 0.01 * SPEED
 
 
-@pytest.mark.parametrize(
-    ("integrator", "step"), [(name, step) for name in ("midpoint", "alpha2") for step in (0.001, 0.004)]
-)
-def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str, step: float) -> None:
+@pytest.mark.parametrize("step", [0.001, 0.004])
+@pytest.mark.parametrize(("integrator", "error"), [("midpoint", 1e-5), ("alpha2", 0.1)])
+def test_an_oblique_impact_is_slowed_by_friction(
+    comm: MPI.Comm, integrator: str, error: float, step: float
+) -> None:
     """By friction times the change of the normal speed, though the gap is passed within a few steps."""
     friction = 0.3
     content = {
@@ -188,7 +189,7 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
     mass, *momentum = system.points.global_sum(float(system.mass.sum()), *(system.mass @ system.v[:n]))
     along, _, normal = momentum / mass
     simulation.destroy()
-    assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=0.1)
+    assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=error)
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
@@ -250,3 +251,22 @@ def test_steps_of_semi_implicit_in_contact_are_those_of_backward_euler(
     largest = np.abs(iterated).max()
     assert largest > 0.0
     np.testing.assert_allclose(once, iterated, atol=1e-3 * largest)
+
+
+def test_a_spinning_rod_without_friction_acts_as_one_at_rest(comm: MPI.Comm) -> None:
+    """Mean velocities in a step of backward Euler, chords of the rod's motion, lead into the sheet."""
+    ends, spin = {"from": [-1.0, 0.0, 0.0], "to": [1.0, 0.0, 0.0], "radius": 0.1}, {"axis": [1.0, 0.0, 0.0]}
+    spins = [{"time": 0.0}, {"time": 1.0, "rotate": spin | {"degrees": 3600.0}}]
+    shapes = []
+    for motion in ({}, {"motion": spins, "interpolation": "linear"}):
+        content = {
+            "mesh": grid(0.2, 0.2, 8, 8) | {"transform": {"translate": [-0.1, -0.1, 0.102]}},
+            "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+            "gravity": [0.0, 0.0, -9.81],
+            "contact": {"gap": 0.004, "self": False},
+            "obstacles": {"rod": {"capsule": ends} | motion},
+            "time": {"end": 0.05, "step": 0.002},
+        }
+        with finished(comm, scene_of(content)) as simulation:
+            shapes.append(shape(simulation))
+    np.testing.assert_allclose(shapes[1], shapes[0], rtol=0.0, atol=1e-5)

@@ -874,7 +874,7 @@ class ContactBarrier(Elastic):
         beta, normal, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
         return self.points[pair], beta, normal, force, self.vertex_of(pair)
 
-    def dashpots(self, x: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Dashpots:
+    def dashpots(self, x: Array, v: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Dashpots:
         active = self.active_pairs(x, frozen.end)
         square = active.square
         stiffness = active.weight * active.stiffness
@@ -885,10 +885,16 @@ class ContactBarrier(Elastic):
         rows, normal, stiffness = rows[kept], normal[kept], stiffness[kept]
         pair, beta = active.pair[rows], active.beta[rows]
         points, obstacle = self.points[pair], self.obstacle[pair]
-        moved = self.obstacles.contact_displacements(
-            x, points, beta, obstacle, self.obstacles.rigid_motions(*last)
+        # the mean for points of the obstacle that are at the contact before and after: chords of its rotation
+        # have components along the normal, even if the distance does not change
+        duration = last[1] - last[0]
+        moved, back = (
+            self.obstacles.contact_displacements(
+                at, points, beta, obstacle, self.obstacles.rigid_motions(*times)
+            )
+            for at, times in ((x, last), (x - duration * v, last[::-1]))
         )
-        approach = np.einsum("ek,ek->e", moved, normal) / (last[1] - last[0])
+        approach = 0.5 * np.einsum("ek,ek->e", moved - back, normal) / duration
         return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, approach)
 
     def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
