@@ -657,6 +657,7 @@ class SteppedScene:
             **stepper,
             "energy": None if self.guard is None else self.guard.saved_state(),
             "late_starts": sorted(system.reference.late),
+            "obstacles": term_states.obstacle_places(system),
         }
         if self._equilibrium is not None:
             more, scalars["equilibrium"] = self._equilibrium.saved_state(time)
@@ -696,7 +697,7 @@ class SteppedScene:
             self.guard.restore(scalars["energy"], same=same)
         if self.local_error is not None:
             self.local_error.restore(arrays, scalars["integrator"])
-        term_states.restore_changing(system, arrays, elements)
+        term_states.restore_changing(system, arrays, elements, scalars.get("obstacles", {}))
         self.stepper.restore(arrays, scalars, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in scalars.get("totals", {}).items()}
         self.stability = self.stability and scalars.get("stability", self.stability)

@@ -66,10 +66,21 @@ def restore_fixed(
             _restore_values(term, system.points.global_number[term.stencil], vertices, values)
 
 
+def obstacle_places(system: StageEquations) -> dict[str, tuple[int, int]]:
+    """Number of each obstacle in `element_arrays`, and of its first point, by name."""
+    return {name: place for term in system.active.changing for name, place in term.obstacle_places.items()}
+
+
 def restore_changing(
-    system: StageEquations, arrays: Mapping[str, Array], elements: Mapping[str, tuple[Ints, Array]]
+    system: StageEquations,
+    arrays: Mapping[str, Array],
+    elements: Mapping[str, tuple[Ints, Array]],
+    places: Mapping[str, tuple[int, int]],
 ) -> None:
-    """Restore the state of vertices, and of elements with changing stencils (pairs that are near)."""
+    """Restore the state of vertices, and of elements with changing stencils (pairs that are near).
+
+    ``places`` are the `obstacle_places` of the checkpoint; those of older versions have none.
+    """
     layout = system.points
     for term in system.active.elastic:
         if term.registration.state:
@@ -77,7 +88,7 @@ def restore_changing(
             term.restore({name: array for name, array in known.items() if array is not None})
         if term.name in elements and term.registration.neighbours:
             own = range(layout.start, layout.start + layout.n_owned)
-            term.restore_elements(*_send_to_owners(system, *elements[term.name]), own)
+            term.restore_elements(*_send_to_owners(system, *elements[term.name]), own, places)
             term.initialise_pairs(system.x, system.active.frozen[term])
 
 

@@ -631,8 +631,18 @@ class Elastic(Term):
         """
         raise NotImplementedError
 
-    def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
-        """Restore what ``element_state`` returned, for elements that touch the owned vertices ``own``."""
+    @property
+    def obstacle_places(self) -> Mapping[str, tuple[int, int]]:
+        """Number of each obstacle in ``element_state``, and of its first point, by name."""
+        return {}
+
+    def restore_elements(
+        self, vertices: Ints, values: Array, own: range, places: Mapping[str, tuple[int, int]]
+    ) -> None:
+        """Restore what ``element_state`` returned, for elements that touch the owned vertices ``own``.
+
+        ``places`` were the ``obstacle_places``.
+        """
 
     def largest_rotation(self, increment: Array) -> float:
         """Largest angle [rad] by which an increment (n_owned, 3) [m] rotates directors of owned edges."""

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
+from physics import CLOTH, end_on_one_rank, finished, gathered, grid, obj_file, scene_of, shape
 
+from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.terms.contact.friction import CoulombFriction
@@ -558,7 +559,7 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
     renamed[between] = vertices[between][:, [3, 2, 1, 0]]
     turned[between, 6:9] *= -1.0
     layout = simulation.problem.points
-    term.restore_elements(renamed, turned, range(layout.start, layout.start + layout.n_owned))
+    term.restore_elements(renamed, turned, range(layout.start, layout.start + layout.n_owned), {})
     for again, before in zip(term.element_state(), (vertices, pairs), strict=True):
         np.testing.assert_array_equal(again, before)
     slips = comm.allgather(np.linalg.norm(pairs[:, 6:9], axis=1).max(initial=0.0))
@@ -570,6 +571,57 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
     if x is not None:
         assert np.abs(unbroken - start).max() > 1e-4
         np.testing.assert_allclose(x, unbroken, rtol=0, atol=1e-9)
+
+
+def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """A sheet sticks on two rails down a slope; the scene that goes on has an obstacle more."""
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
+    place = [(0.01 + 0.9 * GAP) * component for component in NORMAL]
+    ends = (-DOWN).tolist(), (2.0 * DOWN).tolist()
+    rails: dict[str, Any] = {
+        name: {"capsule": {"from": [a, y, b], "to": [c, y, d], "radius": 0.01}}
+        for (a, _, b), (c, _, d), name, y in ((*ends, "left", 0.07), (*ends, "right", 0.31))
+    }
+    content = {
+        "mesh": grid(0.4, 0.4, 5, 5) | {"transform": {"rotate": turn, "translate": place}},
+        "material": CLOTH | {"bending": 1e-2, "damping": 0.01},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE), "self": False},
+        "obstacles": rails,
+        "time": {"end": 0.16, "step": 0.004},
+        "solver": {"force_tolerance": 1e-11, "step_tolerance": 1e-10},
+    }
+    far = {"sphere": {"center": [0.0, 0.0, 9.0], "radius": 0.5}}
+    changed = content | {"obstacles": {"ball": far, "right": rails["right"], "left": rails["left"]}}
+    with finished(comm, content) as simulation:
+        unbroken = shape(simulation)
+    simulation = SteppedScene(comm, scene_of(content))
+    recorder = Recorder(simulation)
+    if comm.rank == 0:
+        (shared_tmp / "run").mkdir()
+    comm.Barrier()
+    recorder.begin(shared_tmp / "run")
+    for _ in range(20):
+        recorder.record(simulation.step())
+    before = shape(simulation)
+    recorder.write_checkpoint()
+    recorder.flush()
+    recorder.close()
+    simulation.destroy()
+    resumed = SteppedScene(comm, scene_of(changed))
+    recorder = Recorder(resumed)
+    recorder.resume(shared_tmp / "run")
+    term = resumed.problem.terms["friction"]
+    assert isinstance(term, CoulombFriction)
+    assert EDGE_EDGE in set().union(*comm.allgather(set(term.element_state()[1][:, 0].tolist())))
+    while not resumed.finished:
+        recorder.record(resumed.step())
+    after = shape(resumed)
+    recorder.flush()
+    recorder.close()
+    resumed.destroy()
+    assert np.abs(unbroken - before).max() > 1e-6
+    np.testing.assert_allclose(after, unbroken, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parallel(1)

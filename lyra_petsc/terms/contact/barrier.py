@@ -192,6 +192,8 @@ class Obstacles:
         Offset [m] of each; the last, 0, is that of sheets.
     moving : bool
         Whether any obstacle moves.
+    places : dict
+        Number of each obstacle and of its first point, by name.
     smooth_points : (n,) bool
         Which points are vertices of triangles, but not of sharp edges.
     smooth_edges : (m,) int64
@@ -262,6 +264,7 @@ class Obstacles:
         self.moving = any(obstacle.motion is not None for obstacle in obstacles)
         self._first = np.array(begins, dtype=np.int64)
         self._is_point = np.concatenate(is_point)
+        self.places = {each.name: (number, begins[number]) for number, each in enumerate(obstacles)}
         self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
         self._fixed_positions: Array | None = None
         if not self.moving:

@@ -220,8 +220,23 @@ class CoulombFriction(Elastic):
         """
         return self._pairs.key[:, :4], self._pairs.data[:, : SLID + 1]
 
-    def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
-        vertices, identity = vertices.copy(), values[:, :6].astype(np.int64)
+    @property
+    def obstacle_places(self) -> Mapping[str, tuple[int, int]]:
+        return self._contact.obstacles.places
+
+    def restore_elements(
+        self, vertices: Ints, values: Array, own: range, places: Mapping[str, tuple[int, int]]
+    ) -> None:
+        obstacle, kept = values[:, 1].copy(), np.ones(len(values), dtype=np.bool_)
+        values = values.copy()
+        for name, (number, first) in places.items():  # the scene's obstacles may be others, in another order
+            at = np.flatnonzero(obstacle == number)
+            kept[at] = name in self.obstacle_places
+            values[at, 1], now = self.obstacle_places.get(name, (number, first))
+            points = values[at, 2:6]
+            values[at, 2:6] = np.where(points < 0, points + (first - now), points)
+        vertices, values = vertices[kept], values[kept]
+        identity = values[:, :6].astype(np.int64)
         slip, edges, sheets = values[:, 6:9].copy(), identity[:, 0] == EDGE_EDGE, identity[:, 1] < 0
         # the order of vertices in an edge depends on their present numbers
         for rows, first in ((edges, 0), (edges & sheets, 2)):
