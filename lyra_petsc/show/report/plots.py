@@ -19,6 +19,8 @@ from lyra_petsc.show.report.document import Drawing, short
 COLOURS = ("#0b62a4", "#d1495b", "#2a9d5c", "#e08e0b", "#7b4fa6", "#14858f", "#8c5a3c", "#5b6470")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 WIDTH, HEIGHT = 7.2, 4.6  # inches
+MOST_INSIDE, BELOW = 12, 0.16
+"""Entries of a legend within the axes, at most; height [inches] of a row of a longer one, below them."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,11 @@ def _finish_axes(axes: Any) -> None:
         axis.set_major_locator(LogLocator(base=10.0, subs=marks, numticks=30))
         axis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
         axis.set_minor_formatter(NullFormatter())
-    if axes.get_legend_handles_labels()[0]:
+    number = len(axes.get_legend_handles_labels()[0])
+    if number > MOST_INSIDE:
+        axes.figure.set_figheight(HEIGHT + BELOW * math.ceil(number / 2))
+        axes.figure.legend(loc="outside lower center", ncols=2, fontsize=7, frameon=False)
+    elif number:
         axes.legend(fontsize=8, framealpha=0.9, edgecolor="#d5d9de")
 
 

@@ -90,6 +90,16 @@ def test_the_same_data_give_the_same_figures() -> None:
     assert [drawing.svg for drawing in one] == [drawing.svg for drawing in two]
 
 
+def test_a_long_legend_is_below_the_axes() -> None:
+    """Within them, it would cover the lines and leave no room for them."""
+    lines = [Series(f"mesh {n}", [0.1, 0.05], [1e-2 + n, 1e-3]) for n in range(60)]
+    heights = []
+    for shown in (lines[:3], lines):
+        drawing = convergence(shown, name="h", caption="Error", x_label="h", y_label="error")
+        heights.append(float(re.search(r'height="([0-9.]+)pt"', drawing.svg.decode())[1]))  # type: ignore[index]
+    assert heights[1] > 1.5 * heights[0]
+
+
 def test_slopes_of_fits() -> None:
     assert fitted_slope(STEPS, [3.0 * step**2 for step in STEPS]) == pytest.approx(2.0)
     assert math.isnan(fitted_slope([0.1], [1.0]))
