@@ -272,8 +272,8 @@ class StageEquations:
         v = self.v.copy()
         self.prescribed.overwrite_with_start_velocity(v[: self.points.n_owned])
         self.points.update_ghosts(v)
-        x, turns = self._frozen_positions(at), bool(self.active.pushing)
-        if turns:  # at the stage an obstacle may be where the sheet still is now
+        x, turns = self._frozen_positions(at), bool(self.active.moving or self.active.constraints)
+        if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
             self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
         total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
         if turns:

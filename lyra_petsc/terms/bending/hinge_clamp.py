@@ -6,7 +6,8 @@ Per held boundary edge of rest length l, with a triangle of rest area A that is 
 
 This is half the energy of a hinge between the triangle and its mirror image at the start, which moves with
 the handle. φ̄ follows from the material's rest curvature. The energy fades out as the triangle loses the last
-tenth of its rest area, see ``hinge_energy``.
+tenth of its rest area, see ``hinge_energy``. Half hinges of moving handles are not damped, as D v has no
+velocity of the mirror image.
 """
 
 from __future__ import annotations
@@ -172,7 +173,7 @@ def elements(rest: RestShape) -> Elements:
     edges, faces, opposite = boundary_edges(rest.mesh.triangles)
     vector, b = edge_in_material(rest, faces, edges[:, 0], edges[:, 1])
     squared = (vector**2).sum(axis=1)
-    rows, numbers = [], []
+    rows, numbers, damped = [], [], []
     for number, handle in enumerate(rest.scene.handles):
         if not handle.clamp:
             continue
@@ -180,6 +181,7 @@ def elements(rest: RestShape) -> Elements:
         held = np.isin(edges, chosen).all(axis=1) & (b > 0.0)
         rows.append(np.flatnonzero(held))
         numbers.append(np.full(len(rows[-1]), float(number)))
+        damped.append(np.full(len(rows[-1]), rest.scene.handles[number].motion is None))
     row = np.concatenate(rows)
     area = rest.area[faces[row]]
     data = {
@@ -188,7 +190,7 @@ def elements(rest: RestShape) -> Elements:
         "height": 2.0 * area / np.sqrt(squared[row]),
         "limit": fading_limit(area),
         "handle": np.concatenate(numbers),
-        "damping": rest.per_triangle("damping")[faces[row]],
+        "damping": rest.per_triangle("damping")[faces[row]] * np.concatenate(damped),
     }
     return Elements(np.column_stack([edges[row], opposite[row]]), data)
 
