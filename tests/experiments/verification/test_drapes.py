@@ -113,19 +113,14 @@ def drawn(mean: float, scatter: float = 0.01) -> list[float]:
 
 
 def test_a_biased_kind_of_mesh_fails() -> None:
-    found = [contacts.differences([*(drawn(0.80) for _ in range(3)), drawn(0.84)]) for _ in range(200)]
-    failed = np.array(found) > 1.0
-    assert failed[:, 3].mean() > 0.9
+    found = [contacts.scatter_of_means([*(drawn(0.80) for _ in range(3)), drawn(0.84)]) for _ in range(200)]
+    assert (np.array(found) > 1.0).mean() > 0.9
 
 
 def test_kinds_of_mesh_that_differ_by_chance_pass() -> None:
-    found = [contacts.differences([drawn(0.80, s) for s in (0.003, 0.01, 0.01, 0.02)]) for _ in range(500)]
-    wrong = (np.array(found) > 1.0).mean(axis=0)
-    assert wrong.max() < 0.15
-    assert wrong.min() > 0.02
+    found = [contacts.scatter_of_means([drawn(0.80) for _ in range(4)]) for _ in range(1000)]
+    assert 0.01 < (np.array(found) > 1.0).mean() < 0.05
 
 
-def test_differences_follow_the_formula() -> None:
-    assert contacts.differences([[0.0, 2.0], [2.0, 4.0]]) == pytest.approx([1.0 / math.sqrt(2.0)] * 2)
-    one, *_ = contacts.differences([[0.0, 2.0], [3.0, 3.0], [6.0, 6.0]])
-    assert one == pytest.approx(3.5 / 2.0)
+def test_the_scatter_follows_the_formula() -> None:
+    assert contacts.scatter_of_means([[0.0, 2.0], [2.0, 4.0]]) == pytest.approx(math.sqrt(2.0) / 2.0)
