@@ -45,7 +45,7 @@ class Compilation(event.Listener):
         self._depth += 1
         if self._depth == 1:
             self._since = time.perf_counter()
-            # numba makes many objects that live: to search them for garbage takes an eighth of the time
+            # numba makes many objects that live: to search them for garbage takes up to a tenth of the time
             self._collects = gc.isenabled()
             gc.disable()
             self.begins()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -91,6 +92,16 @@ def _turn_angles(keyframes: Sequence[Keyframe], key: str, file: object) -> list[
         else:
             turns.append(None)
     return turns
+
+
+def _hermite(s: float, h: float, p: Any, q: Any, m: Any, n: Any) -> tuple[Any, Any]:
+    """Value and rate at the part s of an interval of length h, of the cubic polynomial with values p, q and
+    rates m, n at its ends.
+    """
+    value = (1 + 2 * s) * (1 - s) ** 2 * p + s * s * (3 - 2 * s) * q
+    value = value + h * s * (1 - s) * ((1 - s) * m - s * n)
+    rate = 6 * s * (1 - s) / h * (q - p) + (1 - s) * (1 - 3 * s) * m + s * (3 * s - 2) * n
+    return value, rate
 
 
 class Motion:
@@ -203,21 +214,17 @@ class Motion:
             return values[0], np.zeros(10)
         if time >= times[-1]:
             return values[-1], np.zeros(10)
-        i = int(np.searchsorted(times, time, side="right")) - 1
-        h = times[i + 1] - times[i]
-        s = (time - times[i]) / h
+        i, h, s = self._place(time)
         p, q = values[i], values[i + 1]
         if self._linear:
             return p + s * (q - p), (q - p) / h
-        m, n = h * self._tangents[i], h * self._tangents[i + 1]
-        value = (
-            (1 + 2 * s) * (1 - s) ** 2 * p
-            + s * (1 - s) ** 2 * m
-            + s * s * (3 - 2 * s) * q
-            - s * s * (1 - s) * n
-        )
-        slope = 6 * s * (s - 1) * (p - q) + (1 - s) * (1 - 3 * s) * m + s * (3 * s - 2) * n
-        return value, slope / h
+        return _hermite(s, h, p, q, self._tangents[i], self._tangents[i + 1])
+
+    def _place(self, time: float) -> tuple[int, float, float]:
+        """Number and length [s] of the interval between keyframes at ``time``, and the part of it before."""
+        i = int(np.searchsorted(self._times, time, side="right")) - 1
+        h = float(self._times[i + 1] - self._times[i])
+        return i, h, float(time - self._times[i]) / h
 
     @property
     def times(self) -> list[float]:
@@ -226,23 +233,23 @@ class Motion:
 
     def transform(self, time: float) -> tuple[Array, Array]:
         """Matrix (3, 3) and translation (3,) [m] of T(t): x ↦ A x + d."""
-        value, _ = self._interpolate(time)
-        return self._rotation_at(time, value[6:]) * value[3:6], value[:3]
+        value, rate = self._interpolate(time)
+        return self._rotation_at(time, value[6:], rate[6:])[0] * value[3:6], value[:3]
 
-    def _rotation_at(self, time: float, quaternion: Array) -> Array:
-        """Rotation matrix (3, 3) at a time, from the interpolated quaternion or angle."""
+    def _rotation_at(self, time: float, quaternion: Array, rate: Array) -> tuple[Array, Array]:
+        """Rotation matrix (3, 3) and angular velocity (3,) [rad/s], from the interpolated quaternion and its
+        rate, or from the interpolated angle.
+        """
         times = self._times
         if self._rotations is None or not times[0] < time < times[-1]:
-            return _rotation(quaternion)
-        i = int(np.searchsorted(times, time, side="right")) - 1
-        h = times[i + 1] - times[i]
-        s = (time - times[i]) / h
+            real, imaginary = quaternion[0], quaternion[1:]
+            turn = real * rate[1:] - rate[0] * imaginary + np.cross(imaginary, rate[1:])
+            return _rotation(quaternion), 2.0 * turn / (quaternion @ quaternion)
+        i, h, s = self._place(time)
         axis, angle, first, last = self._rotations[i]
-        part = s * angle
-        if not self._linear:
-            part = s * s * (3 - 2 * s) * angle + h * s * (1 - s) ** 2 * first - h * s * s * (1 - s) * last
+        part, speed = (s * angle, angle / h) if self._linear else _hermite(s, h, 0.0, angle, first, last)
         turn = np.concatenate([[math.cos(0.5 * part)], math.sin(0.5 * part) * axis])
-        return _rotation(turn) @ _rotation(self._values[i, 6:])
+        return _rotation(turn) @ _rotation(self._values[i, 6:]), speed * axis
 
     def moved(self, points: Array, start: float, time: float) -> Array:
         """Positions T(time) T(start)⁻¹ of ``points`` (n, 3) [m]."""
@@ -264,31 +271,10 @@ class Motion:
 
     def _rate(self, time: float) -> tuple[Array, Array]:
         """Time derivatives of the matrix (3, 3) [1/s] and the translation (3,) [m/s] of `transform`."""
-        value, slope = self._interpolate(time)
-        rotation = self._rotation_at(time, value[6:])
-        angular = self._angular_velocity(time, value[6:], slope[6:])
+        value, rate = self._interpolate(time)
+        rotation, angular = self._rotation_at(time, value[6:], rate[6:])
         turning = np.cross(angular, rotation.T).T
-        matrix = np.asarray(turning * value[3:6] + rotation * slope[3:6], dtype=np.float64)
-        return matrix, slope[:3]
-
-    def _angular_velocity(self, time: float, quaternion: Array, rate: Array) -> Array:
-        """Angular velocity (3,) [rad/s] by the quaternion and its rate, or by the angle's rate."""
-        times = self._times
-        if self._rotations is None or not times[0] < time < times[-1]:
-            real, imaginary = quaternion[0], quaternion[1:]
-            turn = real * rate[1:] - rate[0] * imaginary + np.cross(imaginary, rate[1:])
-            angular: Array = 2.0 * turn / (quaternion @ quaternion)
-            return angular
-        i = int(np.searchsorted(times, time, side="right")) - 1
-        h = times[i + 1] - times[i]
-        s = (time - times[i]) / h
-        axis, angle, first, last = self._rotations[i]
-        if self._linear:
-            return axis * (angle / h)
-        part = (
-            6.0 * s * (1.0 - s) * angle / h + (1.0 - s) * (1.0 - 3.0 * s) * first + s * (3.0 * s - 2.0) * last
-        )
-        return axis * part
+        return np.asarray(turning * value[3:6] + rotation * rate[3:6], dtype=np.float64), rate[:3]
 
 
 @dataclass(frozen=True)

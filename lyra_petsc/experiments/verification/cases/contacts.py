@@ -667,7 +667,7 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
 def scatter_of_means(samples: Sequence[Sequence[float]]) -> float:
     """Standard deviation of the samples' means over twice their standard error.
 
-    Samples are of one size. Four of five equal ones exceed 1 with a probability of 3 %.
+    Samples are of one size. Four with equal means, of five values each, exceed 1 in 3 % of all cases.
     """
     means = [np.mean(sample) for sample in samples]
     square = np.mean([np.var(sample, ddof=1) / len(sample) for sample in samples])
