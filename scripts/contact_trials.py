@@ -266,7 +266,7 @@ def scene_of(name: str, friction: float = 0.9) -> Scene:
     coarse = [f"mesh[{sheet}].grid.{n}=3" for sheet in range(20) for n in ("nx", "ny")]
     config, settings = {
         "drape": ("ball", ["mesh.grid.nx=20", "mesh.grid.ny=20", "time.step=0.01", "time.end=1"]),
-        "twist": ("wring", ["mesh.grid.nx=16", "mesh.grid.ny=8", "time.step=0.01", "time.end=1.5"]),
+        "twist": ("twist", ["mesh.grid.nx=16", "mesh.grid.ny=8", "time.step=0.01", "time.end=1.5"]),
         "stack": ("stack", [*coarse, "time.step=0.01", "time.end=1"]),
     }[name]
     return load_scene(CONFIGS / f"{config}.yaml", settings)

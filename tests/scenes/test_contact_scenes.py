@@ -93,9 +93,9 @@ def test_a_stack_loads_its_box_with_its_weight(comm: MPI.Comm, shared_tmp: Path)
 
 
 @pytest.mark.parallel(1)
-def test_a_wrung_cloth_has_eight_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
+def test_a_twisted_cloth_has_eight_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.grid.nx=12", "mesh.grid.ny=3", "time.step=0.02")
-    if (run := run_of(comm, shared_tmp, "wring", *settings)) is None:
+    if (run := run_of(comm, shared_tmp, "twist", *settings)) is None:
         return
     x = run.positions[-1].reshape(4, 13, 3)
     # each long edge is closed far away on its own side
