@@ -52,7 +52,7 @@ class ContactImpulses(NamedTuple):
 
     Attributes
     ----------
-    damping : (n_owned,)
+    normal_force : (n_owned,)
         Mean normal forces [N] of impulses on vertices, for friction.
     handle_force : (m,)
         Mean reaction forces [N] of handles, at the prescribed unknowns.
@@ -62,7 +62,7 @@ class ContactImpulses(NamedTuple):
         Numbers of obstacles, positions [m] of the mean forces on them, and these forces [N].
     """
 
-    damping: Array
+    normal_force: Array
     handle_force: Array
     work: float
     heat: float
@@ -88,12 +88,12 @@ def remove_surplus(
         work += float(np.vdot(pull[:n], moved))
         after += float(term.energies(system.x, frozen[term]).sum())
     gain, stored = (float(value) for value in system.points.global_sum(after - before - work, after))
-    remaining, push = max(surplus_before + gain, -stored), np.zeros(n)
+    remaining, normal_force = max(surplus_before + gain, -stored), np.zeros(n)
     if not remaining > 0.0:
-        return remaining, push
+        return remaining, normal_force
     impulse = np.zeros_like(system.x)
     for term in terms:
-        push += _add_impulses(term, system, frozen[term], impulse)
+        normal_force += _add_impulses(term, system, frozen[term], impulse)
     system.points.add_to_owners(impulse)
     impulse = np.where(system.prescribed.free, impulse[:n], 0.0)
     mass = system.mass[:, None]
@@ -106,7 +106,7 @@ def remove_surplus(
     discriminant = max(rate * rate - 2.0 * square * remaining, 0.0)
     size = (-rate + math.copysign(math.sqrt(discriminant), rate)) / square
     system.state.set(system.x[:n], system.v[:n] + size * change)
-    return remaining + (0.5 * square * size + rate) * size, size / system.dt * push
+    return remaining + (0.5 * square * size + rate) * size, size / system.dt * normal_force
 
 
 def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array) -> Array:
@@ -127,24 +127,23 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     return np.bincount(vertex[at], force[at], system.points.n_owned).astype(np.float64)
 
 
-def damp_impacts(system: StageEquations, push_before: Array | float = 0.0) -> ContactImpulses:
+def damp_impacts(system: StageEquations, normal_force: Array) -> ContactImpulses:
     """Damp the rates at which distances in contact change; collective.
 
-    ``push_before`` (n_owned,) are mean normal forces [N] on vertices by impulses of the step before these.
+    ``normal_force`` (n_owned,) are mean normal forces [N] of earlier impulses of the step on vertices.
     A pair with the rate r gets the impulse −w r of a dashpot in Δt, which keeps second order, with
     w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m). The mass m of `_inverse_masses` is such that no impulse is too large;
     the masses of vertices are divided in proportion to b″, so that a pair that hardly touches takes no mass
     from others, and two halves of a pair are damped as the whole.
     """
     layout, n, dt = system.points, system.points.n_owned, system.dt
-    damping = push_before + np.zeros(n)
     last = _last_times(system)
     all_pairs = [
         term.dashpots(system.x, system.v, system.active.frozen[term], last) for term in system.active.limiting
     ]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
         reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)
-        return ContactImpulses(damping, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))
+        return ContactImpulses(normal_force, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))
     # a pair is handled by the rank of one of its vertices, which knows all pairs with the same nearest points
     owned = [np.empty(len(pairs.points), dtype=bool) for pairs in all_pairs]
     for pairs, own in zip(all_pairs, owned, strict=True):
@@ -158,14 +157,14 @@ def damp_impacts(system: StageEquations, push_before: Array | float = 0.0) -> Co
         given = *pairs[:4], pairs.approach, own, dt, DAMPING
         dashpots.damp(system.v, inverse, *given, push, impulse)
         vertex = np.flatnonzero(own & (pairs.vertex >= 0) & (sheets | (pairs.obstacle >= 0)))
-        damping += np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
+        normal_force = normal_force + np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
         work += float(push @ pairs.approach)
         on = np.flatnonzero(own & (pairs.obstacle >= 0))
         force = (push[on] / dt)[:, None] * pairs.normal[on]
         pushes.append(_obstacle_forces(system, pairs.points[on], pairs.beta[on], pairs.obstacle[on], force))
     handle_force, heat = _apply_impulse(system, impulse, work)
     on_obstacles = (np.concatenate(part) for part in zip(*pushes, strict=True))
-    return ContactImpulses(damping, handle_force, work, heat, *on_obstacles)
+    return ContactImpulses(normal_force, handle_force, work, heat, *on_obstacles)
 
 
 def correct_friction(system: StageEquations, term: Elastic, before: ContactImpulses) -> ContactImpulses:
@@ -182,7 +181,7 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     frozen, sheets = system.active.frozen[term], _corrects_sheets(system)
     last = _last_times(system)
     corrections = term.friction_corrections(
-        stage, x, system.v, frozen, before.damping, dt, sheets=sheets, last=last
+        stage, x, system.v, frozen, before.normal_force, dt, sheets=sheets, last=last
     )
     points, beta, weight, direction, gradient, missing, obstacle, moved = corrections
     pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
@@ -213,7 +212,7 @@ def correct_friction(system: StageEquations, term: Elastic, before: ContactImpul
     total = float(friction_work.sum())
     sums = before.handle_force + handle_force, before.work + work - total, before.heat + heat - total
     on_obstacles = (np.concatenate(part) for part in zip(before[4:], pushed, strict=True))
-    return ContactImpulses(before.damping, *sums, *on_obstacles)
+    return ContactImpulses(before.normal_force, *sums, *on_obstacles)
 
 
 def hold_by_friction(system: StageEquations, term: Elastic, v: Array, acceleration: Array) -> Array:

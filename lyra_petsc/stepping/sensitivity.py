@@ -101,7 +101,7 @@ class Neighbour:
     problem: Problem
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
-    pull: Array | None = None
+    prescribed_force: Array | None = None
     integrator: Integrator = field(init=False)
 
     def __post_init__(self) -> None:
@@ -326,7 +326,7 @@ class Sensitivities:
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()
             system.jacobian(start, 1.0, each.jacobian)
-            each.pull = system.handle_pull
+            each.prescribed_force = system.prescribed_force
 
     def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
         """Set the frames of a neighbour's directors.
@@ -368,8 +368,8 @@ class Sensitivities:
             start = np.zeros_like(v)
             system.prescribe(start)
             system.residual(start, system.stage.sigma * (start - system.history), out)
-            if each.pull is not None:
-                out += each.pull
+            if each.prescribed_force is not None:
+                out += each.prescribed_force
             return out + _product(system, each.jacobian, v - start)
 
         return self._free(_difference(neighbours, delta, residual))

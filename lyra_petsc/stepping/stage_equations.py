@@ -124,12 +124,12 @@ class StageEquations:
         Whether the integrator began the step from accelerations computed at its start.
     refused_displacement : RefusedDisplacement or None
         The displacement of the present step that was found to collide.
-    handle_pull : (n_owned, 3) or None
-        Change [N] of F, to first order, as handles move in a step of one linear solve; set by `jacobian`.
+    prescribed_force : (n_owned, 3) or None
+        Change [N] of F by the motion of prescribed unknowns, in steps of one linear solve; set by `jacobian`.
     """
 
     refused_displacement: RefusedDisplacement | None = None
-    handle_pull: Array | None = None
+    prescribed_force: Array | None = None
     has_active_pairs = starts_anew = False
     _frozen_before: Mapping[Term, Any] | None = None
     _start_velocity: Array | None = None  # found by `find_start`
@@ -397,13 +397,13 @@ class StageEquations:
                 return
             from lyra_petsc.stepping import impacts  # needed only if something is near
 
-            push: Array | float = 0.0
+            normal_force = np.zeros(n)
             if self.removes_contact_surplus:
                 left = self.integrator.surplus
-                self.integrator.surplus, push = impacts.remove_surplus(
+                self.integrator.surplus, normal_force = impacts.remove_surplus(
                     self, self._contact_energy, before, left
                 )
-            self.contact_impulses = impacts.damp_impacts(self, push)
+            self.contact_impulses = impacts.damp_impacts(self, normal_force)
             for term in self.active.changing:
                 if term.slips:
                     self.contact_impulses = impacts.correct_friction(self, term, self.contact_impulses)
@@ -900,10 +900,10 @@ class StageEquations:
 
         The list is empty without such elements.
         """
-        near, frozen = self.active.changing, self.active.frozen
+        near = self.active.changing
         if not near:
             return []
-        acting = [np.count_nonzero(t.active_elements(self._xs, frozen[t])[: t.n_owned]) for t in near]
+        acting = [np.count_nonzero(mask[: t.n_owned]) for t, mask in self._acting_elements().items()]
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
         fixed, every, *numbers = self.points.global_sum(
             *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
@@ -914,16 +914,20 @@ class StageEquations:
         ]
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
 
+    def _acting_elements(self) -> dict[Elastic, NDArray[np.bool_]]:
+        """Which elements of each term with changing stencils act at the positions last evaluated."""
+        x, frozen = self._xs, self.active.frozen
+        return {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
+
     def update_pattern(self) -> bool:
         """Update the pattern of the block rows to the pairs that act at the positions last evaluated.
 
         Returns whether the pattern changed; collective.
         """
-        x, frozen = self._xs, self.active.frozen
         if not self.discretisation.has_near_elements:
             self.has_active_pairs = False
             return self.discretisation.update_pattern({})
-        acting = {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
+        acting = self._acting_elements()
         if acting:
             number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
             self.has_active_pairs = any(self.points.global_max(number))
@@ -948,9 +952,7 @@ class StageEquations:
         """
         if not self.discretisation.has_near_elements:
             return False
-        x, frozen = self._xs, self.active.frozen
-        acting = (term.active_elements(x, frozen.get(term)).any() for term in self.active.changing)
-        return any(self.points.global_max(any(acting)))
+        return any(self.points.global_max(any(mask.any() for mask in self._acting_elements().values())))
 
     @property
     def may_impact(self) -> bool:
@@ -1042,15 +1044,13 @@ class StageEquations:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
         if self.applied.following is not None and blend < 1.0:
             self.applied.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
-        self.handle_pull = self._pull_of_handles(values) if self._from_start else None
+        self.prescribed_force = self._force_of_prescribed(values) if self._from_start else None
         if len(changing):
             rows.constrain(values, self.prescribed.mask, constrained)
 
-    def _pull_of_handles(self, values: Array) -> Array | None:
-        """Change (n_owned, 3) [N] of F, 0 in prescribed rows, as prescribed unknowns move in the step.
-
-        It is the product with their columns of ``values``, before these are decoupled; None if none moves;
-        collective.
+    def _force_of_prescribed(self, values: Array) -> Array | None:
+        """The product (n_owned, 3) [N] of the Jacobian ``values``, before prescribed unknowns are decoupled,
+        with the velocities of these; 0 in their rows. None if none moves; collective.
         """
         if not self.held:
             return None

@@ -597,7 +597,7 @@ class Elastic(Term):
         x: Array,
         v: Array,
         frozen: Any,
-        damping: Array,
+        normal_force: Array,
         dt: float,
         *,
         sheets: bool,
@@ -605,9 +605,9 @@ class Elastic(Term):
     ) -> FrictionCorrections:
         """Corrections of friction at the end of a step of length dt [s]; of a term that `slips`.
 
-        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); dashpots added normal
-        forces ``damping`` (n_owned,) [N]. Friction on obstacles, whose velocities are means between the two
-        times ``last`` [s], and with ``sheets`` also between sheets.
+        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); impulses at its end had
+        the mean normal forces ``normal_force`` (n_owned,) [N]. Friction on obstacles, whose velocities are
+        means between the two times ``last`` [s], and with ``sheets`` also between sheets.
         """
         raise NotImplementedError
 

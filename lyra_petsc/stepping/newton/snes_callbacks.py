@@ -155,9 +155,9 @@ class Newton:
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
-        if self._system.handle_pull is not None:
+        if self._system.prescribed_force is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
-            force += self._system.handle_pull
+            force += self._system.prescribed_force
         self._last_c = self._system.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:

@@ -281,22 +281,25 @@ class Obstacles:
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
 
-    def stage_positions(self, start: float, time: float, end: float) -> tuple[Array, Array]:
-        """Positions (m, 3) at the stage's time of a step, and how far each obstacle is moved for it,
-        (obstacles, 3) [m].
+    def step_positions(self, start: float, stage: float, end: float) -> tuple[Array, Array]:
+        """Points and normals (3, m, 3) at the start, the stage and the end of a step at these times [s], and
+        the distance (obstacles, 3) [m] of each obstacle at the stage from its path.
 
-        Each is moved so that the centre of its points lies on the straight line between its places at both
-        ends of the step, as the stage of a sheet does. On the path of an obstacle with acceleration a the
-        midpoint rule would find a sheet at rest on it by a Δt²/8 nearer or farther than at the ends.
+        At the stage the centre of its points is on the straight line between both ends of the step, as the
+        stage of a sheet is. On the path of an obstacle with acceleration a the midpoint rule would find a
+        sheet at rest on it by a Δt²/8 nearer or farther than at the ends.
         """
-        x, moved = self.positions(time), np.zeros((len(self.each), 3))
-        if self.moving and start < time < end:
-            fraction, count = (time - start) / (end - start), self._is_point.astype(float)
-            line = (1.0 - fraction) * self.positions(start) + fraction * self.positions(end) - x
-            moved = np.add.reduceat(line * count[:, None], self._first)
-            moved /= np.add.reduceat(count, self._first)[:, None]
-            x = x + count[:, None] * np.repeat(moved, np.diff(self._first, append=len(x)), axis=0)
-        return x, moved
+        x, shift = (
+            np.stack([self.positions(time) for time in (start, stage, end)]),
+            np.zeros((len(self.each), 3)),
+        )
+        if self.moving and start < stage < end:
+            fraction, count = (stage - start) / (end - start), self._is_point.astype(float)
+            from_path = (1.0 - fraction) * x[0] + fraction * x[2] - x[1]
+            shift = np.add.reduceat(from_path * count[:, None], self._first)
+            shift /= np.add.reduceat(count, self._first)[:, None]
+            x[1] += count[:, None] * np.repeat(shift, np.diff(self._first, append=len(count)), axis=0)
+        return x, shift
 
     def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
         """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
@@ -440,15 +443,15 @@ class ContactBarrier(Elastic):
     def freeze(self, step: UpcomingStep) -> ObstaclePositions:
         if not self.moving:
             return self._at_rest
-        start, end = (self.obstacles.positions(time) for time in (step.start, step.end))
-        stage, moved = self.obstacles.stage_positions(step.start, step.target_time, step.end)
-        self._next_obstacle_x = np.stack([start, stage, end])
+        times = step.start, step.target_time, step.end
+        self._next_obstacle_x, shift = self.obstacles.step_positions(*times)
         largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
         self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         self._deviations = self.obstacles.path_deviations(step.start, step.end)
-        motions = self.obstacles.rigid_motions(step.start, step.target_time)
-        motions = [(rotation, t + more) for (rotation, t), more in zip(motions, moved, strict=True)]
+        start, stage, end = self._next_obstacle_x
+        motions = self.obstacles.rigid_motions(*times[:2])
+        motions = [(rotation, t + more) for (rotation, t), more in zip(motions, shift, strict=True)]
         return ObstaclePositions(start, stage, end, motions)
 
     @property
@@ -821,8 +824,8 @@ class ContactBarrier(Elastic):
     def work(self, x: Array, at: float, start: float, end: float) -> float:
         to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
         work = 0.0
-        obstacle_x, _ = self.obstacles.stage_positions(start, at, end)
-        for obstacle, force in self._obstacle_gradients(x, obstacle_x):
+        obstacle_x, _ = self.obstacles.step_positions(start, at, end)
+        for obstacle, force in self._obstacle_gradients(x, obstacle_x[1]):
             (r0, t0), (r1, t1) = to_start[obstacle], to_end[obstacle]
             work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
         return work

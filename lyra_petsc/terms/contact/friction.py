@@ -262,8 +262,7 @@ class CoulombFriction(Elastic):
             fraction = (step.target_time - step.start) / (step.end - step.start)
         elif step.target_time < step.end:
             stage_motions = obstacles.rigid_motions(start, step.target_time)
-        end_points = obstacles.positions(step.end)
-        stage_points, _ = obstacles.stage_positions(step.start, step.target_time, step.end)
+        (_, stage_points, end_points), _ = obstacles.step_positions(step.start, step.target_time, step.end)
         return ObstacleMotion(step.end, fraction, stage_motions, end_motions, stage_points, end_points)
 
     def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:
@@ -399,7 +398,7 @@ class CoulombFriction(Elastic):
         x: Array,
         v: Array,
         frozen: ObstacleMotion,
-        damping: Array,
+        normal_force: Array,
         dt: float,
         *,
         sheets: bool,
@@ -421,7 +420,7 @@ class CoulombFriction(Elastic):
                 (self._vertex[sliding], self._force[sliding]),
             )
         )
-        owed = self._vertex_data[:, OWED] / dt + acted + damping[: len(acted)] - given
+        owed = self._vertex_data[:, OWED] / dt + acted + normal_force[: len(acted)] - given
         # vertices may come near after the stage, or leave
         *_, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
         touches = np.isin(np.arange(len(acted)), contact.vertex_of(pair))
