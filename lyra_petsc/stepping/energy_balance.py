@@ -137,7 +137,7 @@ class EnergyBalance:
         budget, sums = self.budget, [float(value) for value in system.points.global_sum(*local)]
         budget.membrane, budget.bending, budget.potential = sums[:3]
         budget.more, budget.kinetic = dict(zip(self._columns, sums[3:-1], strict=True)), sums[-1]
-        system.forget_directors()  # the next step has other frames
+        system.directors.forget()  # the next step has other frames
         return budget
 
     def snapshot(self) -> tuple[Budget, float]:
@@ -151,7 +151,7 @@ class EnergyBalance:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just taken from x_before (n_owned, 3) by the forces at its stage."""
         system = self._system
-        system.move_frames_to_end()
+        system.directors.move_frames_to_end()
         external, damping, damped = self._external_forces(system.forces_at_stage())
         # a handle does work on the sheet through targets that move with it
         if self._pull is None:

@@ -71,6 +71,23 @@ class ContactImpulses(NamedTuple):
     force: Array
 
 
+def apply_impulses(system: StageEquations, x_before: Array, contact_energy: float | None) -> ContactImpulses:
+    """Apply all impulses at the end of a step from x_before (n_owned, 3) [m]; collective.
+
+    ``contact_energy`` [J] is this rank's energy of contact there, or None if no surplus is removed.
+    """
+    normal_force, integrator = np.zeros(system.points.n_owned), system.integrator
+    if contact_energy is not None:
+        integrator.surplus, normal_force = remove_surplus(
+            system, contact_energy, x_before, integrator.surplus
+        )
+    impulses = damp_impacts(system, normal_force)
+    for term in system.active.changing:
+        if term.slips:
+            impulses = correct_friction(system, term, impulses)
+    return impulses
+
+
 def remove_surplus(
     system: StageEquations, before: float, x_before: Array, surplus_before: float
 ) -> tuple[float, Array]:

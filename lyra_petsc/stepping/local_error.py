@@ -28,7 +28,7 @@ class LocalError:
         self._system = system
         self._slope: Array | None = None
         self._dt = 0.0
-        system.followers.append(self)
+        system.start_acceleration.followers.append(self)
 
     @property
     def needs_acceleration(self) -> bool:

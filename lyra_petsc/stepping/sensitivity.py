@@ -334,7 +334,7 @@ class Sensitivities:
         They are its own, or those of the simulation if it has updated its frames since the ``started`` ones.
         """
         pairs = zip(_edged(system), _edged(self._system), started, strict=True)
-        used = [(mine, self._system.frozen_in_step[theirs], start) for mine, theirs, start in pairs]
+        used = [(mine, self._system.directors.frozen_in_step[theirs], start) for mine, theirs, start in pairs]
         found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
             system.active.refreeze(found)
@@ -491,7 +491,7 @@ class Sensitivities:
         stepper, system = self.simulation.stepper, self._system
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
-            system.set_iterate(None)
+            system.predicted_stress.forget()
             linear.assemble(velocity, 0.0, keep=keep, convex=True)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()

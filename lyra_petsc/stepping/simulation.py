@@ -282,7 +282,7 @@ class SteppedScene:
         self._failed_attempts = []
         system.integrator = self._scene_integrator
         starts = False
-        if not self._scene_integrator.iterates and system.touches:
+        if not self._scene_integrator.iterates and system.collisions.touches:
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
@@ -291,14 +291,14 @@ class SteppedScene:
             with self.phases("solve"):
                 self.stepper.follow_integrator()
                 attempt = (self._equilibrium or self.stepper).attempt(self.time, end)
-            starts |= system.starts_anew and system.damping.active
+            starts |= system.start_acceleration.starts_anew and system.damping.active
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
                 if not self._switch_at_crossing(attempt, end - self.time):
                     self._recover_from_failure(attempt, end)
             else:
-                solved = system.integrator.iterates or not system.touches
+                solved = system.integrator.iterates or not system.collisions.touches
                 accurate = solved and self._is_accurate(v_before[:n], end - self.time)
                 if accurate and self._conserves_energy(x_before, v_before, end):
                     break

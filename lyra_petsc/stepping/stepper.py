@@ -259,7 +259,7 @@ class Stepper:
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
         self._follow_stencils()
-        if iteration > 0 and self._system.update_frames():
+        if iteration > 0 and self._system.directors.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
 
@@ -314,7 +314,7 @@ class Stepper:
         before = system.x[: self._shape[0]].copy() if system.solves_edges_at_end else None
         rate_before = system.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        if system.discretisation.limits_motion and not system.find_start():
+        if system.discretisation.limits_motion and not system.collisions.find_start():
             self._trace.begin_solve()
             failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
@@ -322,7 +322,7 @@ class Stepper:
         if (
             velocity is not None
             and system.discretisation.limits_motion
-            and not system.end_is_collision_free(velocity)
+            and not system.collisions.end_is_free(velocity)
         ):
             velocity, message = None, WOULD_CROSS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
@@ -371,10 +371,10 @@ class Stepper:
         system = self._system
         staying = system.stationary_velocity()
         increment = velocity - staying
-        if system.turn_directors(staying, increment):
+        if system.directors.turn_with_triangles(staying, increment):
             velocity = staying + increment
         system.evaluate_at(velocity)
-        system.update_frames()
+        system.directors.update_frames()
         return velocity
 
     def balance_edge_moments(self, floor: float) -> bool:

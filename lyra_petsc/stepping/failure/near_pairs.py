@@ -70,7 +70,7 @@ def worst_pair(system: StageEquations) -> NearPair | None:
 
     If no displacement was refused, it is the nearest pair at the positions last evaluated.
     """
-    refused = system.refused_displacement
+    refused = system.collisions.refused
     if refused is None:
         return nearest_pair(system, system.evaluated[0])
 
@@ -123,7 +123,7 @@ def _worst(system: StageEquations, x: Array, badness: Callable[[Elastic], Array]
         gap = float(_gaps(system, term, x)[row])
         gap = gap if gap > TOUCHING * term.skin else min(gap, 0.0)
         parts = tuple(tuple(int(numbers[point]) for point in part) for part in pair.parts)
-        blocks = system.refused_displacement is not None or gap <= TIGHT * term.skin
+        blocks = system.collisions.refused is not None or gap <= TIGHT * term.skin
         return NearPair(parts, pair.obstacle, middle, gap, pair.thickness, blocks)
 
     return describe_worst(points.comm, values, first, describe)

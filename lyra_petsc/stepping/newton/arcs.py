@@ -69,7 +69,7 @@ class Arcs:
 
     def turns_notably(self, increment: Array) -> bool:
         """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
-        return self._system.largest_turn(increment * self._system.stage.c) > MIN_TURN
+        return self._system.directors.largest_turn(increment * self._system.stage.c) > MIN_TURN
 
     def curve(self, v: Array, increment: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """An increment (n_owned, 3) [m/s] from v along arcs, and the linear one.
@@ -92,7 +92,7 @@ class Arcs:
             np.bincount(corners, element_forces[:, :, i].ravel(), len(x))[: len(increment)] for i in range(3)
         ]
         curved = increment + self._solve(np.stack(forces, axis=1)) / system.stage.c
-        system.match_directors(v, increment, curved)
+        system.directors.match(v, increment, curved)
         return curved, increment
 
     def _gradients(self, x: Array) -> Array:

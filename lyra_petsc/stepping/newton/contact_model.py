@@ -12,7 +12,7 @@ ed., ch. 19.)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from petsc4py import PETSc
@@ -21,12 +21,25 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.contact.one_sided import Springs
+from lyra_petsc.terms.term import Elastic
 
 MAX_SOLVES = 20
 """Largest number of linear systems with springs in a Newton iteration."""
 
 MATCH = 0.1
 """Fraction of the residual by which spring forces may differ from those of the linear system."""
+
+
+def springs_along(system: StageEquations, v: Array, increment: Array) -> dict[Elastic, Springs]:
+    """Springs of the pairs that touch at v, or may touch along an increment (n_owned, 3) [m/s] from v.
+
+    Collective. Their blocks are part of the matrix until they are released.
+    """
+    x, displacement, _ = system.collisions.known_displacement(v, increment, 1.0)
+    moved = np.linalg.norm(displacement[: system.points.n_vertices], axis=1).max(initial=0.0)
+    approach = 2.0 * system.points.global_max(float(moved))[0]
+    found = {term: term.springs(x, approach, system.active.frozen[term]) for term in system.active.limiting}
+    return {term: springs for term, springs in found.items() if springs is not None}
 
 
 class ContactModel:
@@ -75,13 +88,13 @@ class ContactModel:
             Tolerance of the linear solves, relative to the residual.
         """
         system, linear, self.linear_iterations = self._system, self._linear, 0
-        self._springs = system.contact_springs(v, -y.getArray(readonly=True).reshape(v.shape))
+        self._springs = springs_along(system, v, -y.getArray(readonly=True).reshape(v.shape))
         self._set_springs(list(self._springs.values()))
         change, size = self._elongations(y), residual.norm()
         length = self._length + change
         force, expected = self._law(length)[0], self._force - self._stiffness * change
         if self._mismatch(force, expected) <= MATCH * size:
-            system.release_contact_springs({})
+            self._release({})
             return False
         if self._follow():
             assemble()
@@ -108,10 +121,18 @@ class ContactModel:
         if not descends:
             first.copy(y)
         lengths = zip(self._springs, self._split(length), strict=True)
-        system.release_contact_springs(dict(lengths) if descends else {})
+        self._release(dict(lengths) if descends else {})
         for each in (first, z, remaining):
             each.destroy()
         return descends
+
+    def _release(self, length: Mapping[Elastic, Array]) -> None:
+        """End the use of the springs; ``length`` [m] is theirs after the increment taken.
+
+        It is empty where another increment is taken.
+        """
+        for term in self._system.active.limiting:
+            term.release_springs(length.get(term))
 
     def _set_springs(self, springs: list[Springs]) -> None:
         """Set lengths and weights of all springs, and their forces and stiffness in the linear system."""
@@ -173,8 +194,12 @@ class ContactModel:
         ksp, linear, system = self._ksp, self._linear, self._system
         each = dict(zip(self._springs, self._split(slopes - self._stiffness), strict=True))
 
-        def add(rows: Array) -> None:
-            system.add_contact_springs(self._springs, each, rows)
+        def add(values: Array) -> None:
+            rows, constrained = system.discretisation.rows, system.prescribed.constrained
+            for term, springs in self._springs.items():
+                springs.add_stiffness(system.stage.c * each[term], rows.pattern.offsets[term.name], values)
+            if len(constrained.changed):
+                rows.constrain(values, system.prescribed.mask, constrained)
 
         linear.assemble_with(add)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)

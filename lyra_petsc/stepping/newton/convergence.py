@@ -174,7 +174,8 @@ class Convergence:
         if was_good or not (system.discretisation.limits_motion and system.integrator.dynamic):
             return False
         enough, part = self.force_tolerance(), FINER_IN_CONTACT
-        return (self.norm > part * enough or self.remaining > part * tolerance) and system.may_impact
+        coarse = self.norm > part * enough or self.remaining > part * tolerance
+        return coarse and system.collisions.may_impact
 
     def force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""

@@ -154,7 +154,7 @@ class Globalisation:
         self._returns = self._watchdog.must_return
         if self._returns:
             self._watchdog.return_to_best(x, y)
-            self._system.set_iterate(None)
+            self._system.predicted_stress.forget()
         return self._returns
 
     @property

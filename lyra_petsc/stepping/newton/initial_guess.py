@@ -20,24 +20,24 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     """
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
-        out[:] = system.start_velocity()
+        out[:] = system.collisions.start_velocity()
         if not isinstance(integrator, Static) or integrator.predicted is None:
             return False
         guess = integrator.predicted / integrator.pseudo_dt
         system.prescribe(guess)
-        if system.discretisation.has_near_elements or not system.moves_freely(out, guess - out):
+        if system.discretisation.has_near_elements or not system.collisions.moves_freely(out, guess - out):
             return False
         out[:] = guess
-        system.linearise_at_state()
+        system.predicted_stress.take_state(system.x)
         return True
     moving = system.v[:n].copy()
     system.prescribe(moving)
     if integrator.order > 1 and not system.discretisation.limits_motion:
         out[:] = moving
         return False
-    still = system.start_velocity()
+    still = system.collisions.start_velocity()
     if system.discretisation.limits_motion:
-        moving = still + system.largest_step(still, moving - still) * (moving - still)
+        moving = still + system.collisions.largest_step(still, moving - still) * (moving - still)
     use_still = system.objective(still)[0] < system.objective(moving)[0]
     out[:] = still if use_still else moving
     return False

@@ -280,7 +280,7 @@ class LinearSystem:
         self.assemble_operator(v, blend)
         if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._system):
             self._set_preconditioner(v, keep=keep, convex=convex)
-        self._system.forget_directors()
+        self._system.directors.forget()
 
     def _set_preconditioner(self, v: Array, *, keep: bool, convex: bool) -> None:
         if not self._regularised:

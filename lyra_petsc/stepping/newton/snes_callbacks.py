@@ -132,7 +132,8 @@ class Newton:
         self._step_length, self.step_fraction = 0.0, 1.0
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
-        collides = self._iterates and self._system.may_collide(COLLISION * self.convergence.spacing)
+        approach = COLLISION * self.convergence.spacing
+        collides = self._iterates and self._system.collisions.may_collide(approach)
         self._linear.begin_solve()
         self._linear.shift.decrease()
         self.convergence.begin_solve()
@@ -150,7 +151,7 @@ class Newton:
         """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
         v = self._array(u)
         if self._iterates:
-            self._system.set_iterate(v)
+            self._system.predicted_stress.set_iterate(self._system.evaluate_at(v)[0])
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
@@ -206,7 +207,7 @@ class Newton:
         curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
         if self._system.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
-        if self._system.limits_steps and not curved:
+        if self._system.collisions.limits_steps and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if full and self._corrects:
@@ -268,7 +269,7 @@ class Newton:
             if exact:
                 _apply_broyden(correction, steps)
             before, increment = size, -self._array(y) - self._array(correction)
-            if not self._system.moves_freely(v, increment):
+            if not self._system.collisions.moves_freely(v, increment):
                 break
             size, force = self._residual(v + increment)
             if not size < MAX_REMAINING * before:
@@ -279,7 +280,7 @@ class Newton:
                 break
             steps.append(correction.copy())
         if corrected:
-            self._system.linearise_to(first)
+            self._system.predicted_stress.take_uncorrected(self._system.evaluate_at(first)[0])
         for vector in (right, correction, *steps):
             vector.destroy()
         return corrected
@@ -300,11 +301,11 @@ class Newton:
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
-        lowest, start = np.inf, self._system.start_velocity()
+        lowest, start = np.inf, self._system.collisions.start_velocity()
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
             self._system.prescribe(end)
-            if not self._system.moves_freely(start, end - start):
+            if not self._system.collisions.moves_freely(start, end - start):
                 continue
             energy = self._system.objective(end)[0] if others else 0.0
             if energy < lowest:
@@ -334,9 +335,9 @@ class Newton:
         before = y.copy()
         curved, increment = self._arcs.curve(v, -self._array(y))
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and self._system.moves_freely(v, curved)
+        descends = bool(residual.dot(y) > 0.0) and self._system.collisions.moves_freely(v, curved)
         if descends:
-            self._system.linearise_to(v + increment)
+            self._system.predicted_stress.take_uncorrected(self._system.evaluate_at(v + increment)[0])
             self.step_fraction = 1.0
         else:
             before.copy(y)
@@ -351,7 +352,7 @@ class Newton:
     def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
         increment = -self._array(y)
-        if not self._system.turn_directors(self._array(x), increment):
+        if not self._system.directors.turn_with_triangles(self._array(x), increment):
             return False
         before = y.copy()
         y.setArray(-increment.ravel())
@@ -368,13 +369,15 @@ class Newton:
         """
         system, v = self._system, self._array(x)
         shortened = self._limit_displacement(y)
-        fraction = system.largest_step(v, -self._array(y))
+        collisions = system.collisions
+        fraction = collisions.largest_step(v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
-        separated = system.second_order_correction(v, -self._array(y)) if fraction < 1.0 or slow else None
+        correct = fraction < 1.0 or slow
+        separated = collisions.second_order_correction(v, -self._array(y)) if correct else None
         if separated is not None:
             before = y.copy()
             y.setArray(-separated.ravel())
-            farther = system.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
+            farther = collisions.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:

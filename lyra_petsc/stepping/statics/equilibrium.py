@@ -258,7 +258,7 @@ class Equilibrium:
                 if not solved_once:  # the force before is smaller if handles move
                     progress.restart()
                 solved_once = True
-                system.transport_frames()  # edges may turn far until they are in equilibrium
+                system.directors.transport_frames()  # edges may turn far until they are in equilibrium
                 self._pseudo_time.record_success(attempt.newton_iterations)
             elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
                 resumed += 1
@@ -278,7 +278,7 @@ class Equilibrium:
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        system.transport_frames(frozen)
+        system.directors.transport_frames(frozen)
         system.active.restore_contacts(contacts)
         return dataclasses.replace(
             attempt,
@@ -392,7 +392,7 @@ class Equilibrium:
         if lowest is None:
             return False
         system.state.set(lowest, np.zeros_like(lowest))
-        system.transport_frames()
+        system.directors.transport_frames()
         return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:

@@ -182,8 +182,8 @@ class Examination:
         if best == 0.0:
             return None
         displacement, system = best * mode, self._system
-        if system.limits_steps:
-            displacement *= system.largest_step(np.zeros_like(mode), displacement / system.stage.c)
+        if system.collisions.limits_steps:
+            displacement *= system.collisions.largest_step(np.zeros_like(mode), displacement / system.stage.c)
         return displacement
 
     def _potential(self, displacement: Array) -> float:

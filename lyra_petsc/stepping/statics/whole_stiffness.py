@@ -73,12 +73,12 @@ class WholeStiffness:
             last = force
             self._set_positions(system.x[:n] + displacement)
         system.state.set(x, np.zeros_like(x))
-        system.transport_frames(frozen)
+        system.directors.transport_frames(frozen)
         return None
 
     def _set_positions(self, x: Array) -> None:
         self._system.state.set(x, np.zeros_like(x))
-        self._system.transport_frames()
+        self._system.directors.transport_frames()
 
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""
