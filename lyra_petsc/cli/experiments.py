@@ -280,7 +280,7 @@ def fabric(
     first = Path("fabric") / f"{Path(named).stem}-{test}"
     folder = out or on_root(comm, lambda: first if force else free_name(first))
     again = command(comm, "fabric", [test, *asked, *to_arguments({"--ranks": ranks})])
-    view = fabric_report.Fabric(named)
+    view = fabric_report.FabricView(named)
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, len(cases))
 

@@ -16,8 +16,8 @@ from lyra_petsc.cli.run import petsc_prints, warn_unused
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
 from lyra_petsc.experiments.fit.estimate import Evaluation
-from lyra_petsc.experiments.fit.fit_report import Fit, FitOutcome, outcome_of
-from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene, unknowns_of
+from lyra_petsc.experiments.fit.fit_report import FitOutcome, FitView, outcome_of
+from lyra_petsc.experiments.fit.fit_runner import FIT, FitObserver, fit_scene, unknowns_of
 from lyra_petsc.experiments.results import Results
 from lyra_petsc.output.run_folder import RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
@@ -25,7 +25,7 @@ from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 
 
-class FitProgress(ProgressBar, Observer):
+class FitProgress(ProgressBar, FitObserver):
     """Shows the progress of a fit: the current evaluation, and the sum of squares of the last one."""
 
     def __init__(self, comm: MPI.Comm, *, plain: bool) -> None:
@@ -84,7 +84,7 @@ def fit(
         return f"; evaluations are kept in {choice.path}, fit --resume goes on"
 
     watch = stop_check(comm, kept)
-    view = Fit(f"Fit of {loaded.title or scene.stem}")
+    view = FitView(f"Fit of {loaded.title or scene.stem}")
     with RunDirectory(comm, choice) as directory:
         folder = directory.path
         directory.clean()

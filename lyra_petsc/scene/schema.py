@@ -30,8 +30,8 @@ from typing_extensions import Self
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.fit_block import Fit
-from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
 from lyra_petsc.scene.materials.library import is_isotropic, isotropic_names, material_names, measured_names
+from lyra_petsc.scene.materials.measured_curves import Points, checked_points, read_curve
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.rules import Rule, absent, any_of, exactly_one, given, holds, one_of, when
 from lyra_petsc.scene.values import (

@@ -23,7 +23,7 @@ MIN_STIFFNESS = 1e-14
 """Tangent stiffness of sliding elements over that of sticking ones, where it is replaced by a parabola."""
 
 
-class Friction(NamedTuple):
+class FrictionLimits(NamedTuple):
     """Limit M and yield strain q_y of elements, (E,) each."""
 
     limit: Array

@@ -13,7 +13,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.coulomb import Friction
+from lyra_petsc.terms.coulomb import FrictionLimits
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 
@@ -40,7 +40,7 @@ class ShearFriction(Elastic):
         super().__init__(elements)
         data = elements.data
         self._shape, area = data["shape"], data["area"]
-        self._friction = Friction(area * data["friction"], np.full(self.n_elements, YIELD_SHEAR))
+        self._friction = FrictionLimits(area * data["friction"], np.full(self.n_elements, YIELD_SHEAR))
         self.sheared: Array = np.zeros(self.n_elements)
 
     def _shear(self, x: Array, rows: slice = slice(None)) -> tuple[Array, Array]:
@@ -64,7 +64,7 @@ class ShearFriction(Elastic):
     def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
         rows = slice(lo, hi)
         shear, slope = self._shear(x, rows)
-        friction = Friction(*(values[rows] for values in self._friction))
+        friction = FrictionLimits(*(values[rows] for values in self._friction))
         k, change = friction.tangent(shear - self.sheared[rows], blend)
         u, v = self._shape[rows, :, 0], self._shape[rows, :, 1]
         np.einsum("e,eai,ebj->eabij", 2.0 * k, slope, slope, out=out)

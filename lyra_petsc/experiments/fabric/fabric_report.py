@@ -15,7 +15,7 @@ from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_draw
 
 
 @dataclass(frozen=True)
-class Number:
+class FabricNumber:
     """A result; ``scatter`` is the standard deviation over several starts, NaN for a single one."""
 
     quantity: str
@@ -41,7 +41,7 @@ class Record:
 
     Attributes
     ----------
-    numbers : list of Number
+    numbers : list of FabricNumber
     curves : list of Curve
     shadow : list of list of int
         Pixels of the shadow of a drape, 1 for dark, bottom row first; empty for other tests.
@@ -55,7 +55,7 @@ class Record:
         Wall time [s].
     """
 
-    numbers: list[Number] = field(default_factory=list)
+    numbers: list[FabricNumber] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     shadow: list[list[int]] = field(default_factory=list)
     extent: float = 0.0
@@ -98,12 +98,12 @@ def outcome_of(case: FabricCase, record: Record) -> FabricOutcome:
     return FabricOutcome(case, verdicts, record.seconds, record=record)
 
 
-def _value(number: Number) -> str:
+def _value(number: FabricNumber) -> str:
     spread = "" if math.isnan(number.scatter) else f" ± {short(number.scatter, 2)}"
     return f"{short(number.value, 4)}{spread}"
 
 
-class Fabric(View[FabricOutcome]):
+class FabricView(View[FabricOutcome]):
     """Numbers by test and direction.
 
     Parameters

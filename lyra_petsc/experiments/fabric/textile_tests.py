@@ -35,15 +35,15 @@ from lyra_petsc.experiments.drape import (
 from lyra_petsc.experiments.fabric.fabric_report import (
     Curve,
     FabricCase,
+    FabricNumber,
     FabricOutcome,
-    Number,
     Record,
     outcome_of,
 )
 from lyra_petsc.experiments.fabric.specimens import Fabric, G
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, square_to_disc
-from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import GF_PER_CM, ShellMaterial
+from lyra_petsc.scene.materials.measured_curves import force_at
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -104,7 +104,7 @@ def _add_loop_width(
 ) -> None:
     """Add the mean width of a hysteresis loop at ±``at``, and the verdict on it."""
     width = 0.5 * float((up(at) - down(at)) + (up(-at) - down(-at)))
-    record.numbers.append(Number(name, width, unit))
+    record.numbers.append(FabricNumber(name, width, unit))
     record.claim(name, width, known, 0.01)
 
 
@@ -167,16 +167,18 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     percent, converted = [100.0 * e for e in strains], [f / GF_PER_CM for f in forces]
     record.curves = [Curve("tensile", "strain [%]", "force [gf/cm]", percent, converted)]
     if forces[-1] < FULL_LOAD:
-        record.numbers = [Number(f"force at {percent[-1]:.3g} % (less than 500)", converted[-1], "gf/cm")]
+        record.numbers = [
+            FabricNumber(f"force at {percent[-1]:.3g} % (less than 500)", converted[-1], "gf/cm")
+        ]
         return record
     emt = float(np.interp(FULL_LOAD, forces, strains))
     e = np.linspace(0.0, emt, 400)
     pulls = np.interp(e, strains, forces)
     work = float(0.5 * np.sum((pulls[1:] + pulls[:-1]) * np.diff(e)))
     record.numbers = [
-        Number("EMT", 100.0 * emt, "%"),
-        Number("WT", work / GF_PER_CM, "gf·cm/cm²"),
-        Number("LT", work / (0.5 * FULL_LOAD * emt), "1"),
+        FabricNumber("EMT", 100.0 * emt, "%"),
+        FabricNumber("WT", work / GF_PER_CM, "gf·cm/cm²"),
+        FabricNumber("LT", work / (0.5 * FULL_LOAD * emt), "1"),
     ]
     return record
 
@@ -230,7 +232,7 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     sheared = [f - pull * math.tan(math.radians(angle)) for f, angle in zip(converted, angles, strict=True)]
     up, down = _branches(angles, sheared, rise)
     stiffness = 0.5 * sum((f(2.5 * s) - f(0.5 * s)) / (2.0 * s) for f, s in ((up, 1), (down, -1)))
-    record.numbers = [Number("G", stiffness, "gf/(cm·°)")]
+    record.numbers = [FabricNumber("G", stiffness, "gf/(cm·°)")]
     if shell.law != "measured" and not shell.curves:
         record.claim("G", stiffness, math.radians(shell.c33) / GF_PER_CM, 0.01)
     if rubs:
@@ -304,7 +306,7 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, converted)]
     up, down = _branches(curvature, converted, rise)
     stiffness = 0.5 * ((up(1.5) - up(0.5)) + (down(-0.5) - down(-1.5)))
-    record.numbers = [Number("B", stiffness, "gf·cm²/cm")]
+    record.numbers = [FabricNumber("B", stiffness, "gf·cm²/cm")]
     record.claim("B", stiffness, shell.plate[0] / (1e-4 * GF_PER_CM), 0.01)
     if limit > 0.0:
         for at in (0.5, 1.5):
@@ -357,10 +359,10 @@ def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     half = 0.5 * lengths[-1]
     rigidity = weight * half**3
     record.numbers = [
-        Number("overhang", 1e2 * lengths[-1], "cm"),
-        Number("bending length c", 1e2 * half, "cm"),
-        Number("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
-        Number("B", 1e6 * rigidity, "µN·m"),
+        FabricNumber("overhang", 1e2 * lengths[-1], "cm"),
+        FabricNumber("bending length c", 1e2 * half, "cm"),
+        FabricNumber("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
+        FabricNumber("B", 1e6 * rigidity, "µN·m"),
     ]
     record.curves = [_shape("strip", line)]
     if not max(shell.friction_moment) > 0.0:
@@ -477,10 +479,10 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         shapes.append(found)
     lengths = [loop_length(h, strip) for h, strip in zip(heights, strips, strict=True)]
     record.numbers = [
-        Number(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
+        FabricNumber(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
         for h, strip in zip(heights, strips, strict=True)
     ]
-    record.numbers.append(Number("bending length c, by Peirce's formula", 1e2 * lengths[1], "cm"))
+    record.numbers.append(FabricNumber("bending length c, by Peirce's formula", 1e2 * lengths[1], "cm"))
     record.curves = [_shape(f"{1e2 * s:.3g} cm", shape) for s, shape in zip(strips, shapes, strict=True)]
     if not max(shell.friction_moment) > 0.0:
         for strip, height in zip(strips, heights, strict=True):
@@ -513,7 +515,7 @@ def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
         coefficients.append(100.0 * drape_coefficient(dark))
         counts.append(float(count_folds(dark)))
     record.numbers = [
-        Number(name, float(np.mean(values)), unit, float(np.std(values, ddof=1)))
+        FabricNumber(name, float(np.mean(values)), unit, float(np.std(values, ddof=1)))
         for name, values, unit in (("drape coefficient", coefficients, "%"), ("folds", counts, "1"))
     ]
     record.shadow, record.extent = dark.astype(int).tolist(), 100.0 * MARGIN * CLOTH

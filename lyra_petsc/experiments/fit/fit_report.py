@@ -42,7 +42,7 @@ def _deviation(estimate: Estimate) -> str:
     return f"{low:.5g} to {high:.5g}"
 
 
-class Fit(View[FitOutcome]):
+class FitView(View[FitOutcome]):
     """Report of one fit."""
 
     verb = "fit"

@@ -74,7 +74,7 @@ class StoredEvaluations:
     trials: list[Evaluation] = field(default_factory=list)
 
 
-class Observer:
+class FitObserver:
     """Is notified of the progress of a fit; to be overridden."""
 
     def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
@@ -187,7 +187,7 @@ def fit_scene(
     *,
     folder: Path | None = None,
     watch: Watch = lambda: None,
-    observer: Observer | None = None,
+    observer: FitObserver | None = None,
     measured: Sequence[Array] | None = None,
 ) -> Fitted:
     """Fit the numbers that the block ``fit`` of a scene names; collective.
@@ -200,7 +200,7 @@ def fit_scene(
         Folder in which evaluations are stored; stored ones are not repeated.
     watch : callable
         Called before every step.
-    observer : Observer, optional
+    observer : FitObserver, optional
     measured : sequence of arrays, optional
         Replacements of the measured values of each reading, in their order.
 
@@ -212,7 +212,7 @@ def fit_scene(
         If a simulation fails.
     """
     began = time.monotonic()
-    listener = observer or Observer()
+    listener = observer or FitObserver()
     unknowns = on_root(comm, lambda: unknowns_of(scene))
     assert scene.fit is not None
     readings = on_root(comm, lambda: readings_of(scene, scene.fit.measurements if scene.fit else ()))

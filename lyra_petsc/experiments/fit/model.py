@@ -41,7 +41,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass
-class Evaluation:
+class ModelEvaluation:
     """Values (m,) of the readings and, if requested, their derivatives (m, n) with respect to the numbers."""
 
     values: Array
@@ -124,7 +124,7 @@ class Model:
 
     def evaluate(
         self, numbers: Sequence[float], *, derivatives: bool = True, progress: Progress = lambda part: None
-    ) -> Evaluation:
+    ) -> ModelEvaluation:
         """Simulate with these numbers.
 
         Raises
@@ -144,7 +144,7 @@ class Model:
                 f"with {numbers_text}: {error}", collective=error.collective, details=error.details
             ) from error
 
-    def _evaluate(self, numbers: Array, derivatives: bool, progress: Progress) -> Evaluation:
+    def _evaluate(self, numbers: Array, derivatives: bool, progress: Progress) -> ModelEvaluation:
         scene = self.at(numbers.tolist())
         stops = [instant.time for instant in self._instants]
         values: list[Array] = []
@@ -184,9 +184,9 @@ class Model:
             self.shape = shape if self.comm.rank == 0 else None
             if sensitivities is not None:
                 sensitivities.destroy()
-        return Evaluation(np.concatenate(values), np.concatenate(slopes) if slopes else None)
+        return ModelEvaluation(np.concatenate(values), np.concatenate(slopes) if slopes else None)
 
-    def _evaluate_by_differences(self, numbers: Array, progress: Progress) -> Evaluation:
+    def _evaluate_by_differences(self, numbers: Array, progress: Progress) -> ModelEvaluation:
         """By central differences of whole runs."""
         count = 2 * len(numbers) + 1
         columns = []
@@ -200,7 +200,7 @@ class Model:
                 pair.append(run.values)
             columns.append((pair[0] - pair[1]) / (2.0 * WHOLE_RUNS * size))
         found = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
-        return Evaluation(found.values, np.stack(columns, axis=1))
+        return ModelEvaluation(found.values, np.stack(columns, axis=1))
 
 
 def _scaled(progress: Progress, done: int, count: int, part: float) -> None:

@@ -365,7 +365,7 @@ def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ErrorKind:
     """A kind of error that is measured for each combination.
 
     Attributes
@@ -387,20 +387,20 @@ MEAN_SQUARE = "position_l2"
 """Name of the quantity whose samples are combined by their mean square; others by their maximum."""
 
 POSITION = (
-    Quantity(MEAN_SQUARE, "L2 error in position / sheet size"),
-    Quantity("position_max", "largest error in position / sheet size"),
+    ErrorKind(MEAN_SQUARE, "L2 error in position / sheet size"),
+    ErrorKind("position_max", "largest error in position / sheet size"),
 )
 """Root mean square over area and sample times, and maximum over vertices and sample times."""
 
-ENERGY = Quantity("energy", "error in energy / largest energy exchanged")
+ENERGY = ErrorKind("energy", "error in energy / largest energy exchanged")
 
 
-def probe_quantity(name: str) -> Quantity:
+def probe_quantity(name: str) -> ErrorKind:
     """The error in the position of a probe."""
-    return Quantity(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
+    return ErrorKind(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
 
 
-def parse_quantities(text: str, probes: Iterable[str]) -> list[Quantity]:
+def parse_quantities(text: str, probes: Iterable[str]) -> list[ErrorKind]:
     """The quantities of ``--quantities``; all for an empty text.
 
     Parameters
@@ -419,7 +419,7 @@ def parse_quantities(text: str, probes: Iterable[str]) -> list[Quantity]:
     known = {quantity.probe: [quantity] for quantity in every}
     known |= {"position": [*POSITION], "energy": [ENERGY], "probes": every}
     words = [word.strip() for word in text.split(",")] if text.strip() else ["position", "energy", "probes"]
-    found: list[Quantity] = []
+    found: list[ErrorKind] = []
     for word in words:
         if not word:
             raise InputError("has an empty name between its commas", key=key)
@@ -522,7 +522,7 @@ class Plan:
     base : Scene
     axes : list of Axis
     combinations : list of Combination
-    quantities : list of Quantity
+    quantities : list of ErrorKind
     end : float
         End time [s], or load factor of a static analysis.
     interval : float
@@ -535,7 +535,7 @@ class Plan:
     base: Scene
     axes: list[Axis]
     combinations: list[Combination]
-    quantities: list[Quantity]
+    quantities: list[ErrorKind]
     end: float
     interval: float
     notes: list[str] = field(default_factory=list)

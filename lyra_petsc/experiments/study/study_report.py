@@ -21,9 +21,9 @@ from lyra_petsc.experiments.study.jobs import PHASES
 from lyra_petsc.experiments.study.plan import (
     MEAN_SQUARE,
     Axis,
+    ErrorKind,
     Physics,
     Plan,
-    Quantity,
     StudyCase,
     describe_setting,
     describe_settings,
@@ -368,7 +368,7 @@ def _write_tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     )
 
 
-def _short_title(quantity: Quantity) -> str:
+def _short_title(quantity: ErrorKind) -> str:
     text = {"position_max": "position, max", "position_l2": "position, L2"}
     return "error in " + text.get(quantity.name, quantity.name.replace("_", " ", 1))
 
@@ -439,13 +439,13 @@ def drawings(plan: Plan, rows: Sequence[StudyRow], known: Reference, mark: str) 
     return found
 
 
-def _error_floor(known: Reference, quantity: Quantity) -> float | None:
+def _error_floor(known: Reference, quantity: ErrorKind) -> float | None:
     own = known.own_errors.get(quantity.name)
     return None if own is None or not own.error > 0.0 else SAFETY * own.error
 
 
 def _work_precision(
-    plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis | None, mark: str
+    plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: ErrorKind, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
     lines = []
@@ -484,7 +484,7 @@ def _point_label(row: StudyRow, axis: Axis | None) -> str:
 
 
 def _convergence(
-    rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis, mark: str
+    rows: Sequence[StudyRow], known: Reference, quantity: ErrorKind, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
         Series(label, [spacing(row, axis) for row in group], [row.resolved(quantity.name) for row in group])

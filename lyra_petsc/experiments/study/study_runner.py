@@ -56,7 +56,7 @@ NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EstimatedError:
     """Estimated error of a reference in one quantity.
 
     Attributes
@@ -90,7 +90,7 @@ class Reference:
     sheets : sequence of int
         Number of vertices of each mesh source; needed for comparison between meshes.
     notes : list of str
-    own_errors : dict of str to Estimate
+    own_errors : dict of str to EstimatedError
         Its own error by quantity; empty if unknown.
     seconds : float
         Wall time [s] of its steps, if it was run by this study.
@@ -102,7 +102,7 @@ class Reference:
     folder: Path | None = None
     sheets: Sequence[int] = ()
     notes: list[str] = field(default_factory=list)
-    own_errors: dict[str, Estimate] = field(default_factory=dict)
+    own_errors: dict[str, EstimatedError] = field(default_factory=dict)
     seconds: float = math.nan
 
 
@@ -317,7 +317,7 @@ def _tolerances(plan: Plan, tighter: float) -> list[str]:
 # -- error of the reference ------------------------------------------------------------------------------
 
 
-def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:
+def richardson(first: float, second: float, ratio: float, order: int) -> EstimatedError:
     """Error of the finest of three runs.
 
     Differences that decrease faster than the expected order do so by chance, as errors of several causes may
@@ -334,9 +334,9 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
         Expected order; the observed one is used if it is smaller.
     """
     if math.isnan(first) or math.isnan(second):
-        return Estimate(math.nan, math.nan, False)
+        return EstimatedError(math.nan, math.nan, False)
     if first == second == 0.0:
-        return Estimate(0.0, math.nan, True)
+        return EstimatedError(0.0, math.nan, True)
     observed = math.inf if first == 0.0 else -math.inf
     if first > 0.0 < second:
         observed = math.log(second / first) / math.log(ratio)
@@ -346,16 +346,16 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
     error = largest / (ratio**used - 1.0)
     if order > 0:
         error = max(error, second / ratio**order / (ratio**order - 1.0))
-    return Estimate(error, observed, trusted)
+    return EstimatedError(error, observed, trusted)
 
 
-def sum_estimates(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
+def sum_estimates(estimates: Sequence[dict[str, EstimatedError]]) -> dict[str, EstimatedError]:
     """Sum of the errors of time integration and mesh, by quantity."""
     names = dict.fromkeys(name for estimate in estimates for name in estimate)
     found = {}
     for name in names:
         parts = [estimate[name] for estimate in estimates]
-        found[name] = Estimate(
+        found[name] = EstimatedError(
             math.fsum(part.error for part in parts),
             parts[0].order if len(parts) == 1 else math.nan,
             all(part.trusted for part in parts),
@@ -363,7 +363,7 @@ def sum_estimates(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimat
     return found
 
 
-def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, Estimate]:
+def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, EstimatedError]:
     """Error of the finest run of a chain, by quantity.
 
     The place and time of a maximum error change between runs, so that maxima give no reliable order. It is
@@ -383,7 +383,7 @@ def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, Es
     found = {}
     for name, first in sums[0].items():
         if len(differences) == 1:
-            found[name] = Estimate(first, math.nan, True)
+            found[name] = EstimatedError(first, math.nan, True)
             continue
         found[name] = whole = richardson(first, sums[1][name], REFINEMENT, chain.order)
         if name != MEAN_SQUARE and not math.isnan(whole.error):
@@ -400,7 +400,7 @@ ROUND_OFF = 1e-13
 """Error of an exact reference"""
 
 
-class Observer(Protocol):
+class StudyObserver(Protocol):
     """Is notified of the progress of a study, and may end it."""
 
     def case(self, label: str, *, resumed: bool) -> None:
@@ -503,7 +503,7 @@ class StudyRunner:
     planned : dict of physics → Reference
         References as chosen before anything runs.
     folder : Path
-    observer : Observer
+    observer : StudyObserver
     launcher : Launcher or None
         Starts processes for each case; None: cases run on this communicator.
     lock : int
@@ -518,7 +518,7 @@ class StudyRunner:
     plan: Plan
     planned: dict[Physics, Reference]
     folder: Path
-    observer: Observer
+    observer: StudyObserver
     launcher: Launcher | None = None
     lock: int = -1
     rows: list[StudyRow] = field(default_factory=list, init=False)
@@ -612,7 +612,9 @@ class StudyRunner:
             found.notes.append("the own error of the reference run is not known")
         quantities = self.plan.quantities
         if found.motion is not None:
-            found.own_errors = {quantity.name: Estimate(ROUND_OFF, math.nan, True) for quantity in quantities}
+            found.own_errors = {
+                quantity.name: EstimatedError(ROUND_OFF, math.nan, True) for quantity in quantities
+            }
             errors_of: Callable[..., Errors] = partial(
                 comparison.motion_errors, self.comm, motion=found.motion
             )
@@ -676,7 +678,7 @@ class StudyRunner:
             self.comm, folder, self.plan.sample_times(), self.plan.interval, sheets
         )
 
-    def _estimate_errors(self, chains: list[Chain], known: Reference) -> Runs[dict[str, Estimate]]:
+    def _estimate_errors(self, chains: list[Chain], known: Reference) -> Runs[dict[str, EstimatedError]]:
         """Estimate the error of a reference from its chains."""
         estimates = []
         for chain in chains:

@@ -24,7 +24,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.scene.materials.curves import Points, interpolation
+from lyra_petsc.scene.materials.measured_curves import Points, interpolation
 
 if TYPE_CHECKING:
     from lyra_petsc.scene.schema import Material, PlateStiffness

@@ -32,7 +32,7 @@ from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
-from lyra_petsc.stepping.statics.progress import PROGRESS, Progress
+from lyra_petsc.stepping.statics.load_step_progress import PROGRESS, LoadStepProgress
 from lyra_petsc.stepping.statics.pseudo_time import LEAP_ITERATIONS, PseudoTimeStep
 from lyra_petsc.stepping.statics.relaxation import Relaxation
 from lyra_petsc.stepping.statics.stability import Examination, Stability
@@ -202,7 +202,7 @@ class Equilibrium:
         judges_energy = contact and self._is_held()
         contacts = system.active.contact_state()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
-        progress, relaxation = Progress(), Relaxation(system.points.comm)
+        progress, relaxation = LoadStepProgress(), Relaxation(system.points.comm)
         self._pseudo_time.begin_load_step()
         self._friction.begin_step()
         attempt = Attempt(False, 0, 0, 0.0)
@@ -471,7 +471,9 @@ class Equilibrium:
         """Whether attempts since the last equilibrium show that a smaller increment would not help."""
         return self._in_vain >= MAX_IN_VAIN or self._friction.in_vain
 
-    def _failure_message(self, solves: int, progress: Progress, before: Array, *, solved_once: bool) -> str:
+    def _failure_message(
+        self, solves: int, progress: LoadStepProgress, before: Array, *, solved_once: bool
+    ) -> str:
         """Why no further proximal step is taken, or an empty string; collective.
 
         ``before`` (n_owned, 3) [m] are the positions at the start of the load step.
@@ -496,7 +498,9 @@ class Equilibrium:
             return ""
         return "no equilibrium: proximal steps lead farther off"
 
-    def _failed_solve(self, before: float, factor: float, progress: Progress, x: Array) -> FailedSolve:
+    def _failed_solve(
+        self, before: float, factor: float, progress: LoadStepProgress, x: Array
+    ) -> FailedSolve:
         """The state that the proximal steps from positions x (n_owned, 3) [m] have reached; collective."""
         system, n = self._system, self._system.points.n_owned
         system.begin_step(before, factor)

@@ -25,7 +25,7 @@ ORIGINAL_STIFFNESS = 1000.0
 """Stiffness [N/m] of the original Lyra, which exact handles have while they fade."""
 
 
-class Springs(NamedTuple):
+class HandleSprings(NamedTuple):
     """Springs in one step.
 
     Attributes
@@ -60,7 +60,7 @@ class Spring(HandleTerm):
     def reference_rows(self) -> NDArray[np.int64]:
         return self.stencil[:, 0].astype(np.int64)
 
-    def freeze(self, step: UpcomingStep) -> Springs:
+    def freeze(self, step: UpcomingStep) -> HandleSprings:
         target, stiffness = np.zeros((self.n_elements, 3)), np.zeros((self.n_elements, 3))
         for number, (motion, window, fading_only) in self._handles.items():
             mine = self._handle == number
@@ -72,24 +72,24 @@ class Spring(HandleTerm):
                 stiffness[mine] = strength * self.elements.data["stiffness"][mine]
                 start = step.reference(window.start, self.stencil[mine, 0].astype(np.int64))
                 target[mine] = motion.moved(start, window.start, step.target_time)
-        return Springs(target, stiffness)
+        return HandleSprings(target, stiffness)
 
-    def _elongation(self, x: Array, frozen: Springs) -> Array:
+    def _elongation(self, x: Array, frozen: HandleSprings) -> Array:
         return x[self.stencil[:, 0]] - frozen.target
 
-    def energies(self, x: Array, frozen: Springs) -> Array:
+    def energies(self, x: Array, frozen: HandleSprings) -> Array:
         return 0.5 * (frozen.stiffness * self._elongation(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
 
-    def handle_forces(self, x: Array, frozen: Springs, count: int) -> Array:
+    def handle_forces(self, x: Array, frozen: HandleSprings, count: int) -> Array:
         forces = np.zeros((count, 3))
         n = self.n_owned
         np.add.at(forces, self._handle[:n], -(frozen.stiffness * self._elongation(x, frozen))[:n])
         return forces
 
-    def add_gradient(self, x: Array, frozen: Springs, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: HandleSprings, out: Array) -> None:
         np.add.at(out, self.stencil[:, 0], frozen.stiffness * self._elongation(x, frozen))
 
-    def hessians(self, x: Array, frozen: Springs, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: HandleSprings, lo: int, hi: int, blend: float, out: Array) -> None:
         out[:] = 0.0
         for axis in range(3):
             out[:, 0, 0, axis, axis] = frozen.stiffness[lo:hi, axis]

@@ -15,8 +15,8 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import inlined, kernel
-from lyra_petsc.scene.materials.curves import interpolation
 from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.scene.materials.measured_curves import interpolation
 from lyra_petsc.terms.membrane_laws import compression
 
 SOFTENS = False

@@ -17,7 +17,7 @@ from lyra_petsc.experiments.fabric import textile_tests
 from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, outcome_of
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
-from lyra_petsc.scene.materials.curves import force_at
+from lyra_petsc.scene.materials.measured_curves import force_at
 
 FABRIC = Fabric(
     "fabric",

@@ -15,7 +15,7 @@ from mpi4py import MPI
 import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.fit.estimate import Evaluation, Unknown, conclude, search
-from lyra_petsc.experiments.fit.fit_runner import FIT, Observer, fit_scene
+from lyra_petsc.experiments.fit.fit_runner import FIT, FitObserver, fit_scene
 from lyra_petsc.experiments.fit.readings import Positions
 
 TRUE = 4.2e-5
@@ -147,12 +147,12 @@ def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
 def test_a_fit_resumes_without_repeating(tmp_path: Path) -> None:
     scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
 
-    class Stops(Observer):
+    class Stops(FitObserver):
         def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
             if number == 2:
                 raise KeyboardInterrupt
 
-    class Counts(Observer):
+    class Counts(FitObserver):
         made = resumed = 0
 
         def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
@@ -315,12 +315,12 @@ def test_contact_by_differences() -> None:
 
 def test_report(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from lyra_petsc.experiments.fit.fit_report import Fit, outcome_of
+    from lyra_petsc.experiments.fit.fit_report import FitView, outcome_of
     from lyra_petsc.experiments.results import Results
 
     scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
     comm = MPI.COMM_SELF
-    results: Any = Results(comm, tmp_path / "fit", Fit("A strip"), ranks=1, command=["fit"])
+    results: Any = Results(comm, tmp_path / "fit", FitView("A strip"), ranks=1, command=["fit"])
     outcome = outcome_of(fit_scene(comm, scene))
     results.run([outcome.case], lambda case: outcome)
     text = json.loads((tmp_path / "fit" / "fit.json").read_text())["cases"][0]

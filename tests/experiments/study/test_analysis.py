@@ -17,7 +17,7 @@ from lyra_petsc.experiments.study.study_report import (
 )
 from lyra_petsc.experiments.study.study_runner import (
     Chain,
-    Estimate,
+    EstimatedError,
     StudyRow,
     estimate_chain,
     mark_unresolved,
@@ -195,7 +195,7 @@ def test_richardson_limits_the_order_and_refuses_divergence() -> None:
 
 
 def test_errors_in_time_and_space_add_up() -> None:
-    both = sum_estimates([{"a": Estimate(1.0, 2.0, True)}, {"a": Estimate(0.5, 2.0, False)}])
+    both = sum_estimates([{"a": EstimatedError(1.0, 2.0, True)}, {"a": EstimatedError(0.5, 2.0, False)}])
     assert both["a"].error == 1.5
     assert not both["a"].trusted
     two = estimate_chain([{"a": np.array([0.1, 0.2])}], Chain((), 0))

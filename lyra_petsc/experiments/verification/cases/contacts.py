@@ -265,7 +265,7 @@ THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("
 
 
 @dataclass
-class Balance:
+class CollisionBalance:
     """Largest violations of balances over all steps of a collision.
 
     Attributes
@@ -294,7 +294,7 @@ class Balance:
             setattr(self, name, max(getattr(self, name), value))
 
 
-def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance:
+def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> CollisionBalance:
     """Simulate a sheet and a smaller, tilted one above it that fly towards each other; collective."""
     side, small = 0.3, 0.24
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 50.0}
@@ -308,7 +308,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance
         "contact": {"gap": 0.005, "friction": friction},
         "time": {"end": FLIGHT, "step": 1.0 / n, "integrator": integrator},
     }
-    found = Balance()
+    found = CollisionBalance()
     with bench.simulation(content) as trial:
         system, contact = trial.simulation.problem.system, trial.simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)

@@ -34,7 +34,7 @@ from lyra_petsc.terms.bending.hinge import Bending
 
 
 @dataclass(frozen=True)
-class Hinges:
+class PlateHinges:
     """The energy ½ (slopes · z)² of every hinge for the deflections z [m] of its vertices.
 
     Attributes
@@ -49,7 +49,7 @@ class Hinges:
     slopes: Array
 
 
-def hinges_of(trial: Trial) -> Hinges:
+def hinges_of(trial: Trial) -> PlateHinges:
     """All hinges of the bending term in the start shape; collective."""
     problem = trial.simulation.problem
     term = next(term for term in problem.terms.values() if isinstance(term, Bending))
@@ -59,7 +59,7 @@ def hinges_of(trial: Trial) -> Hinges:
     mine = (term.elements.index[:n], problem.points.mesh_vertex_of_local()[term.stencil[:n]], slopes)
     index, stencil, slopes = map(np.concatenate, zip(*problem.points.comm.allgather(mine), strict=True))
     order = np.argsort(index)
-    return Hinges(stencil[order], slopes[order])
+    return PlateHinges(stencil[order], slopes[order])
 
 
 def _slopes(corners: Array) -> Array:
@@ -85,14 +85,14 @@ OFF_THE_LINES = 0.0917
 """Offset of the periodic cell over its size, such that no hinge lies on its border."""
 
 
-def strip_stiffness(hinges: Hinges, points: Array, start: float, period: float, width: float) -> float:
+def strip_stiffness(hinges: PlateHinges, points: Array, start: float, period: float, width: float) -> float:
     """B_effective [N·m] of a strip along x with free edges: moment per width over curvature.
 
     Lateral curvature, twist and deflections of the vertices are relaxed.
 
     Parameters
     ----------
-    hinges : Hinges
+    hinges : PlateHinges
     points : (V, 2) float64
         Vertices at rest [m].
     start, period : float [m]
@@ -107,12 +107,12 @@ def strip_stiffness(hinges: Hinges, points: Array, start: float, period: float, 
     return float(bent / (period * width))
 
 
-def sheet_stiffness(hinges: Hinges, points: Array, start: Sequence[float], lattice: Array) -> Array:
+def sheet_stiffness(hinges: PlateHinges, points: Array, start: Sequence[float], lattice: Array) -> Array:
     """D (3, 3) [N·m] of an infinite sheet: energy per area ½ κᵀ D κ with κ = (κ11, κ22, 2 κ12).
 
     Parameters
     ----------
-    hinges : Hinges
+    hinges : PlateHinges
     points : (V, 2) float64
         Vertices at rest [m].
     start : (2,)
@@ -126,7 +126,7 @@ def sheet_stiffness(hinges: Hinges, points: Array, start: Sequence[float], latti
     return energy / abs(float(np.linalg.det(lattice)))
 
 
-def _relaxed(hinges: Hinges, points: Array, shapes: Array, to_cell: Array, start: Array) -> Array:
+def _relaxed(hinges: PlateHinges, points: Array, shapes: Array, to_cell: Array, start: Array) -> Array:
     """Quadratic form (m, m) of the energy of a cell in the amplitudes of ``shapes`` (V, m).
 
     ``to_cell`` (d, 2) maps positions to lattice coordinates.

@@ -17,7 +17,7 @@ MIN_FALL = 0.01
 """Fall of the potential energy below its least value that counts as progress, over its range so far."""
 
 
-class Progress:
+class LoadStepProgress:
     """Out-of-balance forces and potential energies in a load step.
 
     Attributes
