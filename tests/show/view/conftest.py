@@ -115,6 +115,9 @@ def browser() -> Iterator[Any]:
         options.add_argument(f"--{word}")
     options.add_argument("--enable-unsafe-swiftshader")
     options.add_argument("--use-angle=swiftshader")
+    # for WebGL only: to draw the page around it with this renderer takes as long again
+    options.add_argument("--disable-gpu-rasterization")
+    options.add_argument("--disable-gpu-compositing")
     if os.geteuid() == 0:
         options.add_argument("--no-sandbox")  # it does not start as root otherwise
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})

@@ -124,8 +124,12 @@ class Seen:
         self.until(lambda: not self.elements(items))
 
     def complaints(self):
-        """Messages of the browser's console above the level of notes."""
-        return [line for line in self.browser.get_log("browser") if line["level"] not in ("INFO", "DEBUG")]
+        """Messages of the browser's console above the level of notes, without that on its own compositing."""
+        return [
+            line
+            for line in self.browser.get_log("browser")
+            if line["level"] not in ("INFO", "DEBUG") and "GPU stall due to ReadPixels" not in line["message"]
+        ]
 
     def asked_elsewhere(self, url):
         """Addresses asked for that are not those of our server."""
