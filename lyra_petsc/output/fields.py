@@ -200,7 +200,11 @@ def check_field(field: Field, problem: Problem) -> None:
         )
     if not any(term in problem.terms for term in field.terms):
         needed = " or ".join(f"'{term}'" for term in field.terms)
-        why = "no contact?" if field.terms == ("contact",) else "bending: 0?"
+        reasons: dict[tuple[str, ...], str] = {
+            ("contact",): "no contact?",
+            ("midedge",): "bending_model: hinge?",
+        }
+        why = reasons.get(field.terms, "bending: 0?")
         raise InputError(
             f"'{field.name}' needs the term {needed}, which this scene does not have ({why})",
             file=problem.scene.source,

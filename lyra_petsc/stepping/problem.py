@@ -199,6 +199,9 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
             file=scene.source,
             key="material",
         )
+    held = select_exact(scene, mesh)
+    _check_symmetry(rest, held)
+    _check_sliding(rest, held)
     elements: dict[str, Elements] = {}
     names: list[str] = []
     for entry in needed_terms(scene, rest.shells):
@@ -211,11 +214,8 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     spacing = mean_edge_length(mesh)
     largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, largest, scene)
-    held = select_exact(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
-    _check_symmetry(rest, held)
-    _check_sliding(rest, held)
     for entry in map(registration_of, names):
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
@@ -262,7 +262,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
-    """Refuse symmetry handles whose vertices are not in one plane, or at which hinges end."""
+    """Refuse symmetry handles off a plane, and those at which hinges end or a sheet lies in the plane."""
     scene, mesh = rest.scene, rest.mesh
     tolerance = FLAT * float(np.ptp(mesh.positions, axis=0).max())
     for number, vertices in held.items():
@@ -271,14 +271,22 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
             continue
         coordinate = mesh.positions[vertices][:, AXES.index(axis)]
         distance = np.abs(coordinate - np.median(coordinate))
+        at_plane = has_edge_in(mesh, vertices)
+        along = mesh.positions[mesh.triangles, AXES.index(axis)] - np.median(coordinate)
+        in_plane = (np.abs(along) <= tolerance).all(axis=1) & ~np.isin(mesh.triangles, vertices).all(axis=1)
         problem = ""
         if distance.max() > tolerance:
             problem = (
                 f"vertex {vertices[distance.argmax()]} lies {distance.max():.2g} m beside the plane {axis} = "
                 f"{np.median(coordinate):.6g} m; choose only vertices in one plane, or hold axes instead"
             )
-        elif (has_edge_in(mesh, vertices) & rest.bends_with("hinge")).any():
+        elif (at_plane & rest.bends_with("hinge")).any():
             problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
+        elif len(flat := np.flatnonzero(at_plane & in_plane)):
+            problem = (
+                f"triangle {flat[0]} lies in the plane {axis} = {np.median(coordinate):.6g} m, to which the "
+                "sheet must be normal; take another axis, or hold axes instead"
+            )
         if problem:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
 

@@ -52,15 +52,18 @@ def test_collapsed_triangles_have_no_curvature() -> None:
     assert not np.any(energy > 1e-30)
 
 
-def test_energy_densities_add_up() -> None:
-    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+@pytest.mark.parametrize("model", ["hinge", "midedge"])
+def test_energy_densities_add_up(model: str) -> None:
+    content = ALL | {"material": MATERIAL | {"bending_model": model}}
+    with Simulation(content, MPI.COMM_SELF) as simulation:
         simulation.set_state(x=simulation.x + np.random.default_rng(3).normal(0.0, 0.01, simulation.x.shape))
         area = simulation.problem.membrane.elements.data["area"]
         total = value(simulation, "membrane_energy") @ area
         assert total == pytest.approx(simulation.energy("membrane"))
         vertex_area = simulation.mass / 0.2
         bending = value(simulation, "bending_energy") @ vertex_area[simulation.problem.points.mesh_vertices]
-        assert bending == pytest.approx(simulation.energy("bending"))
+        name = "bending" if model == "hinge" else model
+        assert bending == pytest.approx(simulation.energy(name))
 
 
 def test_strain_and_stress_of_a_stretch() -> None:
@@ -92,4 +95,10 @@ def test_without_the_field_the_start_is_not_stored() -> None:
 def test_a_field_of_an_absent_term_is_refused() -> None:
     content = ALL | {"material": MATERIAL | {"bending": 0}, "output": {"fields": ["curvature"]}}
     with Simulation(content, MPI.COMM_SELF) as simulation, pytest.raises(InputError, match="bending"):
+        chosen_fields(simulation.problem)
+
+
+def test_the_curvature_tensor_of_hinges_is_refused_with_the_remedy() -> None:
+    content = ALL | {"output": {"fields": ["curvature_tensor"]}}
+    with Simulation(content, MPI.COMM_SELF) as simulation, pytest.raises(InputError, match="model: hinge"):
         chosen_fields(simulation.problem)

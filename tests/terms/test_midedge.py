@@ -852,6 +852,18 @@ def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> Non
             Run(MPI.COMM_SELF, scene_of(content))
 
 
+@pytest.mark.parametrize(
+    ("group", "axis", "words"),
+    [("left", "y", "beside the plane y"), ("sheet", "x", "beside"), ("left", "z", "lies in the plane z")],
+)
+def test_symmetry_of_a_flat_sheet_is_refused_with_its_key(group: str, axis: str, words: str) -> None:
+    """An edge normal to the plane gave the message on folds of the start shape, a sheet in the plane none."""
+    content = vault(grid(1.0, 0.5, 4, 2, "diagonal"), [{"group": group, "symmetry": axis}])
+    with pytest.raises(InputError, match=words) as raised:
+        Run(MPI.COMM_SELF, scene_of(content))
+    assert raised.value.key == "handles[1].symmetry"
+
+
 # -- moments -------------------------------------------------------------------------------------------
 
 
