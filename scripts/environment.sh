@@ -160,10 +160,10 @@ lock() {
     flock -n 9 || { say "waiting for another set-up of $venv" && flock 9; }
 }
 
-# install_missing EXTRA: the requirements of the project and of EXTRA ("run" for none) that are not met
+# install_missing EXTRA...: the requirements of the project and of these extras ("run" for none) that are not met
 install_missing() {
-    local wanted log=$venv/set-up.log
-    wanted=$("$venv/bin/python" -B "$helper" missing "$root/pyproject.toml" "${1/#run/stack}")
+    local extra wanted log=$venv/set-up.log
+    wanted=$("$venv/bin/python" -B "$helper" missing "$root/pyproject.toml" "${@/#run/stack}")
     [[ -z $wanted ]] || mapfile -t wanted <<<"$wanted"
     if [[ -n $wanted ]]; then
         say "installing from PyPI into $venv: ${wanted[*]}"
@@ -174,7 +174,7 @@ install_missing() {
             give_up "pip could not install these; its whole output is in $log"
         fi
     fi
-    fingerprint >"$venv/ready-$1"
+    for extra in "$@"; do fingerprint >"$venv/ready-$extra"; done
 }
 
 # --- the launcher --------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ set_launcher_environment() {
 # --- all together --------------------------------------------------------------------------------
 
 set_up() {
-    local extra extras=(run "$@") site lacking=no
+    local extra extras=(run "$@") site lacking=()
     if ! find_stack; then
         install_packages "${packages[@]}" "${faster[@]}"
         find_stack || give_up "petsc4py and mpi4py are installed but no interpreter sees them; $manual"
@@ -229,11 +229,11 @@ set_up() {
         python=("$base") # the environment in use has everything
         export PYTHONPATH=$root${PYTHONPATH:+:$PYTHONPATH}
     else
-        for extra in "${extras[@]}"; do is_up_to_date "$extra" || lacking=yes; done
-        if [[ $lacking == yes ]]; then
+        for extra in "${extras[@]}"; do is_up_to_date "$extra" || lacking+=("$extra"); done
+        if ((${#lacking[@]})); then
             lock
             make_venv
-            for extra in "${extras[@]}"; do is_up_to_date "$extra" || install_missing "$extra"; done
+            install_missing "${lacking[@]}"
             exec 9>&-
         fi
         python=("$venv/bin/python")
