@@ -14,6 +14,13 @@ if TYPE_CHECKING:
     from lyra_petsc.stepping.stage_equations import StageEquations
 
 
+MAX_ITERATIONS = 100
+"""Largest number of iterations for the rates of directors, whose equations are well-conditioned."""
+
+ROUND_OFF = 1e-10
+"""Norm of their residual over the first one at which they count as solved."""
+
+
 class StartAcceleration:
     """Gives accelerations to those that need them: at the start of a run, and after jumps of the forces.
 
@@ -67,6 +74,8 @@ class StartAcceleration:
         turns = bool(active.moving or active.constraints)
         if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
             active.move_targets(UpcomingStep(system.t0, system.t1, system.t0, x, system.reference.at))
+        if system.damping.active and system.points.n_edges_global:
+            self._balance_moments(v)
         force, mass = system.out_of_balance(v), system.mass[:, None]
         if turns:
             active.move_targets(UpcomingStep(system.t0, system.t1, at, x, system.reference.at))
@@ -78,3 +87,36 @@ class StartAcceleration:
                 if term.slips:
                     acceleration = impacts.hold_by_friction(system, term, v, acceleration)
         return acceleration
+
+    def _balance_moments(self, v: Array) -> None:
+        """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
+
+        Directors have no mass: damping balances their moments. Other rates would give the vertices the
+        accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
+        """
+        system, layout = self._system, self._system.points
+        edges, free = slice(layout.n_vertices, layout.n_owned), system.prescribed.free
+        diagonal, increment = np.zeros_like(v), np.zeros_like(v)
+        for term in system.active.with_edges:
+            damping = term.elements.data["damping"]
+            diagonal.reshape(-1)[term.edge_indices] = term.edge_stiffness(damping)
+        scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
+        residual = system.out_of_balance(v)[edges]
+        direction = scale * residual
+        square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
+        for _ in range(MAX_ITERATIONS):
+            increment[edges] = direction
+            layout.update_ghosts(increment)
+            product = np.where(free, system.damping.product(increment), 0.0)[edges]
+            power = layout.global_sum(float(np.vdot(direction, product)))[0]
+            if not power > 0.0:
+                break
+            v[edges] += square / power * direction
+            residual -= square / power * product
+            before, square = square, layout.global_sum(float(np.vdot(residual, scale * residual)))[0]
+            if square <= ROUND_OFF**2 * first:
+                break
+            direction = scale * residual + square / before * direction
+        layout.update_ghosts(v)
+        system.v[edges] = v[edges]
+        system.state.update_ghosts()

@@ -651,9 +651,8 @@ class Elastic(Term):
     def clear_cache(self) -> None:
         """Free everything that can be computed again from positions."""
 
-    @property
-    def edge_stiffness(self) -> Array:
-        """Stiffness [N/m] of the edges' unknowns in the rest shape, (n,)."""
+    def edge_stiffness(self, weight: Array | None = None) -> Array:
+        """Stiffness [N/m] of the edges' unknowns in the rest shape, (n,), with elements weighted (E,)."""
         return np.empty(0)
 
     def updated_frames(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:

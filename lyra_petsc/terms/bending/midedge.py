@@ -183,9 +183,10 @@ class MidEdge(Elastic):
         self._at_end = self._transported(frozen, x)
         return self._at_end
 
-    @property
-    def edge_stiffness(self) -> Array:
+    def edge_stiffness(self, weight: Array | None = None) -> Array:
         diagonal = self.elements.data["stiffness"][:, [0, 3, 5]]
+        if weight is not None:
+            diagonal = weight[:, None] * diagonal
         sums = np.bincount(self.of_edges.of_triangles.ravel(), diagonal.ravel())
         return np.asarray(sums / self.of_edges.length**2)
 
