@@ -43,8 +43,9 @@ from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Stepper
 from lyra_petsc.terms import registry
 from lyra_petsc.terms.contact import barrier, contact_pairs
-from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, Barrier, ContactBarrier, ObstaclePositions
+from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, Barrier, ContactBarrier
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact.obstacle_points import ObstaclePositions
 from lyra_petsc.terms.term import UpcomingStep
 
 Array = NDArray[np.float64]

@@ -22,7 +22,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
-from lyra_petsc.mesh.near import near_pairs, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.symmetry import symmetry_walls
@@ -30,9 +29,11 @@ from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.contact import contact_pairs, surface_shares
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
-from lyra_petsc.terms.contact.contact_search import SheetSearch, Simplices
+from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact.obstacle_points import ObstaclePositions, Obstacles
+from lyra_petsc.terms.contact.obstacle_search import ObstacleSearch
 from lyra_petsc.terms.contact.one_sided import Springs
+from lyra_petsc.terms.contact.sheet_search import SheetSearch
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, StepInterval, UpcomingStep
@@ -60,9 +61,6 @@ EDGE_GAP = 0.3
 lie on each other are kept apart by pairs of vertices and triangles, two for each vertex; pairs of edges, of
 which there are ten times as many, are needed only for what these miss. The same holds for edges and points of
 obstacles' smooth surfaces, so that forces on the vertices of a sheet do not depend on the obstacle's mesh."""
-
-SHARP_ANGLE = 0.5
-"""Angle [rad] between two triangles of an obstacle above which their common edge has the full gap."""
 
 SKIN = 0.5
 """Distance over the gap by which points may approach each other between two searches."""
@@ -116,23 +114,6 @@ class Barrier(NamedTuple):
     walls: tuple[Container, ...] = ()
 
 
-class ObstaclePositions(NamedTuple):
-    """Obstacles in one step.
-
-    Attributes
-    ----------
-    start, stage, end : (m, 3)
-        Points of all obstacles [m], and normals of planes, at the start, the stage and the end of the step.
-    stage_motions : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle from the start to the stage.
-    """
-
-    start: Array
-    stage: Array
-    end: Array
-    stage_motions: list[tuple[Array, Array]]
-
-
 class ActivePairs(NamedTuple):
     """Pairs nearer than the gap; of those with the same nearest vertices only one.
 
@@ -175,182 +156,6 @@ _EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EM
 NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
 
 
-class Obstacles:
-    """The points of all obstacles in one array, and their simplices.
-
-    Attributes
-    ----------
-    triangles, edges, points, planes, segments : (n, 5)
-        Numbers of three points, number of the obstacle, and for triangles the code of `surface_shares.rings`.
-        A plane is a point and a normal. The axis of a nearly flat sphere or rod is also a degenerate
-        triangle.
-    each : list of Solid or Container
-        First those of the scene, then the symmetry planes.
-    first_wall : int
-        Number of the first symmetry plane.
-    radius : (obstacles + 1,)
-        Offset [m] of each; the last, 0, is that of sheets.
-    moving : bool
-        Whether any obstacle moves.
-    places : dict
-        Number of each obstacle and of its first point, by name.
-    smooth_points : (n,) bool
-        Which points are vertices of triangles, but not of sharp edges.
-    smooth_edges : (m,) int64
-        Edges of triangles that are not sharp, in ascending order: lower number × ``n_points`` + higher
-        number.
-    """
-
-    def __init__(
-        self,
-        obstacles: Sequence[Solid | Container],
-        flat: float = np.inf,
-        walls: Sequence[Container] = (),
-        wall_radius: float = 0.0,
-    ) -> None:
-        self.first_wall = len(obstacles)
-        self.each = obstacles = [*obstacles, *walls]
-        parts: dict[str, list[Ints]] = {
-            kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
-        }
-        radius, first, begins = np.zeros(len(obstacles) + 1), 0, []
-        smooth_points, smooth_edges = [np.empty(0, dtype=np.bool_)], [np.empty((0, 2), dtype=np.int64)]
-        is_point = [np.empty(0, dtype=np.bool_)]
-        for number, obstacle in enumerate(obstacles):
-            n = len(obstacle.points)
-            begins.append(first)
-
-            def rows(simplices: Ints, number: int = number, first: int = first) -> Ints:
-                n, m = simplices.shape
-                filled = np.concatenate([simplices, np.repeat(simplices[:, :1], 3 - m, axis=1)], axis=1)
-                rings = surface_shares.rings(simplices) if m == 3 else np.zeros(n, dtype=np.int64)
-                return np.column_stack([filled + first, np.full(n, number), rings])
-
-            if isinstance(obstacle, Solid):
-                radius[number] = obstacle.radius
-                edges, sharp = _triangle_edges(obstacle)
-                smooth_edges.append(first + edges[~sharp])
-                points = np.zeros(n, dtype=np.bool_)
-                points[obstacle.triangles] = True
-                points[edges[sharp]] = False
-                smooth_points.append(points)
-                parts["triangles"].append(rows(obstacle.triangles))
-                parts["edges"].append(rows(obstacle.edges))
-                parts["points"].append(rows(np.arange(n)[:, None]))
-                if obstacle.radius >= flat:
-                    points[:] = True
-                    smooth_edges.append(first + obstacle.edges)
-                    axis = np.array([[0, n - 1, n - 1]])
-                    parts["triangles"].append(np.column_stack([axis + first, [number], [0]]))
-            elif obstacle.kind == "planes":
-                parts["planes"].append(rows(np.column_stack([np.arange(n), np.arange(n, 2 * n)])))
-                n *= 2
-            else:
-                radius[number] = -obstacle.radius
-                parts["segments"].append(rows(np.array([[0, n - 1]])))
-            if not isinstance(obstacle, Solid):
-                smooth_points.append(np.zeros(n, dtype=np.bool_))
-            is_point.append(np.arange(n) < len(obstacle.points))  # else normals
-            first += n
-        radius[self.first_wall : -1] = wall_radius
-        smooth = np.concatenate(smooth_edges)
-        self.smooth_points = np.concatenate(smooth_points)
-        self.smooth_edges = np.sort(smooth[:, 0] * first + smooth[:, 1])
-        empty = np.empty((0, 5), dtype=np.int64)
-        self.triangles, self.edges, self.points, self.planes, self.segments = (
-            np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
-        )
-        self.radius, self.n_points = radius, first
-        self.moving = any(obstacle.motion is not None for obstacle in obstacles)
-        self._first = np.array(begins, dtype=np.int64)
-        self._is_point = np.concatenate(is_point)
-        self.places = {each.name: (number, begins[number]) for number, each in enumerate(obstacles)}
-        self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
-        self._fixed_positions: Array | None = None
-        if not self.moving:
-            self._fixed_positions = self.positions(0.0)
-
-    def positions(self, time: float) -> Array:
-        """Points and normals (m, 3) at a time [s]."""
-        if self._fixed_positions is not None:
-            return self._fixed_positions
-        rows = [np.empty((0, 3))]
-        for obstacle in self.each:
-            rows.append(obstacle.positions(time))
-            if isinstance(obstacle, Container) and obstacle.kind == "planes":
-                rows.append(obstacle.normals_at(time))
-        return np.concatenate(rows)
-
-    def step_positions(self, start: float, stage: float, end: float) -> tuple[Array, Array]:
-        """Points and normals (3, m, 3) at the start, the stage and the end of a step at these times [s], and
-        the distance (obstacles, 3) [m] of each obstacle at the stage from its path.
-
-        At the stage the centre of its points is on the straight line between both ends of the step, as the
-        stage of a sheet is. On the path of an obstacle with acceleration a the midpoint rule would find a
-        sheet at rest on it by a Δt²/8 nearer or farther than at the ends.
-        """
-        x, shift = (
-            np.stack([self.positions(time) for time in (start, stage, end)]),
-            np.zeros((len(self.each), 3)),
-        )
-        if self.moving and start < stage < end:
-            fraction, count = (stage - start) / (end - start), self._is_point.astype(float)
-            from_path = (1.0 - fraction) * x[0] + fraction * x[2] - x[1]
-            shift = np.add.reduceat(from_path * count[:, None], self._first)
-            shift /= np.add.reduceat(count, self._first)[:, None]
-            x[1] += count[:, None] * np.repeat(shift, np.diff(self._first, append=len(count)), axis=0)
-        return x, shift
-
-    def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
-        """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
-        low, high = x.min(axis=0), x.max(axis=0)
-        return np.minimum.reduceat(low, self._first), np.maximum.reduceat(high, self._first)
-
-    def path_deviations(self, start: float, end: float) -> Array:
-        """Largest deviation [m] of each obstacle's paths from straight lines between two times [s],
-        (obstacles,).
-        """
-        times, out = np.linspace(start, end, 9), np.zeros(len(self.each))
-        for number, each in enumerate(self.each):
-            if each.motion is not None:
-                first, *between, last = (each.positions(time) for time in times)
-                chord = last - first
-                square = np.maximum(np.sum(chord * chord, axis=1, keepdims=True), np.finfo(float).tiny)
-                for x in between:
-                    t = np.clip(np.sum((x - first) * chord, axis=1, keepdims=True) / square, 0.0, 1.0)
-                    deviation = np.linalg.norm(x - first - t * chord, axis=1).max(initial=0.0)
-                    out[number] = max(out[number], float(deviation))
-        return out
-
-    def rigid_motions(self, start: float, end: float) -> list[tuple[Array, Array]]:
-        """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
-        if not self.moving:
-            return self._at_rest
-        motions = []
-        for each in self.each:
-            (r0, t0), (r1, t1) = each.rigid_motion(start), each.rigid_motion(end)
-            rotation = r1 @ r0.T
-            motions.append((rotation, t1 - rotation @ t0))
-        return motions
-
-    def contact_displacements(
-        self, x: Array, points: Ints, beta: Array, obstacle: Ints, motions: list[tuple[Array, Array]]
-    ) -> Array:
-        """Displacements (m, 3) [m] of obstacles at their contacts, times Σ β_i of the sheet's points.
-
-        ``points``, ``beta`` (m, 4) and ``obstacle`` (m,) are the pairs at positions x (n_local, 3) after the
-        ``motions``; 0 for pairs between sheets, whose obstacle is −1.
-        """
-        out = np.zeros((len(points), 3))
-        for number, (rotation, translation) in enumerate(motions if self.moving else []):
-            rows = np.flatnonzero(obstacle == number)
-            sheet_beta = np.where(points[rows] >= 0, beta[rows], 0.0)
-            side = sheet_beta.sum(axis=1, keepdims=True)
-            contact = np.einsum("ei,eik->ek", sheet_beta, x[np.maximum(points[rows], 0)]) / side
-            out[rows] = side * (contact - (contact - translation) @ rotation)
-        return out
-
-
 class ContactBarrier(Elastic):
     """The barrier energy of all near pairs.
 
@@ -370,13 +175,12 @@ class ContactBarrier(Elastic):
         empty = {"what": np.empty((0, 8)), "number": np.empty((0, 4))}
         self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
-        self._obstacle_x, self._deviations = np.empty((3, 0, 3)), np.zeros(1)
+        self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
+        self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, 0.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
         self.surface_marks = marks
         self._capacity = 0
-        self._obstacle_boxes: tuple[Array, Array] | None = None  # of obstacles in ``_obstacle_x``
-        self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
         self._searched: Ints | None = None  # triangles that the search has
         self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
         self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
@@ -396,11 +200,10 @@ class ContactBarrier(Elastic):
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
-        self._obstacle_x = self._next_obstacle_x = np.stack([self.obstacles.positions(0.0)] * 3)
-        start, stage, end = self._obstacle_x
+        self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, self.search_distance)
+        start, stage, end = self._next_obstacle_x = self._obstacle_search.x
         self._at_rest = ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(0.0, 0.0))
         self.stale = False
-        self._deviations, self._obstacle_boxes = np.zeros(1), None
 
     def set_elements(self, elements: Elements) -> None:
         super().set_elements(elements)
@@ -418,7 +221,7 @@ class ContactBarrier(Elastic):
         self.pair_stiffness *= self._image_scale**2
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
-        largest = np.append(np.abs(self._obstacle_x).max(axis=(0, 2)), 0.0)
+        largest = np.append(np.abs(self._obstacle_search.x).max(axis=(0, 2)), 0.0)
         of_points = largest[np.where(self.points < 0, ~self.points, -1)]
         self._largest_coordinate = np.maximum(np.abs(self.offset), of_points.max(axis=1))
         self._springs: Springs | None = None
@@ -444,11 +247,12 @@ class ContactBarrier(Elastic):
         if not self.moving:
             return self._at_rest
         times = step.start, step.target_time, step.end
+        search = self._obstacle_search
         self._next_obstacle_x, shift = self.obstacles.step_positions(*times)
-        largest = np.linalg.norm(self._next_obstacle_x - self._obstacle_x, axis=-1).max(initial=0.0)
+        largest = np.linalg.norm(self._next_obstacle_x - search.x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
         self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
-        self._deviations = self.obstacles.path_deviations(step.start, step.end)
+        search.deviations = self.obstacles.path_deviations(step.start, step.end)
         start, stage, end = self._next_obstacle_x
         motions = self.obstacles.rigid_motions(*times[:2])
         motions = [(rotation, t + more) for (rotation, t), more in zip(motions, shift, strict=True)]
@@ -462,7 +266,7 @@ class ContactBarrier(Elastic):
 
     def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         if self.moving:
-            self._obstacle_x, self._obstacle_boxes = self._next_obstacle_x, None
+            self._obstacle_search.move(self._next_obstacle_x)
         self.stale = False
         if triangles is not self._searched:
             self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
@@ -481,7 +285,7 @@ class ContactBarrier(Elastic):
         boxes = self._sheet_search.boxes(x, dx)
         found = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.each:
-            found += self._obstacle_pairs(x, dx, boxes)
+            found += self._obstacle_search.pairs(x, dx, boxes, self._walled)
         if self.self_contact:
             radius = self.search_distance
             edge_radius = radius - (1.0 - EDGE_GAP) * self.barrier.gap
@@ -512,109 +316,6 @@ class ContactBarrier(Elastic):
         # no edge between two planes is shorter than the gap
         in_one = np.ptp(place, axis=1) < 0.5 * self.barrier.gap
         return (on_planes.all(axis=1) & in_one).sum(axis=1)
-
-    def _within_radius(
-        self, x: Array, dx: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints
-    ) -> Ints:
-        """Rows (m, 7) of the pairs that may come within the search distance on displacements dx (N, 3)."""
-        points, bounds = points.astype(np.int64), np.empty(len(points))
-        kinds = np.full(len(points), kind)
-        radius = self.search_distance + self.obstacles.radius[obstacle] + self._deviations.max()
-        start = self._obstacle_x[0]
-        _, to_stage, to_end = self._obstacle_x - start
-        farther = np.linalg.norm(to_end, axis=1) > np.linalg.norm(to_stage, axis=1)
-        longer = np.where(farther[:, None], to_end, to_stage)
-        contact_pairs.swept_distance_bounds(x, start, dx, longer, kinds, points, radius, bounds)
-        return np.column_stack([kinds, obstacle, points, rings])[bounds < radius]
-
-    def _obstacle_pairs(self, x: Array, dx: Array, boxes: Array) -> list[Ints]:
-        """Pairs of sheets and obstacles anywhere on their displacements in the step.
-
-        ``boxes`` are those of the patches of sheets (`SheetSearch.boxes`).
-        """
-        obstacles, sheets = self.obstacles, self._sheet_search
-        patches = np.minimum(boxes[0], boxes[2]), np.maximum(boxes[1], boxes[3])
-        if not len(patches[0]):
-            return []
-        low, high = patches[0].min(axis=0), patches[1].max(axis=0)
-        radius = self.search_distance + self._deviations.max()
-        obstacle_x = self._obstacle_x if self.moving else self._obstacle_x[:1]
-        found = self._container_pairs(x, dx, patches, obstacle_x, radius)
-        if self._obstacle_boxes is None:
-            self._obstacle_boxes = obstacles.bounding_boxes(obstacle_x)
-        margin = (radius + obstacles.radius[:-1])[:, None]
-        lowest, highest = self._obstacle_boxes
-        is_near = ((lowest - margin <= high) & (highest + margin >= low)).all(axis=1)
-        if not is_near.any():
-            return found
-
-        def add_pairs(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
-            others = others[is_near[others[:, 3]]]
-            if not len(others):
-                return
-            swept = obstacle_x[:, others[:, :size]]
-            margin = (radius + obstacles.radius[others[:, 3]])[:, None]
-            boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
-            kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
-            others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
-            near_patches = near_pairs(patches, boxes)
-            if not len(near_patches):
-                return
-            corners = sheet.corners_of(np.unique(near_patches[:, 0]))
-            pairs = near_pairs(swept_boxes(x, dx, corners), boxes)
-            own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
-            points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
-            rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
-            found.append(self._within_radius(x, dx, kind, others[pairs[:, 1], 3], points, rings))
-
-        add_pairs(VERTEX_TRIANGLE, sheets.vertices, obstacles.triangles, 3, sheet_first=True)
-        add_pairs(VERTEX_TRIANGLE, sheets.triangles, obstacles.points, 1, sheet_first=False)
-        add_pairs(EDGE_EDGE, sheets.edges, obstacles.edges, 2, sheet_first=True)
-        return found
-
-    def _container_pairs(
-        self, x: Array, dx: Array, patches: tuple[Array, Array], obstacle_x: Array, radius: float
-    ) -> list[Ints]:
-        """Pairs of vertices and planes, and of vertices in balls and capsules and the axis segments."""
-        found = []
-        for kind, others in ((VERTEX_PLANE, self.obstacles.planes), (VERTEX_INSIDE, self.obstacles.segments)):
-            if not len(others):
-                continue
-            low, high = patches[0].min(axis=0, keepdims=True), patches[1].max(axis=0, keepdims=True)
-            # distances of two points from a plane or segment differ at most by the points' distance
-            for lower, upper in ((low, high), patches):
-                half_diagonal = 0.5 * np.linalg.norm(upper - lower, axis=1)
-                close = self._is_close(
-                    0.5 * (lower + upper), kind, others, obstacle_x, radius + half_diagonal
-                )
-                others = others[close.any(axis=0)]
-                if not len(others):
-                    break
-            else:
-                single = self._sheet_search.vertices.corners_of(np.flatnonzero(close.any(axis=1)))[:, 0]
-                close = np.zeros((len(single), len(others)), dtype=np.bool_)
-                for end in (x, x + dx):  # on straight paths the distance is lowest at an end
-                    close |= self._is_close(end[single], kind, others, obstacle_x, radius)
-                walls = np.flatnonzero(others[:, 3] >= self.obstacles.first_wall)
-                close[:, walls] &= self._walled[single][:, others[walls, 3] - self.obstacles.first_wall]
-                number, plane = np.nonzero(close)
-                points = np.column_stack([single[number], ~others[plane, :3]])
-                zeros = np.zeros(len(points), dtype=np.int64)
-                found.append(np.column_stack([zeros + kind, others[plane, 3], points, zeros]))
-        return found
-
-    def _is_close(
-        self, points: Array, kind: int, others: Ints, obstacle_x: Array, radius: float | Array
-    ) -> NDArray[np.bool_]:
-        """Whether points (n, 3) [m] are within radius [m] of planes or segments (m, 5), (n, m)."""
-        n, m = len(points), len(others)
-        pairs = np.column_stack([np.repeat(np.arange(n), m), np.tile(~others[:, :3], (n, 1))])
-        kinds, out, smallest = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
-        for positions in obstacle_x:
-            contact_pairs.distances(points, positions, kinds, pairs, out)
-            smallest = np.minimum(smallest, out.reshape(n, m))
-        smallest -= self.obstacles.radius[others[:, 3]]
-        return smallest < np.reshape(radius, (-1, 1))
 
     # -- energy ------------------------------------------------------------------------------------
 
@@ -760,10 +461,10 @@ class ContactBarrier(Elastic):
     ) -> bool:
         if not self.n_elements:
             return True
-        curved = np.flatnonzero(self._deviations > MAX_DEVIATION * self.barrier.gap)
+        curved = np.flatnonzero(self._obstacle_search.deviations > MAX_DEVIATION * self.barrier.gap)
         if len(curved) and np.isin(self.obstacle, curved).any():
             return False
-        motion = _displacements(frozen, interval, dx)
+        motion = frozen.displacements(interval, dx)
         return bool(contact_pairs.free_fraction(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
 
     def distances(self, x: Array, obstacle_x: Array) -> Array:
@@ -776,7 +477,7 @@ class ContactBarrier(Elastic):
         return (self._image_scale * self.distances(x, frozen.stage))[: self.n_owned]
 
     def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
-        """The collision-free fractions (n,) of the first n pairs, with a motion from `_displacements`."""
+        """The collision-free fractions (n,) of the first n pairs in a motion of `ObstaclePositions`."""
         out = np.empty(n)
         contact_pairs.free_fractions(x, *motion, *self._geometry, KEPT_FRACTION, out)
         return out
@@ -784,10 +485,10 @@ class ContactBarrier(Elastic):
     def collision_free_fractions(
         self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
     ) -> Array:
-        return self._free_fractions(x, _displacements(frozen, interval, dx), self.n_owned)
+        return self._free_fractions(x, frozen.displacements(interval, dx), self.n_owned)
 
     def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
-        motion = _displacements(frozen, TO_STAGE, dx)
+        motion = frozen.displacements(TO_STAGE, dx)
         return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
 
     def pair(self, element: int) -> Pair:
@@ -833,7 +534,7 @@ class ContactBarrier(Elastic):
     def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
         if not self.moving:
             return dx
-        motion = _displacements(frozen, TO_STAGE, dx)
+        motion = frozen.displacements(TO_STAGE, dx)
         blocked = self._free_fractions(x, motion, self.n_elements) < 1.0
         moved = dx.copy()
         for number, (rotation, translation) in enumerate(frozen.stage_motions):
@@ -926,37 +627,6 @@ class ContactBarrier(Elastic):
             smallest = min(smallest, (scale[rows] * (distance - self.offset[rows])).min())
         work = {"friction_work": 0.0}  # replaced by the friction term's if there is one
         return work | {"contacts": float(active.owned_weight.sum()), "smallest_gap": float(smallest)}
-
-
-def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
-    """Edges (n, 2) of an obstacle's triangles, lower numbers first, and whether they are sharp: at the
-    boundary, or with an angle above `SHARP_ANGLE`.
-    """
-    triangles = obstacle.triangles.astype(np.int64).reshape(-1, 3)
-    a, b, c = (obstacle.points[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    sign = np.where(sides[:, :1] < sides[:, 1:], 1.0, -1.0)
-    edges, number, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(edges), 3))
-    np.add.at(sums, number.ravel(), sign * np.tile(normal, (3, 1)))  # n − n′ of equally oriented triangles
-    difference = np.linalg.norm(sums, axis=1)
-    return edges, (count != 2) | (difference > 2.0 * np.sin(0.5 * SHARP_ANGLE))
-
-
-def _displacements(
-    frozen: ObstaclePositions, interval: StepInterval, dx: Array
-) -> tuple[Array, Array, Array]:
-    """Positions of obstacles' points at the start of an interval of the step, and the displacements of sheets
-    and of obstacles in it.
-    """
-    begin, end = interval
-    if begin >= 1.0:
-        moved = frozen.end - frozen.stage
-        return frozen.stage + (begin - 1.0) * moved, dx, (end - begin) * moved
-    moved = frozen.stage - frozen.start
-    return frozen.start + begin * moved, dx, (end - begin) * moved
 
 
 def elements(rest: RestShape) -> Elements:
