@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -103,6 +104,14 @@ def test_imports_go_in_one_direction() -> None:
 )
 def test_an_upward_import_is_found(source: str, name: str, found: list[str]) -> None:
     assert upward(ast.parse(source), f"lyra_petsc.{name}") == found
+
+
+def test_names_of_classes_and_modules_occur_once() -> None:
+    """A search for a name leads to one place."""
+    names = Counter(path.stem for path in MODULES if path.name != "__init__.py")
+    classes = (node.name for path in MODULES for node in parsed(path).body if isinstance(node, ast.ClassDef))
+    names.update(classes)
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_only_the_command_line_prints() -> None:
