@@ -411,7 +411,8 @@ class Material(Block):
         Stretching stiffness.
     bending : float or (3,) or PlateStiffness [N·m] or None
         Cylindrical bending stiffness B; three values are for hinges whose edge is at 0°, 45°, 90° to the
-        warp. Or a block with the four numbers of an orthotropic plate.
+        warp, and ``midedge`` takes them as d11, d33 + (d11 + d22)/4 and d22. Or a block for an orthotropic
+        plate.
     bending_model : str or None
         ``hinge``: angles between neighbouring triangles; fast, but the stiffness of plates depends on the
         mesh. ``midedge``: an additional unknown on every edge; converges on any mesh. The default is
