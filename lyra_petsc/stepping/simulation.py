@@ -65,6 +65,9 @@ IMPACT_SKIN_FRACTION, IMPACT_RUN_FRACTION = 0.02, 1e-4
 adaptive steps are not shortened for the error of an impact, which would lead to ever shorter ones.
 """
 
+DOUBTFUL = 0.1
+"""Residual at round-off over the loads above which a note doubts an equilibrium."""
+
 START_HALVINGS = 2
 """Halvings after which backward Euler takes a step of a damped sheet at the start or after a jump."""
 
@@ -372,10 +375,13 @@ class SteppedScene:
         loads = float(np.sum(self.problem.system.applied.force**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
+            times = residual / driving
+            doubt = "; slender triangles or a stiffness that is too large for the loads may make it wrong"
             self._note_once(
                 "roundoff",
                 f"step {self.step_number} ({self.time_text()}) ended at round-off: double precision leaves "
-                f"a residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads",
+                f"a residual of {residual:.2g} N at this stiffness, {times:.1g} times the loads"
+                + (doubt if self.scene.time.static and times > DOUBTFUL else ""),
             )
 
     def time_text(self) -> str:
