@@ -150,13 +150,13 @@ def verify(
     """
     from lyra_petsc.experiments.verification import verification_case
     from lyra_petsc.experiments.verification.cases import CASES
-    from lyra_petsc.experiments.verification.verification_case import Verification
+    from lyra_petsc.experiments.verification.verification_case import VerificationView
 
     if listed:
         return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
     cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
     again = command(comm, "verify", [*names, *to_arguments({"--quick": quick})])
-    results = Results(comm, out, Verification(), ranks=comm.size, command=again, force=force)
+    results = Results(comm, out, VerificationView(), ranks=comm.size, command=again, force=force)
     run = partial(verification_case.run_case, comm, quick=quick, watch=stop_check(comm))
     return _run(comm, results, cases, run, len(CASES.modules))
 
@@ -187,7 +187,7 @@ def stress(
     """
     from lyra_petsc.experiments.stress import stress_runner
     from lyra_petsc.experiments.stress.cases import FAMILIES, selected
-    from lyra_petsc.experiments.stress.stress_runner import Stress
+    from lyra_petsc.experiments.stress.stress_runner import StressView
     from lyra_petsc.experiments.stress.stress_scenes import Scope, StressCase, setting_of
 
     if quick and full:
@@ -226,7 +226,7 @@ def stress(
         on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.saved()))
         return 0 if outcome.passed else FAILED
     arguments = [*asked, *to_arguments({"--only": ",".join(names), "--ranks": ranks})]
-    again, view = command(comm, "stress", arguments), Stress(setting, len(cases))
+    again, view = command(comm, "stress", arguments), StressView(setting, len(cases))
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, known)
 

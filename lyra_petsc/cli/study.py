@@ -16,7 +16,7 @@ from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.results import Results
 from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
-from lyra_petsc.experiments.study.study_report import Study
+from lyra_petsc.experiments.study.study_report import StudyView
 from lyra_petsc.experiments.study.study_runner import StudyRunner, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
@@ -62,7 +62,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **give
         with StudyProgress(comm, check, len(plan.combinations), plain=petsc_prints()) as progress:
             for note in [*plan.notes, *([directory.note] if directory.note else [])]:
                 progress.note(note)
-            view = Study(StudyRunner(comm, plan, chosen, folder, progress, launcher, lock))
+            view = StudyView(StudyRunner(comm, plan, chosen, folder, progress, launcher, lock))
             again = command(comm, "study", _arguments(plan))
             results = Results(comm, folder, view, ranks=view.ranks, command=again, force=True)
             results.run(view.cases(), view.runner.run)
@@ -81,7 +81,7 @@ def _arguments(plan: Plan) -> list[str]:
     return [request.scene, *to_arguments(options | {"--trust-mesh": request.trust_mesh})]
 
 
-def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
+def _close(comm: MPI.Comm, view: StudyView, folder: Path) -> None:
     """Print the outcome; raises if the study failed as a whole."""
     rows = view.runner.rows
     done = sum(row.passed for row in rows)

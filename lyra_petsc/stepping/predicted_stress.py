@@ -1,7 +1,7 @@
-"""The stress that the next Jacobian takes: predicted at Newton's last iterate.
+"""The stress that the Jacobian takes at Newton's iterate: predicted from the iterate before.
 
-It is the strain's linearisation at the iterate before, as in a mixed method: stiff sheets then converge as
-fast as soft ones. (Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. Engng 313, 2017.)
+The strain is linearised at the iterate before, as in a mixed method: stiff sheets then converge as fast as
+soft ones. (Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. Engng 313, 2017.)
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class PredictedStress:
         self._at_state = False
 
     def set_iterate(self, x: Array) -> None:
-        """Predict the stress of the next iterate's Jacobian to positions x (n_local, 3) [m]."""
+        """Take Newton's iterate x (n_local, 3) [m], and predict its stress from the iterate before."""
         before, self._iterate = self._iterate, x.copy()
         reached = self._iterate if self._uncorrected is None else self._uncorrected
         self.positions = None if before is None else (before, before if self._at_state else reached)
         self._uncorrected, self._at_state = None, False
 
     def take_uncorrected(self, x: Array) -> None:
-        """Predict the stress at x (n_local, 3) [m], the next iterate before a correction."""
+        """Predict the stress of the next iterate at x (n_local, 3) [m], where it was before a correction."""
         self._uncorrected = x.copy()
 
     def take_state(self, x: Array) -> None:

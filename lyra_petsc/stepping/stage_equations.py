@@ -98,6 +98,7 @@ class StageEquations:
     prescribed_force: Array | None = None
     contact_impulses: ContactImpulses | None = None
     has_active_pairs = solving_edges = False
+    _contact_energy: float | None = None  # at the start of the step
     _past_velocity: Array | None = None  # (n_owned, 3) before the last step, if there is contact
 
     def __init__(
@@ -190,9 +191,7 @@ class StageEquations:
         self.start_acceleration.begin_step(t0 + after, changed)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
-        if self.removes_contact_surplus:
-            terms = self.active.limiting
-            self._contact_energy = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
+        self._contact_energy = self._energy_of_contact()
         self.history = self.v[:n] if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
@@ -309,8 +308,7 @@ class StageEquations:
                 return
             from lyra_petsc.stepping import impacts  # needed only if something is near
 
-            before_contact = self._contact_energy if self.removes_contact_surplus else None
-            self.contact_impulses = impacts.apply_impulses(self, before, before_contact)
+            self.contact_impulses = impacts.apply_impulses(self, before, self._contact_energy)
 
     def go_on_with(self, integrator: Integrator, v_before: Array) -> None:
         """Change the integrator after a step from velocities v_before (n_owned, 3) that another one took."""
@@ -405,10 +403,14 @@ class StageEquations:
         self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
 
-    @property
-    def removes_contact_surplus(self) -> bool:
-        """Whether the energy that contact adds is known and removed; not so with moving obstacles."""
-        return self.integrator.exact_work and bool(self.active.limiting) and not self.active.pushing
+    def _energy_of_contact(self) -> float | None:
+        """Energy [J] of this rank's contact; None if what a step adds to it is not known, as with moving
+        obstacles, and so not removed.
+        """
+        if not self.integrator.exact_work or not self.active.limiting or self.active.pushing:
+            return None
+        frozen = self.active.frozen
+        return sum(float(term.energies(self.x, frozen[term]).sum()) for term in self.active.limiting)
 
     def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
         """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].

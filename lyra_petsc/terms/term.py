@@ -652,7 +652,7 @@ class Elastic(Term):
         """Free everything that can be computed again from positions."""
 
     def edge_stiffness(self, weight: Array | None = None) -> Array:
-        """Stiffness [N/m] of the edges' unknowns in the rest shape, (n,), with elements weighted (E,)."""
+        """Stiffness [N/m] of the edges' unknowns at rest, (n,), of elements times ``weight`` (E,)."""
         return np.empty(0)
 
     def updated_frames(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:

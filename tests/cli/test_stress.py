@@ -21,7 +21,7 @@ from launch import (
 )
 
 from lyra_petsc.experiments.stress.cases import FAMILIES
-from lyra_petsc.experiments.stress.stress_runner import Stress
+from lyra_petsc.experiments.stress.stress_runner import StressView
 
 TWO = ["--only", "one-triangle,chain-1e6"]
 
@@ -45,7 +45,7 @@ def test_cases_pass_and_tables_and_a_page_with_pictures_are_written(tmp_path: Pa
     assert "2 of 2 cases passed" in left.out
     folder = tmp_path / "stress" / "sheet"
     rows = read_csv(folder / "stress.csv")
-    assert tuple(rows[0]) == Stress.columns
+    assert tuple(rows[0]) == StressView.columns
     assert [row["case"] for row in rows] == ["one-triangle", "chain-1e6"]
     assert {row["passed"] for row in rows} == {"True"}
     assert [int(row["steps"]) for row in rows] == [40, 40]

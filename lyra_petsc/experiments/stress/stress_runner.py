@@ -328,7 +328,7 @@ def cells(outcome: StressOutcome) -> list[str]:
     ]
 
 
-class Stress(View[StressOutcome]):
+class StressView(View[StressOutcome]):
     """One row per case.
 
     Parameters

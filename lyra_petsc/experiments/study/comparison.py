@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
-from lyra_petsc.experiments.study.plan import MEAN_SQUARE, ErrorKind
+from lyra_petsc.experiments.study.plan import MEAN_SQUARE, StudyQuantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
@@ -350,7 +350,7 @@ Rows = Callable[[int], Array]
 
 
 def motion_errors(
-    comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[ErrorKind]
+    comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[StudyQuantity]
 ) -> Errors:
     """Errors of a run against an exact motion; collective."""
     start, times = samples.rows(comm, 0), samples.times
@@ -369,13 +369,13 @@ def motion_errors(
     return overall(_errors(samples, whole, quantities, positions))
 
 
-def run_errors(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[ErrorKind]) -> Errors:
+def run_errors(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[StudyQuantity]) -> Errors:
     """Errors of a run against another, over all samples; collective."""
     return overall(history_against_run(comm, mine, other, quantities))
 
 
 def history_against_run(
-    comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[ErrorKind]
+    comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[StudyQuantity]
 ) -> History:
     """Errors of a run against another at each sample; collective.
 
@@ -386,7 +386,7 @@ def history_against_run(
 
 
 def _errors(
-    mine: Samples, other: Samples, quantities: Sequence[ErrorKind], positions: Callable[[], History]
+    mine: Samples, other: Samples, quantities: Sequence[StudyQuantity], positions: Callable[[], History]
 ) -> History:
     """Errors of the quantities in their order; empty where they are unknown."""
     found: History = {}

@@ -365,7 +365,7 @@ def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -
 
 
 @dataclass(frozen=True)
-class ErrorKind:
+class StudyQuantity:
     """A kind of error that is measured for each combination.
 
     Attributes
@@ -387,20 +387,20 @@ MEAN_SQUARE = "position_l2"
 """Name of the quantity whose samples are combined by their mean square; others by their maximum."""
 
 POSITION = (
-    ErrorKind(MEAN_SQUARE, "L2 error in position / sheet size"),
-    ErrorKind("position_max", "largest error in position / sheet size"),
+    StudyQuantity(MEAN_SQUARE, "L2 error in position / sheet size"),
+    StudyQuantity("position_max", "largest error in position / sheet size"),
 )
 """Root mean square over area and sample times, and maximum over vertices and sample times."""
 
-ENERGY = ErrorKind("energy", "error in energy / largest energy exchanged")
+ENERGY = StudyQuantity("energy", "error in energy / largest energy exchanged")
 
 
-def probe_quantity(name: str) -> ErrorKind:
+def probe_quantity(name: str) -> StudyQuantity:
     """The error in the position of a probe."""
-    return ErrorKind(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
+    return StudyQuantity(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
 
 
-def parse_quantities(text: str, probes: Iterable[str]) -> list[ErrorKind]:
+def parse_quantities(text: str, probes: Iterable[str]) -> list[StudyQuantity]:
     """The quantities of ``--quantities``; all for an empty text.
 
     Parameters
@@ -419,7 +419,7 @@ def parse_quantities(text: str, probes: Iterable[str]) -> list[ErrorKind]:
     known = {quantity.probe: [quantity] for quantity in every}
     known |= {"position": [*POSITION], "energy": [ENERGY], "probes": every}
     words = [word.strip() for word in text.split(",")] if text.strip() else ["position", "energy", "probes"]
-    found: list[ErrorKind] = []
+    found: list[StudyQuantity] = []
     for word in words:
         if not word:
             raise InputError("has an empty name between its commas", key=key)
@@ -522,7 +522,7 @@ class Plan:
     base : Scene
     axes : list of Axis
     combinations : list of Combination
-    quantities : list of ErrorKind
+    quantities : list of StudyQuantity
     end : float
         End time [s], or load factor of a static analysis.
     interval : float
@@ -535,7 +535,7 @@ class Plan:
     base: Scene
     axes: list[Axis]
     combinations: list[Combination]
-    quantities: list[ErrorKind]
+    quantities: list[StudyQuantity]
     end: float
     interval: float
     notes: list[str] = field(default_factory=list)

@@ -21,10 +21,10 @@ from lyra_petsc.experiments.study.jobs import PHASES
 from lyra_petsc.experiments.study.plan import (
     MEAN_SQUARE,
     Axis,
-    ErrorKind,
     Physics,
     Plan,
     StudyCase,
+    StudyQuantity,
     describe_setting,
     describe_settings,
 )
@@ -368,7 +368,7 @@ def _write_tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     )
 
 
-def _short_title(quantity: ErrorKind) -> str:
+def _short_title(quantity: StudyQuantity) -> str:
     text = {"position_max": "position, max", "position_l2": "position, L2"}
     return "error in " + text.get(quantity.name, quantity.name.replace("_", " ", 1))
 
@@ -439,13 +439,18 @@ def drawings(plan: Plan, rows: Sequence[StudyRow], known: Reference, mark: str) 
     return found
 
 
-def _error_floor(known: Reference, quantity: ErrorKind) -> float | None:
+def _error_floor(known: Reference, quantity: StudyQuantity) -> float | None:
     own = known.own_errors.get(quantity.name)
     return None if own is None or not own.error > 0.0 else SAFETY * own.error
 
 
 def _work_precision(
-    plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: ErrorKind, axis: Axis | None, mark: str
+    plan: Plan,
+    rows: Sequence[StudyRow],
+    known: Reference,
+    quantity: StudyQuantity,
+    axis: Axis | None,
+    mark: str,
 ) -> Drawing:
     name = quantity.name
     lines = []
@@ -484,7 +489,7 @@ def _point_label(row: StudyRow, axis: Axis | None) -> str:
 
 
 def _convergence(
-    rows: Sequence[StudyRow], known: Reference, quantity: ErrorKind, axis: Axis, mark: str
+    rows: Sequence[StudyRow], known: Reference, quantity: StudyQuantity, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
         Series(label, [spacing(row, axis) for row in group], [row.resolved(quantity.name) for row in group])
@@ -508,7 +513,7 @@ def _file_name(name: str) -> str:
 # -- the whole study -----------------------------------------------------------------------------------
 
 
-class Study(View[Outcome[Any]]):
+class StudyView(View[Outcome[Any]]):
     """Errors against run times; written once all cases have been compared with their references.
 
     Parameters

@@ -381,7 +381,7 @@ def headings(unit: str) -> list[str]:
     return [name + suffix if name in ("value", "exact") else name for name in HEADINGS]
 
 
-class Verification(View[VerificationOutcome]):
+class VerificationView(View[VerificationOutcome]):
     """Rows by case, quantity and resolution."""
 
     verb = "verify"

@@ -15,8 +15,8 @@ from lyra_petsc.experiments.stress.stress_runner import (
     MAX_FIGURES,
     BaseClock,
     SavedOutcome,
-    Stress,
     StressOutcome,
+    StressView,
     csv_row,
     run_case,
 )
@@ -64,7 +64,7 @@ def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
         run_case(comm, StressCase("a", "b", base_scene, steps=1), SMALL) for _ in range(MAX_FIGURES + 2)
     ]
     outcomes[-1].record.stop_reason = "at once"
-    Stress(SMALL, len(outcomes)).case_ended(outcomes)
+    StressView(SMALL, len(outcomes)).case_ended(outcomes)
     assert outcomes[-1].record.last is not None
     assert sum(outcome.record.last is not None for outcome in outcomes) == MAX_FIGURES
 
@@ -138,7 +138,7 @@ def test_an_outcome_is_read_from_its_file(comm: MPI.Comm, tmp_path: Path) -> Non
     back = StressOutcome(outcome.case, **vars(load_record(tmp_path / OUTCOME_FILE, SavedOutcome)))
     assert back.verdicts == outcome.verdicts
     mine, theirs = csv_row(outcome), csv_row(back)
-    assert tuple(mine) == tuple(theirs) == Stress.columns
+    assert tuple(mine) == tuple(theirs) == StressView.columns
     np.testing.assert_equal(list(theirs.values()), list(mine.values()))
     np.testing.assert_array_equal(back.record.last, outcome.record.last)
     np.testing.assert_array_equal(back.record.triangles, outcome.record.triangles)
