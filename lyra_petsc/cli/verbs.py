@@ -135,7 +135,7 @@ def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
     help="What varies: dt, mesh, integrator, tolerance, ksp_rtol (any PETSc option), any key of the scene; "
     "may be repeated, all combinations are run.",
 )
-@click.option("--reference", metavar="auto|exact:NAME|run:DIR", help="The reference for errors.")
+@click.option("--reference", metavar="auto|finer|exact:NAME|run:DIR", help="The reference for errors.")
 @click.option("--quantities", metavar="NAME,NAME,…", help="position, energy, probes, or a probe's name.")
 @click.option("--repeats", type=int, metavar="N", help="How often each combination is timed (3).")
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -30,6 +30,8 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.mesh.build import build_scene_mesh
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import needed_terms
 from lyra_petsc.terms.rest import RestShape
@@ -92,19 +94,21 @@ SAME = 1e-9
 class Body:
     """Mesh, materials and masses of a scene, and properties that exact solutions assume.
 
-    Parameters
-    ----------
-    scene : Scene
-
-    Raises
-    ------
-    InputError
-        For a mesh that cannot be simulated.
+    The mesh is made when it is first needed, which raises InputError if it cannot be simulated.
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.mesh = scene, build_scene_mesh(scene)
-        self.rest = RestShape(scene, self.mesh)
+        self.scene = scene
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The mesh of the scene."""
+        return build_scene_mesh(self.scene)
+
+    @cached_property
+    def rest(self) -> RestShape:
+        """The rest shape with its materials."""
+        return RestShape(self.scene, self.mesh)
 
     @cached_property
     def mass(self) -> float:
@@ -144,41 +148,39 @@ class Body:
 
     @property
     def is_bent(self) -> bool:
-        """Whether some hinge does not start at its rest angle."""
-        if not any(entry.name == "bending" for entry in needed_terms(self.scene, self.rest.shells)):
-            return False
+        """Whether some interior edge that resists bending does not start at its rest angle."""
         from lyra_petsc.terms.bending import hinge
 
-        hinges = hinge.elements(self.rest)
-        angles = hinge.dihedral_angles(self.mesh.positions, hinges.stencil)
-        return bool(np.abs(angles - hinges.data["rest_angle"]).max(initial=0.0) > 1e-7)
+        for model in {shell.model for shell in self.rest.shells if shell.bends_with(shell.model)}:
+            hinges = hinge.elements(self.rest, model)
+            angles = hinge.dihedral_angles(self.mesh.positions, hinges.stencil)
+            if np.abs(angles - hinges.data["rest_angle"]).max(initial=0.0) > 1e-7:
+                return True
+        return False
 
     # -- assumptions shared by solutions -----------------------------------------------------------------
 
-    def forced(self) -> list[str]:
-        """Names of influences other than gravity, wind and initial velocity."""
+    def influences(self, accounted: Iterable[str]) -> list[str]:
+        """Names of all that acts on the sheet, but for initial velocity and the ``accounted`` terms.
+
+        Needs no mesh.
+        """
         scene, initial = self.scene, self.scene.initial
-        return _holding(
-            {
-                "a static analysis": scene.time.static,
-                "handles": scene.handles,
-                "loads": scene.loads,
-                "initial.noise": initial is not None and initial.noise > 0.0,
-                "initial.angular_velocity": initial is not None and any(initial.angular_velocity),
-            }
-        )
+        shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
+        terms = (entry.name for entry in needed_terms(scene, shells))
+        conditions = {
+            "a static analysis": scene.time.static,
+            "handles": scene.handles,
+            "initial.noise": initial is not None and initial.noise > 0.0,
+            "initial.angular_velocity": initial is not None and any(initial.angular_velocity),
+        }
+        return [*_holding(conditions), *(name for name in terms if name not in accounted)]
 
     def strained(self) -> list[str]:
         """Reasons why the start shape is not free of stress."""
         stretched = np.abs(self.stretch - 1.0).max() > SAME
         bent = {"a start shape that is bent, or a rest curvature": self.is_bent}
         return _holding({"a start shape that is stretched": stretched} | bent)
-
-    @property
-    def has_wind(self) -> bool:
-        """Whether air acts on the sheet."""
-        wind = self.scene.wind
-        return wind is not None and (wind.density > 0.0 or wind.drag > 0.0)
 
 
 @dataclass(frozen=True)
@@ -190,29 +192,41 @@ class Solution:
     name : str
     title : str
         Description for reports.
-    violations : callable
-        Properties of a scene that contradict its assumptions; empty if it holds.
+    terms : frozenset of str
+        Terms of the registry that the solution accounts for; it does not hold where another one acts.
+    assumptions : callable
+        Properties of a scene, on which no other term acts, that contradict the solution.
     motion : callable
         The motion, for a scene without violations.
     """
 
     name: str
     title: str
-    violations: Callable[[Body], list[str]]
+    terms: frozenset[str]
+    assumptions: Callable[[Body], list[str]]
     motion: Callable[[Body], ExactMotion]
+
+    def violations(self, body: Body) -> list[str]:
+        """What contradicts the solution: all that it does not account for, or else properties."""
+        return body.influences(self.terms) or self.assumptions(body)
 
 
 SOLUTIONS: dict[str, Solution] = {}
 """Exact solutions by name."""
 
+RIGID = frozenset({"membrane", "bending", "midedge", "midedge_friction", "shear_friction", "gravity"})
+"""Terms without force in the translation of a sheet free of stress, and gravity."""
+
 Motion = Callable[[Body], ExactMotion]
 
 
-def _solution(name: str, title: str, violations: Callable[[Body], list[str]]) -> Callable[[Motion], Motion]:
+def _solution(
+    name: str, title: str, terms: frozenset[str], assumptions: Callable[[Body], list[str]]
+) -> Callable[[Motion], Motion]:
     """Decorator that registers the function which makes the motion."""
 
     def add(motion: Motion) -> Motion:
-        SOLUTIONS[name] = Solution(name, title, violations, motion)
+        SOLUTIONS[name] = Solution(name, title, terms, assumptions, motion)
         return motion
 
     return add
@@ -227,12 +241,7 @@ def _holding(conditions: Mapping[str, object]) -> list[str]:
     return [name for name, holds in conditions.items() if holds]
 
 
-def free_violations(body: Body) -> list[str]:
-    """Properties of a scene that contradict a free fall."""
-    return [*body.forced(), *(["wind"] if body.has_wind else []), *body.strained()]
-
-
-@_solution("free-fall", "free fall, x = X + v t + g t²/2", free_violations)
+@_solution("free-fall", "free fall, x = X + v t + g t²/2", RIGID, Body.strained)
 def free_fall(body: Body) -> ExactMotion:
     """A sheet that moves freely without deformation: x = X + v₀ t + g t²/2."""
     return _translation(body, partial(_free_path, body.start_velocity, body.gravity))
@@ -248,12 +257,12 @@ def _in_still_air(body: Body, drag: str) -> list[str]:
     air = {
         "no gravity": not body.gravity.any(),
         "initial.velocity": body.start_velocity.any(),
-        "no air (wind with velocity [0, 0, 0])": not body.has_wind,
-        "wind that is not still": body.has_wind and wind is not None and any(wind.velocity),
+        "no air (wind with velocity [0, 0, 0])": wind is None,
+        "wind that is not still": wind is not None and any(wind.velocity),
         f"wind.{drag} 0": wind is not None and getattr(wind, drag) == 0.0,
         "materials of different densities": np.ptp(densities) > SAME * densities.max(),
     }
-    return [*body.forced(), *_holding(air), *body.strained()]
+    return [*_holding(air), *body.strained()]
 
 
 def _cosines(body: Body) -> Array:
@@ -268,7 +277,12 @@ def level_violations(body: Body) -> list[str]:
     return _in_still_air(body, "density") + ([] if level else ["a sheet that is not flat and level"])
 
 
-@_solution("terminal-fall", "level sheet falling in still air, v = vt tanh(g t/vt)", level_violations)
+@_solution(
+    "terminal-fall",
+    "level sheet falling in still air, v = vt tanh(g t/vt)",
+    RIGID | {"wind"},
+    level_violations,
+)
 def flat_fall(body: Body) -> ExactMotion:
     """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
 
@@ -300,6 +314,7 @@ def edge_violations(body: Body) -> list[str]:
 @_solution(
     "edge-fall",
     "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
+    RIGID | {"wind"},
     edge_violations,
 )
 def edge_fall(body: Body) -> ExactMotion:
@@ -368,8 +383,7 @@ def breathing_violations(body: Body) -> list[str]:
     uneven = np.ptp(stretch) > SAME * stretch.max()
     open_ended = not 0.0 < stretch[0] < math.sqrt(2.0) or abs(stretch[0] - 1.0) < SAME
     held = {
-        "gravity": body.gravity.any(),
-        "wind": body.has_wind,
+        "a membrane law other than stvk": shell.law != "stvk",
         "initial.velocity": body.start_velocity.any(),
         "c11 and c22 that differ": abs(shell.c11 - shell.c22) > SAME * shell.c11,
         "damping": shell.damping > 0.0,
@@ -377,12 +391,13 @@ def breathing_violations(body: Body) -> list[str]:
         "a start that is not stretched alike in all directions": uneven,
         "a start stretched by a factor that is 1, or √2 or more": open_ended and not uneven,
     }
-    return [*body.forced(), *_holding(held)]
+    return _holding(held)
 
 
 @_solution(
     "breathing-triangle",
     "equilateral triangle oscillating in its plane, Jacobi's dn",
+    frozenset({"membrane", "bending", "midedge"}),
     breathing_violations,
 )
 def breathing(body: Body) -> ExactMotion:
@@ -407,7 +422,7 @@ def exact_motion(name: str, body: Body) -> ExactMotion:
     Raises
     ------
     InputError
-        Unknown name, or a scene that violates assumptions; the message names all of them.
+        Unknown name, or a scene to which the solution does not apply; the message says why.
     """
     key = f"--reference exact:{name}"
     if name not in SOLUTIONS:

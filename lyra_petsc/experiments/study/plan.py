@@ -449,7 +449,7 @@ class Request:
     vary : tuple of str
         ``--vary``; empty: the default sweep.
     reference : str
-        ``auto``, ``exact:NAME`` or ``run:DIR``.
+        ``auto``, ``finer``, ``exact:NAME`` or ``run:DIR``.
     quantities : str
         Separated by commas; empty: all.
     repeats : int

@@ -140,28 +140,33 @@ class Advice:
     text: str
 
 
-def advise(rows: Sequence[StudyRow], quantity: str, axis: Axis | None = None) -> list[Advice]:
+def advise(rows: Sequence[StudyRow], quantities: Sequence[str], axis: Axis | None = None) -> list[Advice]:
     """The fastest setting for each accuracy among those that ran; nothing is extrapolated.
 
     Parameters
     ----------
     rows : sequence of StudyRow
-    quantity : str
+    quantities : sequence of str
+        The first one decides; the text names others in which the recommended row is less accurate.
     axis : Axis, optional
         The text says if the recommended row is the coarsest along this axis.
     """
-    able = _rows_with_error(rows, quantity)
+    able = _rows_with_error(rows, quantities[0])
     if not able:
         return []
-    best = min(row.error_bound(quantity) for row in able)
+    best = min(row.error_bound(quantities[0]) for row in able)
     targets = list(TARGETS)
     while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
         targets.append(targets[-1] / 10.0)
     coarsest = [group[0] for group in families(able, axis).values()] if axis is not None else []
-    return [_advice(able, quantity, float(f"{target:.3g}"), coarsest) for target in targets]
+    return [_advice(able, quantities, float(f"{target:.3g}"), coarsest) for target in targets]
 
 
-def _advice(rows: Sequence[StudyRow], quantity: str, target: float, coarsest: Sequence[StudyRow]) -> Advice:
+def _advice(
+    rows: Sequence[StudyRow], quantities: Sequence[str], target: float, coarsest: Sequence[StudyRow]
+) -> Advice:
+    quantity = quantities[0]
+
     def error(row: StudyRow) -> float:
         return row.error_bound(quantity)
 
@@ -190,7 +195,31 @@ def _advice(rows: Sequence[StudyRow], quantity: str, target: float, coarsest: Se
             row = min(others, key=error)
             found = f"{_without_line(row)}: {_error(row, quantity)}, {seconds(row.run_time)}"
             text += f"; {line} did not reach it ({found})"
-    return Advice(target, winner, text + ".")
+    return Advice(target, winner, f"{text}.{_disagreement(good, winner, quantities, target)}")
+
+
+def _disagreement(
+    good: Sequence[StudyRow], winner: StudyRow, quantities: Sequence[str], target: float
+) -> str:
+    """Sentence on the quantities in which the winner misses the accuracy; empty if there are none."""
+
+    def missed(row: StudyRow) -> list[str]:
+        return [name for name in quantities if name != "position_max" and row.error_bound(name) > target]
+
+    if not (names := missed(winner)):
+        return ""
+    text = " Its error is " + " and ".join(
+        f"{_error_text(winner, one)} in {_plain_name(one)}" for one in names
+    )
+    if able := [row for row in good if not missed(row)]:
+        row = min(able, key=lambda row: row.run_time)
+        return f"{text}; for {percent(target)} in all choose {setting(row)}: {seconds(row.run_time)}."
+    return f"{text}; nothing that ran reaches {percent(target)} in all."
+
+
+def _plain_name(quantity: str) -> str:
+    """Name of a quantity within a sentence."""
+    return {MEAN_SQUARE: "position"}.get(quantity, quantity.replace("_", " ", 1))
 
 
 def setting(row: StudyRow) -> str:
@@ -203,13 +232,17 @@ def _without_line(row: StudyRow) -> str:
 
 
 def _error(row: StudyRow, quantity: str) -> str:
-    unresolved = quantity in row.unresolved
-    bound = f"below {percent(row.error_bound(quantity))}" if unresolved else percent(row.errors[quantity])
-    text = f"error {bound}"
+    text = f"error {_error_text(row, quantity)}"
     largest = row.error_bound("position_max")
     if quantity == "position_l2" and math.isfinite(largest):
         text += f", at most {percent(largest)} anywhere"
     return text
+
+
+def _error_text(row: StudyRow, quantity: str) -> str:
+    if quantity in row.unresolved:
+        return f"below {percent(row.error_bound(quantity))}"
+    return percent(row.errors[quantity])
 
 
 def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
@@ -550,7 +583,7 @@ class StudyView(View[Outcome[Any]]):
         self.orders = observed_orders(runner.rows, plan.axes, names)
         for physics in runner.references:
             mark_front(runner.rows_of(physics), names[0])
-            self.advice[physics] = advise(runner.rows_of(physics), names[0], main_axis(plan.axes))
+            self.advice[physics] = advise(runner.rows_of(physics), names, main_axis(plan.axes))
             choose_recommended(self.advice[physics])
         self.columns, self.ready = list(csv_row(plan, runner.rows[0])), True
 

@@ -130,6 +130,8 @@ def choose_references(plan: Plan) -> dict[Physics, Reference]:
 
     if kind == "auto" and not colon:
         return {physics: _automatic_reference(scene(physics)) for physics in groups}
+    if kind == "finer" and not colon:
+        return {physics: Reference("finer") for physics in groups}
     if kind == "exact" and name:
         return {
             physics: _exact_reference(name, exact_motion(name, Body(scene(physics)))) for physics in groups
@@ -141,7 +143,7 @@ def choose_references(plan: Plan) -> dict[Physics, Reference]:
                 f"one run cannot be the reference of different scenes ({listed} varies)", key=key
             )
         return {groups[0]: _reference_run(plan, Path(name), key)}
-    raise InputError("must be auto, exact:NAME or run:DIR", key=key)
+    raise InputError("must be auto, finer, exact:NAME or run:DIR", key=key)
 
 
 def _exact_reference(name: str, motion: ExactMotion) -> Reference:
@@ -149,8 +151,6 @@ def _exact_reference(name: str, motion: ExactMotion) -> Reference:
 
 
 def _automatic_reference(scene: Scene) -> Reference:
-    if scene.handles or scene.loads:
-        return Reference("finer")  # no exact solution has handles or loads; saves building the mesh
     body = Body(scene)
     solution = matching(body)
     return Reference("finer") if solution is None else _exact_reference(solution.name, solution.motion(body))

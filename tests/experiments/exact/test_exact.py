@@ -14,6 +14,8 @@ from physics import Simulation as Stepping
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, exact_motion, matching
+from lyra_petsc.terms import registry
+from lyra_petsc.terms.registry import Registration, Role
 
 pytest.importorskip("scipy")
 
@@ -22,6 +24,9 @@ UPRIGHT = SHEET | {"transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
 AIR = {"velocity": [0, 0, 0], "density": 1.2, "drag": 0.3}
 DOWN = [0, 0, -9.81]
 ROUND = {"density": 0.2, "membrane": {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}}
+FLOOR = {"floor": {"plane": {"point": [0, 0, -1], "normal": [0, 0, 1]}}}
+SHELL = {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-4}
+RUBBER = {**SHELL, "law": "neo-hookean"}
 
 
 def triangle(folder: Path, stretch: float = 1.2) -> dict[str, Any]:
@@ -113,12 +118,32 @@ def test_the_exact_motion_of_a_scene_is_found(name: str, tmp_path: Path) -> None
     assert found.name == name
 
 
+@pytest.mark.parametrize("name", list(SOLUTIONS))
+def test_no_exact_motion_where_a_term_acts_that_it_does_not_account_for(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also a term that is registered later."""
+    body = Body(scene_of(content(name, tmp_path)))
+    other = Registration("magnet", lambda scene, shells: True, Role.LOAD)
+    monkeypatch.setattr(registry, "REGISTRY", [*registry.REGISTRY, other])
+    assert matching(body) is None
+    with pytest.raises(InputError, match="which has magnet"):
+        exact_motion(name, body)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
         ("free-fall", {"handles": [{"nodes": [0]}]}, "handles"),
         ("free-fall", {"wind": AIR}, "wind"),
-        ("free-fall", {"loads": [{"pressure": 1.0}]}, "loads"),
+        ("free-fall", {"loads": [{"pressure": 1.0}]}, "pressure"),
+        ("free-fall", {"contact": {}}, "contact"),
+        ("terminal-fall", {"contact": {}, "obstacles": FLOOR}, "contact"),
+        ("edge-fall", {"contact": {"friction": 0.2}}, "contact, friction"),
+        ("breathing-triangle", {"contact": {}}, "contact"),
+        ("breathing-triangle", {"material": RUBBER}, "membrane law other than stvk"),
+        ("breathing-triangle", {"material": ROUND | {"friction_force": 0.1}}, "shear_friction"),
+        ("free-fall", {"material": SHELL | {"rest_curvature": [1, 0, 0]}}, "bent"),
         ("free-fall", {"initial": {"noise": 1e-3}}, "initial.noise"),
         ("free-fall", {"initial": {"angular_velocity": [0, 0, 1]}}, "initial.angular_velocity"),
         ("free-fall", {"material": CLOTH | {"bending": 1e-4, "rest_curvature": [1, 0, 0]}}, "bent"),

@@ -128,6 +128,14 @@ def test_the_reference_is_exact_if_an_exact_motion_applies(tmp_path: Path) -> No
     assert chosen.kind == "finer"
 
 
+def test_in_contact_and_on_request_the_reference_is_a_finer_run(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, SCENE + MOVING + "contact: {}\n", "dt=0.01")
+    (chosen,) = choose_references(plan).values()
+    assert chosen.kind == "finer"
+    plan = plan_of(tmp_path, SCENE + MOVING, "gravity=[0,0,-9],[0,0,-1]", reference="finer")
+    assert [one.kind for one in choose_references(plan).values()] == ["finer", "finer"]
+
+
 def test_every_physical_scene_has_a_reference_of_its_own(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, SCENE + MOVING, "gravity=[0,0,-9.81],[0,0,-1.62]", "dt=0.02,0.01")
     chosen = choose_references(plan)
@@ -143,9 +151,9 @@ def test_every_physical_scene_has_a_reference_of_its_own(tmp_path: Path) -> None
         )
 
 
-@pytest.mark.parametrize("reference", ["exact", "exact:", "run:", "best", "auto:x", ""])
+@pytest.mark.parametrize("reference", ["exact", "exact:", "run:", "best", "auto:x", "finer:x", ""])
 def test_invalid_references_are_refused(tmp_path: Path, reference: str) -> None:
-    with pytest.raises(InputError, match="must be auto, exact:NAME or run:DIR"):
+    with pytest.raises(InputError, match="must be auto, finer, exact:NAME or run:DIR"):
         choose_references(plan_of(tmp_path, HELD + MOVING, "dt=0.01", reference=reference))
 
 
