@@ -125,6 +125,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """Start the progress bar, and show the run on the page."""
+        self._folder = folder
         self._progress = Progress(
             self._comm,
             simulation.control.end,
@@ -149,12 +150,14 @@ class TerminalProgress(ProgressCallbacks):
             self._progress.update(report.step, report.time, *iterations, simulation.budget.total)
 
     def close(self) -> None:
-        """Leave the terminal as it was, and tell the page that the run has ended."""
+        """Leave the terminal as it was, end the page, and say how to view the run again."""
         COMPILATION.first = no_action
-        if self._page is not None:
-            self._page.end()
         if self._progress is not None:
             self._progress.close()
+        if self._page is not None:
+            self._page.end()
+            with suppress(OSError):
+                print(f"look again   lyra-petsc view {self._folder}", flush=True)
 
     def done(self, simulation: SteppedScene, folder: Path) -> None:
         """Print the closing table, and a warning of unused PETSc options."""
@@ -166,8 +169,6 @@ class TerminalProgress(ProgressCallbacks):
         if not COMPILATION.all_cached and not self._noted_cache:
             self._say(f"note: the next run compiles kernels anew: {NO_CACHE}")
         closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
-        if self._page is not None:
-            print(f"look again   lyra-petsc view {folder}", flush=True)
         if self._comm.rank == 0:
             warn_unused(simulation.stepper.our_options)
 

@@ -16,9 +16,7 @@ from lyra_petsc.cli.options import results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import raise_on_all_ranks
-
-PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
-"""Packages of the extra ``view`` that the page needs."""
+from lyra_petsc.show.view.live import PACKAGES
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -1,4 +1,4 @@
-"""The page of ``run --live``: a separate process, which reads the run's folder.
+"""The page of ``run --live`` and of notebooks: a separate process, which reads the run's folder.
 
 ``python -m lyra_petsc.show.view.live HOST PORT`` reads the folder from its standard input and writes one line
 to its standard output: the address of the page, or the reason for its failure. The end of the standard input
@@ -19,6 +19,9 @@ from pathlib import Path
 from lyra_petsc.api.mpirun import environment
 from lyra_petsc.errors import LyraError
 
+PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
+"""Packages of the extra ``view`` that the page needs."""
+
 READY, FAILED = "ready ", "failed "
 """Prefixes of the line on standard output."""
 
@@ -30,7 +33,7 @@ The process needs it only while a page is loaded; with less, loading the page's 
 
 
 class LivePage:
-    """The page's process, started before the set-up of a run, which never waits for it; for one rank.
+    """The page's process; a run starts it before its set-up and never waits for it. For one rank.
 
     Parameters
     ----------
@@ -46,7 +49,7 @@ class LivePage:
         self, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
     ) -> None:
         self._process: subprocess.Popen[str] | None = None
-        self._ready, self._failed = ready, failed
+        self._ready, self._failed, self._announced = ready, failed, False
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "lyra_petsc.show.view.live", host, str(port)],
@@ -66,6 +69,7 @@ class LivePage:
         assert process.stdout is not None
         line = process.stdout.readline().strip()
         if line.startswith(READY):
+            self._announced = True
             self._ready(line.removeprefix(READY))
         elif process.stdin is not None and not process.stdin.closed:  # closed: the run has ended already
             self._failed(line.removeprefix(FAILED) or "its process ended")
@@ -78,10 +82,15 @@ class LivePage:
                 self._process.stdin.flush()
 
     def end(self) -> None:
-        """Notify the process that the run has ended; it shows the last state until no page is open."""
+        """Notify the process that the run has ended; it shows the last state until no page is open.
+
+        If nobody has got the address of the page yet, the process ends at once.
+        """
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
+            if not self._announced:
+                self._process.terminate()
 
 
 def main(host: str, port: int) -> None:
@@ -103,8 +112,8 @@ def main(host: str, port: int) -> None:
     def ended() -> str:
         sys.stdin.read()
         return (
-            f"The run has ended. This page stays for as long as it is open, at most {MAX_STAY / 60:.0f} "
-            f"minutes; later: lyra-petsc view {folder}"
+            "The run has ended, or the notebook that shows it. This page stays for as long as it is open, at "
+            f"most {MAX_STAY / 60:.0f} minutes; later: lyra-petsc view {folder}"
         )
 
     def ready(url: str) -> None:

@@ -63,6 +63,8 @@ class Access:
     ----------
     n_open : int
         Number of open pages (web sockets).
+    was_opened : bool
+        Whether a page has ever been opened.
     """
 
     def __init__(self, token: str, host: str) -> None:
@@ -73,7 +75,7 @@ class Access:
         if not is_loopback(host):
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
         self._local = is_loopback(host)
-        self.n_open = 0
+        self.n_open, self.was_opened = 0, False
 
     def middleware(self) -> Any:
         """The check as aiohttp's middleware."""
@@ -106,7 +108,7 @@ class Access:
         if not web.WebSocketResponse().can_prepare(request).ok:
             text = f"426: {WEB_SOCKET} is for the page's web socket\n"
             return web.Response(status=426, text=text, headers={"Upgrade": "websocket"})
-        self.n_open += 1
+        self.n_open, self.was_opened = self.n_open + 1, True
         try:
             return await handler(request)
         except (ValueError, TypeError, KeyError, ConnectionError) as error:
@@ -171,6 +173,9 @@ CLOSING_SECONDS = 1.0
 
 RELOAD_SECONDS = 3.0
 """Time [s] for which the server runs after the last page is closed, as a page may only be reloading."""
+
+FIRST_PAGE_SECONDS = 30.0
+"""Time [s] for which the server waits after the end of a run for a first page: a browser starts slowly."""
 
 MAX_STAY = 1800.0
 """Time [s] after the end of the run for which open pages are served."""
@@ -301,7 +306,7 @@ async def serve(
 
 
 async def _await_end(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
-    """After the run has ended, show its end and wait until no page is open, then set ``over``."""
+    """After the run has ended, show its end, and set ``over`` when all pages are closed."""
     loop = asyncio.get_running_loop()
     text: asyncio.Future[str] = loop.create_future()
     # a daemon thread, as it may wait forever
@@ -312,7 +317,9 @@ async def _await_end(ended: Callable[[], str], page: Any, access: Access, over: 
     page.refresh()
     page.show_end(farewell)
     deadline, closed = time.monotonic() + MAX_STAY, 0.0
-    while closed < RELOAD_SECONDS and time.monotonic() < deadline:
+    while closed < (RELOAD_SECONDS if access.was_opened else FIRST_PAGE_SECONDS):
+        if time.monotonic() > deadline:
+            break
         await asyncio.sleep(CLOSING_SECONDS)
         closed = 0.0 if access.n_open else closed + CLOSING_SECONDS
     _finish(over, 0)

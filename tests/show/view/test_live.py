@@ -1,10 +1,12 @@
 """``run --live``: the page starts with the run, follows it, and ends after it."""
 
+import http.client
 import os
 import re
 import signal
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from launch import SCENE, UNHURRIED, done, finish, lyra, start, write_scene
@@ -50,6 +52,17 @@ def address(process):
     pytest.fail("no page:\n" + "".join(messages))
 
 
+def opened(address):
+    """A connection that the server takes for an open page."""
+    url = urlsplit(address)
+    connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    headers |= {"Sec-WebSocket-Key": "c29tZSBub25zZW5zZSAgIA=="}
+    connection.request("GET", "/ws?" + url.query, headers=headers)
+    assert connection.getresponse().status == 101
+    return connection
+
+
 @pytest.fixture(autouse=True)
 def in_its_folder(tmp_path, monkeypatch):
     pytest.importorskip("trame")
@@ -66,7 +79,7 @@ def test_the_page_ends_with_a_run_that_is_killed(tmp_path):
         program=("-c", UNHURRIED),
     )
     try:
-        address(process)
+        opened(address(process)).close()
         assert len(pages(tmp_path)) == 1
         os.killpg(process.pid, signal.SIGKILL)
         until(lambda: not pages(tmp_path), "the page outlives its run")
@@ -83,7 +96,7 @@ def test_a_resumed_run_has_a_page_until_it_is_stopped(tmp_path):
     settings = ["--set", "time.end=500", "--resume", "--live", "--no-browser"]
     process = start(["run", "scene.yaml", "--out", tmp_path / "out", *settings], tmp_path)
     try:
-        assert "token=" in address(process)
+        opened(address(process)).close()
         assert len(pages(tmp_path)) == 1
     finally:
         os.killpg(process.pid, signal.SIGINT)
@@ -99,12 +112,17 @@ def test_a_run_that_ends_or_fails_leaves_no_page(tmp_path):
     live = ["run", "scene.yaml", "--live", "--no-browser", "--out"]
     left = done([*live, tmp_path / "out"], tmp_path)
     options = ["-snes_max_it", "1", "-snes_rtol", "1e-15", "-snes_stol", "0", "-ts_adapt_dt_min", "0.01"]
-    assert lyra([*live, tmp_path / "failed", *options], tmp_path).code == 3
+    failed = lyra([*live, tmp_path / "failed", *options], tmp_path)
+    assert failed.code == 3
+    assert f"lyra-petsc view {tmp_path / 'failed'}" in failed.out
 
     assert len(StoredRun(tmp_path / "out")) == 4
     assert StoredRun(tmp_path / "out").finished
     assert "note: no page" not in left.err
     assert f"lyra-petsc view {tmp_path / 'out'}" in left.out
+    for said in (left.err, failed.err):  # a page that somebody could open waits for a browser
+        for url in re.findall(r"view: (http\S+)", said):
+            opened(url).close()
     until(lambda: not pages(tmp_path), "a page outlives its run")
 
 
@@ -130,10 +148,8 @@ def test_a_page_that_cannot_be_served_is_reported(tmp_path):
     assert "nowhere: no such folder" in messages[0]
 
 
-def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
-    import http.client
-    from urllib.parse import urlsplit
-
+def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_path):
+    """Also if the run ends before the browser has started."""
     writer = Writer(tmp_path / "run")
     writer.write()
     messages = []
@@ -145,18 +161,23 @@ def test_the_page_stays_until_the_last_browser_leaves(tmp_path):
     group = Path(f"/proc/{process}/autogroup")  # where Linux shares the time out among sessions
     if group.exists() and group.read_text().strip():
         assert group.read_text().endswith(f"nice {NICENESS}\n")
-    url = urlsplit(messages[0])
-    connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
-    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
-    connection.request(
-        "GET", "/ws?" + url.query, headers=headers | {"Sec-WebSocket-Key": "c29tZSBub25zZW5zZSAgIA=="}
-    )
-    assert connection.getresponse().status == 101
 
     page.end()
+    time.sleep(6.0)
+    connection = opened(messages[0])
     time.sleep(6.0)
     assert pages(tmp_path), "the page left those who look"
     connection.close()
     connection.sock = None
     until(lambda: not pages(tmp_path), "the page outlives its run")
     assert len(messages) == 1
+
+
+def test_a_page_whose_address_nobody_has_ends_with_the_run(tmp_path):
+    Writer(tmp_path / "run").write()
+    messages = []
+    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
+    page.show(tmp_path / "run")
+    page.end()
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+    assert messages == []
