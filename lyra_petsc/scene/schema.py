@@ -8,6 +8,7 @@ The docstrings are the text of the reference page and of the JSON Schema.
 
 from __future__ import annotations
 
+import html
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -1482,6 +1483,13 @@ class Scene(Block):
         from lyra_petsc.scene.load import change_scene
 
         return change_scene(self, changes)
+
+    def _repr_html_(self) -> str:
+        time = self.time
+        length = "static" if time.static else f"{time.end:g} s, {time.scheme}"
+        usual = {"title", "time", "output", "solver"}
+        keys = [key for key in type(self).model_fields if key not in usual and getattr(self, key)]
+        return f"<b>{html.escape(self.title or 'Scene')}</b>, {length}: <code>{', '.join(keys)}</code>"
 
     def __eq__(self, other: object) -> bool:
         # private attributes, as the file it came from, are ignored

@@ -5,11 +5,14 @@ from __future__ import annotations
 import base64
 import html
 import os
+import queue
 import tempfile
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
-from lyra_petsc.errors import python_argument_names
+from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.read_run import StoredRun
 
@@ -61,6 +64,45 @@ class Media:
         return f"<{self.kind}, {len(self.data)} bytes>"
 
 
+REDIRECTION = """<script>
+location.replace(`http://${parent.location.hostname === "localhost" ? "localhost" : "127.0.0.1"}%s`)
+</script>"""
+"""Opens the page under the notebook's own name of this machine: frames of other names get no cookies."""
+
+
+class ViewedPage(Media):
+    """The live page of a run, served on this machine until this object is gone and nobody has the page open.
+
+    Attributes
+    ----------
+    url : str
+        The page's address, to open it elsewhere than in the notebook.
+
+    Raises
+    ------
+    InputError
+        If the page cannot be served.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        from lyra_petsc.show.view.live import LivePage
+
+        answers: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+        self._process = LivePage(
+            "127.0.0.1", 0, lambda url: answers.put((url, "")), lambda why: answers.put(("", why))
+        )
+        self._process.show(folder)
+        self.url, problem = answers.get()
+        if problem:
+            raise InputError(problem)
+        parts = urlsplit(self.url)
+        redirection = REDIRECTION % f":{parts.port}{parts.path}?{parts.query}"
+        super().__init__(redirection.encode(), "text/html")
+
+    def __repr__(self) -> str:
+        return f"<page {self.url}>"
+
+
 class Run(StoredRun):
     """The results of a run; reads files only when asked for their content, and keeps none open.
 
@@ -77,6 +119,11 @@ class Run(StoredRun):
     def __init__(self, folder: str | Path) -> None:
         with python_argument_names():
             super().__init__(folder)
+
+    def _repr_html_(self) -> str:
+        title = html.escape(self.scene.title or self.name)
+        outcome = html.escape(str(self.summary.get("outcome", "")))
+        return f"<b>{title}</b>, {outcome}: <code>{html.escape(repr(self))}</code>"
 
     def render(self, at: float | None = None, *, film: bool | str = False, **options: Any) -> Media:
         """A picture or a film, as drawn by the command ``render``; not collective.
@@ -123,6 +170,24 @@ class Run(StoredRun):
                 plan = make_plan(RenderOptions(self.folder, **chosen))
                 (path,) = draw(MPI.COMM_SELF, plan, lambda done, count: None)
                 return Media(path.read_bytes(), TYPES[path.suffix.lower()])
+
+    def view(self) -> ViewedPage:
+        """The live page of the run, inside the notebook, as served by the command ``view``.
+
+        Raises
+        ------
+        InputError
+            If packages are missing or the page cannot be served.
+        """
+        return self._page
+
+    @cached_property
+    def _page(self) -> ViewedPage:
+        with python_argument_names():
+            from lyra_petsc.show.view.live import PACKAGES
+
+            require_packages("view", PACKAGES, "view")
+            return ViewedPage(self.folder)
 
     def report(self, out: str | os.PathLike[str] | None = None) -> Media:
         """The report page of the run, as written by the command ``report`` to ``out`` or the run's folder.

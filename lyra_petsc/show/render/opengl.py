@@ -31,7 +31,7 @@ def share_cores(comm: MPI.Comm) -> None:
 
 
 def import_pyvista() -> Any:
-    """The module pyvista, set up to draw off-screen and to print no messages."""
+    """The module pyvista, set up to print no messages."""
     # Mesa and VTK would print each device and window that they fail to open
     os.environ.setdefault("EGL_LOG_LEVEL", "fatal")
     import pyvista
@@ -39,8 +39,12 @@ def import_pyvista() -> Any:
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     vtkObject.GlobalWarningDisplayOff()
-    pyvista.OFF_SCREEN = True
     return pyvista
+
+
+def off_screen_plotter(size: tuple[int, int]) -> Any:
+    """A plotter without lights that draws pictures of a size [pixels] in memory; notebooks do not show it."""
+    return import_pyvista().Plotter(off_screen=True, notebook=False, window_size=size, lighting="none")
 
 
 def check_opengl() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
-from lyra_petsc.show.render.opengl import import_pyvista
+from lyra_petsc.show.render.opengl import import_pyvista, off_screen_plotter
 from lyra_petsc.show.render.render_plan import RenderPlan, decimals
 from lyra_petsc.show.render.sheet_geometry import HeldVertices, split_at_seams, vertex_normals
 
@@ -125,7 +125,7 @@ class SceneDrawing:
         self._plan, self._bounds, self._quantity = plan, bounds, quantity
         self._triangles = plan.run.triangles
         self._pyvista = pyvista = import_pyvista()
-        self._plotter = plotter = pyvista.Plotter(off_screen=True, window_size=plan.size, lighting="none")
+        self._plotter = plotter = off_screen_plotter(plan.size)
         plotter.set_background(HORIZON, top=SKY)
         # FXAA is as smooth as multisampling, with which a software renderer takes 1.5 times as long
         plotter.disable_anti_aliasing()
@@ -306,8 +306,7 @@ class Ground:
         self._pyvista = pyvista = import_pyvista()
         # the sheet projected onto the floor, seen from above: white on black
         self._shadow = pyvista.PolyData.from_regular_faces(np.zeros((n_vertices, 3)), triangles)
-        pixels = (FLOOR_PIXELS, FLOOR_PIXELS)
-        self._above = above = pyvista.Plotter(off_screen=True, window_size=pixels, lighting="none")
+        self._above = above = off_screen_plotter((FLOOR_PIXELS, FLOOR_PIXELS))
         above.disable_anti_aliasing()  # the shadow is blurred anyway
         above.set_background("black")
         above.add_mesh(self._shadow, color="white", lighting=False)

@@ -23,10 +23,11 @@ class Seen:
         from selenium.webdriver.common.by import By
 
         self.browser, self._by = browser, By
-        browser.get("about:blank")
-        for log in ("browser", "performance"):
-            browser.get_log(log)
-        browser.get(url)
+        if url is not None:  # the page is not open yet
+            browser.get("about:blank")
+            for log in ("browser", "performance"):
+                browser.get_log(log)
+            browser.get(url)
         self.until(lambda: self.text("clock"))
         self.until(lambda: self.has_cloth(self.picture()))
 
@@ -345,3 +346,26 @@ def test_a_running_simulation_is_followed_and_its_end_reported_by_open_pages(bro
     seen.until(lambda: seen.has_cloth(seen.picture()))
     assert "The run has ended" in seen.text("notice")
     assert seen.complaints() == []
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
+def test_a_notebook_shows_the_page_inside(browser, tmp_path, host):
+    """Under both names of this machine; a server of files stands for the notebook's."""
+    import functools
+    import http.server
+    import threading
+
+    import lyra_petsc
+
+    page = lyra_petsc.Run(written(tmp_path / "run")).view()
+    (tmp_path / "notebook.html").write_text(page._repr_html_(), encoding="utf-8")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as notebook:
+        threading.Thread(target=notebook.serve_forever, daemon=True).start()
+        try:
+            browser.get(f"http://{host}:{notebook.server_port}/notebook.html")
+            browser.switch_to.frame(0)
+            assert Seen(browser, None).time() == pytest.approx(0.2)
+        finally:
+            browser.switch_to.default_content()
+            notebook.shutdown()
