@@ -249,17 +249,17 @@ class Collisions:
         v = v if system.integrator.iterates else system.stationary_velocity()
         return self._is_collision_free(v, displacement / system.stage.c, after=True)
 
-    @property
-    def touches(self) -> bool:
-        """Whether anything touches at the positions last evaluated: the forces of contact and friction change
-        too abruptly for one linear solve.
+    def touches(self, x: Array) -> bool:
+        """Whether anything touches at positions x (n_local, 3): the forces of contact and friction change too
+        abruptly for one linear solve.
 
         Collective.
         """
         system = self._system
         if not self._discretisation.has_near_elements:
             return False
-        return any(system.points.global_max(any(mask.any() for mask in system.acting_elements().values())))
+        acting = system.acting_elements(x).values()
+        return any(system.points.global_max(any(mask.any() for mask in acting)))
 
     @property
     def may_impact(self) -> bool:

@@ -67,17 +67,14 @@ class Prescribed:
             self._constrained = rows, rows.constrained_entries(self.mask)
         return self._constrained[1]
 
-    def begin_step(self, t0: float, t1: float, x: Array) -> bool:
-        """Prescribe what handles hold in the step t0..t1 [s] from positions x (n_owned, 3); return whether
-        the set of handles has changed since the step before; collective.
-        """
+    def begin_step(self, t0: float, t1: float, x: Array) -> None:
+        """Prescribe what handles hold in the step t0..t1 [s] from positions x (n_owned, 3); collective."""
         if not self.held:
-            return False
+            return
         self._x = x
         layout = self._discretisation.layout
         self._span = t0, t1
         active = self.held.active(t0, t1)
-        changed = self._active is not None and active != self._active
         if active != self._active:
             self._active = active
             # ranks own different vertices of a handle, but all agree on which handles hold
@@ -86,7 +83,6 @@ class Prescribed:
             self._set(own)
             self.not_counted = self.indices
         self.goal = self._positions(t1)
-        return changed
 
     def hold_vertices(self, x: Array) -> None:
         """Prescribe all vertices at positions x (n_owned, 3), too, until `release_vertices`; collective."""

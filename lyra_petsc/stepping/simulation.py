@@ -285,7 +285,7 @@ class SteppedScene:
         self._failed_attempts = []
         system.integrator = self._scene_integrator
         starts = False
-        if not self._scene_integrator.iterates and system.collisions.touches:
+        if not self._scene_integrator.iterates and system.collisions.touches(system.x):
             system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
@@ -301,7 +301,8 @@ class SteppedScene:
                 if not self._switch_at_crossing(attempt, end - self.time):
                     self._recover_from_failure(attempt, end)
             else:
-                solved = system.integrator.iterates or not system.collisions.touches
+                once = not system.integrator.iterates
+                solved = not (once and system.collisions.touches(system.stage_positions))
                 accurate = solved and self._is_accurate(v_before[:n], end - self.time)
                 if accurate and self._conserves_energy(x_before, v_before, end):
                     break

@@ -180,7 +180,7 @@ class StageEquations:
         self.collisions.begin_step()
         self.predicted_stress.forget()
         after = self.integrator.stage_offset(self.dt)
-        changed = self.prescribed.begin_step(t0, t1, self.x)
+        self.prescribed.begin_step(t0, t1, self.x)
         displacement = self.expected_displacement() if self.discretisation.limits_motion else None
         self.update_stencils(self.x, displacement, self.expected_displacement)
         self._freeze(t0 + after)
@@ -188,7 +188,7 @@ class StageEquations:
             # again, with the ghosts of now
             displacement = None if displacement is None else self.expected_displacement()
             self.update_stencils(self.x, displacement, self.expected_displacement)
-        self.start_acceleration.begin_step(t0 + after, changed)
+        self.start_acceleration.begin_step(t0 + after)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
         self._contact_energy = self._energy_of_contact()
@@ -543,7 +543,7 @@ class StageEquations:
         near = self.active.changing
         if not near:
             return []
-        acting = [np.count_nonzero(mask[: t.n_owned]) for t, mask in self.acting_elements().items()]
+        acting = [np.count_nonzero(mask[: t.n_owned]) for t, mask in self.acting_elements(self._xs).items()]
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
         fixed, every, *numbers = self.points.global_sum(
             *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
@@ -554,9 +554,9 @@ class StageEquations:
         ]
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
 
-    def acting_elements(self) -> dict[Elastic, NDArray[np.bool_]]:
-        """Which elements of each term with changing stencils act at the positions last evaluated."""
-        x, frozen = self._xs, self.active.frozen
+    def acting_elements(self, x: Array) -> dict[Elastic, NDArray[np.bool_]]:
+        """Which elements of each term with changing stencils act at positions x (n_local, 3)."""
+        frozen = self.active.frozen
         return {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
 
     def update_pattern(self) -> bool:
@@ -567,7 +567,7 @@ class StageEquations:
         if not self.discretisation.has_near_elements:
             self.has_active_pairs = False
             return self.discretisation.update_pattern({})
-        acting = self.acting_elements()
+        acting = self.acting_elements(self._xs)
         if acting:
             number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
             self.has_active_pairs = any(self.points.global_max(number))

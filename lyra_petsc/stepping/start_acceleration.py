@@ -45,16 +45,16 @@ class StartAcceleration:
         self._system, self._events = system, events
         self.followers: list[NeedsAcceleration] = []
 
-    def begin_step(self, at: float, jumps: bool) -> None:
+    def begin_step(self, at: float) -> None:
         """Compute accelerations at the start of the step where they are needed; collective.
 
-        ``at`` [s] is the time of the step's stage. ``jumps`` says whether forces jump at the start of the
-        step, as they do at events.
+        ``at`` [s] is the time of the step's stage. Whether forces jump at the start of the step is decided by
+        its time alone, so that a resumed run decides alike.
         """
         system = self._system
         everyone = (system.integrator, *self.followers)
         # the start of a step may differ from the time of an event by round-off
-        if jumps or any(abs(system.t0 - event) <= 1e-6 * system.dt for event in self._events):
+        if any(abs(system.t0 - event) <= 1e-6 * system.dt for event in self._events):
             for each in everyone:
                 each.restart()
         self.starts_anew = system.integrator.needs_acceleration

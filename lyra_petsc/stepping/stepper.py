@@ -308,6 +308,7 @@ class Stepper:
     def attempt(self, t0: float, t1: float) -> Attempt:
         """Try the step from t0 to t1 [s]; the state changes only on success; collective."""
         system = self._system
+        self._record(t0)
         with PETSc.Log.Event(FROZEN):
             system.begin_step(t0, t1)
         number = self.ts.getStepNumber()
@@ -453,10 +454,18 @@ class Stepper:
         names, newton = self._suspended or (self.presets, self._newton.saved_state())
         numbers: dict[str, Any] = {"preset": names[0], **newton}
         self.linear.reuse.discard()  # a resumed run has no preconditioner to reuse, and must behave alike
-        if not self._iterates or self._suspended is not None:
-            self._extrapolation.record(time, self._system.v[: self._shape[0]])
+        if self._record(time):
             arrays, numbers["extrapolation"] = self._extrapolation.saved_state()
         return arrays, numbers
+
+    def _record(self, time: float) -> bool:
+        """Record the velocities at ``time`` [s], where the scene's integrator extrapolates them, also while
+        another one replaces it; return whether it does; collective.
+        """
+        extrapolates = not self._iterates or self._suspended is not None
+        if extrapolates:
+            self._extrapolation.record(time, self._system.v[: self._shape[0]])
+        return extrapolates
 
     def restore(
         self, arrays: Mapping[str, Array], numbers: Mapping[str, Any], time: float, step: int
