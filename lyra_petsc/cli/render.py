@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--range", metavar="LOW,HIGH", help="Range of the colours: values, or percentiles as 2%,98%.")
 @click.option("--cells", is_flag=True, help="Colour each triangle by its own value, not by means.")
 @click.option("--texture", type=click.Path(path_type=Path), metavar="IMAGE", help="A picture on the sheet.")
-@click.option("--colors", metavar="FRONT,BACK", help="Of the sheet, as firebrick,ivory or #c8402f,#f0e2c8.")
+@click.option("--colors", metavar="FRONT,BACK", help="Of the sheets, as firebrick,ivory or #c8402f,#f0e2c8.")
 @click.option("--handles", is_flag=True, help="Show the vertices that are held.")
 @click.option("--wind", is_flag=True, help="Show the wind as arrows.")
 @click.option("--no-ground", is_flag=True, help="No floor and no shadow on it.")

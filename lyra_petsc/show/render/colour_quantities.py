@@ -138,6 +138,15 @@ class ColourQuantity:
         return replace(self, values=values, on_triangles=False)
 
 
+def round_numbers(low: float, high: float) -> Array:
+    """(n,) about five round numbers from ``low`` to ``high``, in equal steps."""
+    from matplotlib.ticker import MaxNLocator
+
+    numbers = np.asarray(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+    tolerance = 1e-6 * (high - low)
+    return numbers[(numbers >= low - tolerance) & (numbers <= high + tolerance)]
+
+
 def colour_limits(low: float, high: float) -> tuple[float, float]:
     """The range from ``low`` to ``high``, or a small range if it is empty."""
     if low < high:

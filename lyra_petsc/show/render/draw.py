@@ -20,7 +20,13 @@ from lyra_petsc.show.render.camera import CameraFit, up_direction
 from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
 from lyra_petsc.show.render.render_plan import RenderPlan, run_line_of_sight
-from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, near_obstacle_points, wind_arrows
+from lyra_petsc.show.render.scene_drawing import (
+    Bounds,
+    SceneDrawing,
+    floor_height,
+    near_obstacle_points,
+    wind_arrows,
+)
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
@@ -74,7 +80,7 @@ def _write(files: PictureFiles | None, states: list[int], images: list[list[Imag
 
 
 def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
-    """The drawing, with camera and colours that fit most of the motion; collective."""
+    """The drawing, with a camera that fits most of the states drawn, and colours the motion; collective."""
     shown = on_every_rank(comm, lambda: _colour_quantity(plan))
     sight = on_every_rank(comm, lambda: run_line_of_sight(plan.run, plan.scene))
     axes = Bounds.axes_of(up_direction(plan.scene))
@@ -84,13 +90,19 @@ def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
     supports, values = on_every_rank(comm, lambda: measure_states(plan.run, mine, normals, shown))
     supports, values = (np.concatenate(comm.allgather(part)) for part in (supports, values))
     n, whole = len(fit.normals), supports.max(axis=0)
-    support, bounds = fit.framed_support(supports[:, :n]), Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
+    drawn = np.isin(
+        np.concatenate([plan.motion[rank :: comm.size] for rank in range(comm.size)]), plan.states
+    )
+    support = fit.framed_support(supports[drawn, :n])
+    bounds = Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
+    times = plan.run.times
     obstacles: list[ObstacleSurface] = []
     if plan.scene.obstacles:
         obstacles = on_every_rank(comm, lambda: _obstacles(plan, bounds))
-        near = near_obstacle_points(obstacles, bounds, plan.run.times[plan.motion])
-        support = np.maximum(support, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
-        bounds = bounds.including(near)
+    floor = floor_height(obstacles, bounds, times[plan.motion])
+    near = near_obstacle_points(obstacles, bounds, times[plan.states], normals)
+    support = np.maximum(support, (near @ fit.normals.T).max(axis=0, initial=-np.inf))
+    bounds = bounds.including(near)
     limits = (0.0, 1.0) if shown is None else shown.limits(values, plan.limits)
     wind = None
     if plan.options.wind and plan.scene.wind is not None:
@@ -99,7 +111,9 @@ def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
         ends = np.concatenate([feet, feet + arrow])
         support = np.maximum(support, (ends @ fit.normals.T).max(axis=0))
     view = fit.view(support)
-    return on_every_rank(comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles))
+    return on_every_rank(
+        comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles, floor)
+    )
 
 
 def _obstacles(plan: RenderPlan, bounds: Bounds) -> list[ObstacleSurface]:

@@ -20,7 +20,7 @@ from lyra_petsc.show.render.camera import line_of_sight, up_direction
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.image_files import TILES, check_film, parse_colors, read_texture
 from lyra_petsc.show.render.opengl import check_opengl
-from lyra_petsc.show.render.sheet_geometry import HeldVertices
+from lyra_petsc.show.render.sheet_geometry import HeldVertices, sheet_numbers
 
 PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 """Packages of the extra ``view`` that pictures need."""
@@ -28,11 +28,23 @@ PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 SIZE = "1280x720"
 MIN_PIXELS, MAX_PIXELS = 32, 8192
 """Limits of a picture's width and height [pixels]."""
-COLORS = "#c8402f,#f0e2c8"
+COLORS = ("#c8402f", "#f0e2c8")
+"""Front and back of a single sheet."""
+SHEET_COLORS = (
+    ("#c8402f", "#e8ab9f"),
+    ("#2f6f9f", "#a3c0d6"),
+    ("#d99a2b", "#f0d3a0"),
+    ("#4b8b57", "#aecfb4"),
+    ("#7d4a94", "#c9b2d3"),
+    ("#2b9a9a", "#a0d3d3"),
+    ("#8a5a3c", "#cdb5a5"),
+    ("#5c6675", "#b5bac2"),
+)
+"""Front and back of each of several sheets, in turn."""
 FILM, SHEET = "film.mp4", "sheet.png"
 MAX_PICTURES = 1000
 MOTION_STATES = 500
-"""Number of states, besides those drawn, to which camera and colours are fitted."""
+"""Number of states, besides those drawn, to which floor and colours are fitted."""
 SIGHT_STATES = 9
 """Number of states from which the direction of the camera is chosen."""
 
@@ -63,7 +75,7 @@ class RenderOptions:
     range: str | None = None
     cells: bool = False
     texture: Path | None = None
-    colors: str = COLORS
+    colors: str | None = None
     handles: bool = False
     wind: bool = False
     ground: bool = True
@@ -99,8 +111,8 @@ class RenderPlan:
         The run's scene, with the camera changed by ``--set``.
     size : (int, int)
         Width and height [pixels].
-    colors : (str, str)
-        Front and back of the sheet, as #rrggbb.
+    colors : tuple of (str, str)
+        Front and back, as #rrggbb, of the first sheet, the second and so on, in turn.
     pictures : list of (Path, int)
         Files of single pictures and the number of each picture's state.
     film : (Path, FilmTiming) or None
@@ -115,7 +127,7 @@ class RenderPlan:
     run: StoredRun
     scene: Scene
     size: tuple[int, int]
-    colors: tuple[str, str]
+    colors: tuple[tuple[str, str], ...]
     pictures: list[tuple[Path, int]]
     film: tuple[Path, FilmTiming] | None
     sheet: tuple[Path, tuple[int, ...]] | None
@@ -131,7 +143,7 @@ class RenderPlan:
 
     @property
     def motion(self) -> list[int]:
-        """States to which camera and colours are fitted: of the whole run, so that all its pictures agree."""
+        """States to which floor and colours are fitted: of the whole run, so that all its pictures agree."""
         return sorted({*self.states, *spread_states(self.run.times, MOTION_STATES)})
 
 
@@ -163,7 +175,11 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     nothing_named = not (times or options.film or options.sheet)
     folder = options.out or run.folder
     film_file = options.film or (folder / FILM if nothing_named else None)
-    colors = parse_colors(options.colors)
+    colors: tuple[tuple[str, str], ...] = (COLORS,)
+    if options.colors is not None:
+        colors = (parse_colors(options.colors),)
+    elif options.field is None and options.texture is None and sheet_numbers(run).any():
+        colors = SHEET_COLORS
     texture = None if options.texture is None else read_texture(options.texture)
     film = None
     if film_file is not None:

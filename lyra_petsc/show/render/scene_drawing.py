@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
-from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
+from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates, round_numbers
 from lyra_petsc.show.render.opengl import import_pyvista, off_screen_plotter
 from lyra_petsc.show.render.render_plan import RenderPlan, decimals
-from lyra_petsc.show.render.sheet_geometry import HeldVertices, split_at_seams, vertex_normals
+from lyra_petsc.show.render.sheet_geometry import HeldVertices, sheet_numbers, split_at_seams, vertex_normals
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
@@ -28,7 +28,7 @@ HANDLE_COLOR, WIND_COLOR, OBSTACLE_COLOR = "#30343b", "#6d8fae", "#9aa0a8"
 MAP, SIGNED_MAP = "viridis", "coolwarm"
 
 OBSTACLE_MARGIN = 0.25
-"""Distance from the motion within which obstacles are in the picture, relative to the motion's size."""
+"""Distance from the motion within which large obstacles are in the picture, relative to the motion's size."""
 
 FLOOR_PIXELS = 512
 """Pixels of the floor's texture in each direction."""
@@ -37,7 +37,7 @@ BLUR = 0.012
 DARKNESS = 0.42
 FLOOR_COLOR = (225, 224, 221)
 FLOOR_GAP = 0.02
-"""Height of the lowest point above the floor, relative to the size of the motion."""
+"""Height of the sheets' lowest point above the floor, relative to the size of the motion."""
 
 
 @dataclass(frozen=True)
@@ -72,26 +72,41 @@ class Bounds:
         return (self.low + self.high) / 2.0 @ self.axes
 
     def including(self, points: Array) -> Bounds:
-        """The smallest box that includes this one and points (n, 3), given along the axes [m]."""
-        whole = np.concatenate([points, [self.low, self.high]])
+        """The smallest box that includes this one and points (n, 3) [m]."""
+        whole = np.concatenate([points @ self.axes.T, [self.low, self.high]])
         return Bounds(self.axes, whole.min(axis=0), whole.max(axis=0))
 
 
-def near_obstacle_points(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array) -> Array:
-    """(n, 3) corners of the obstacles' bounding boxes at some times [s], along the axes of ``bounds`` [m].
+def near_obstacle_points(
+    obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array, normals: Array
+) -> Array:
+    """(n, 3) outermost points [m] of the obstacles along ``normals`` (m, 3) at some times [s].
 
-    Corners farther from the ``bounds`` than `OBSTACLE_MARGIN` are moved to that distance.
+    Of an obstacle that extends beyond the size of the motion, points are moved to within `OBSTACLE_MARGIN`.
     """
     margin = OBSTACLE_MARGIN * bounds.size
-    boxes = [np.empty((0, 3))]
+    points = [np.empty((0, 3))]
+    for x in _solid_positions(obstacles, times):
+        along = x @ bounds.axes.T
+        if np.maximum(bounds.low - along, along - bounds.high).max() > bounds.size:
+            along = along.clip(bounds.low - margin, bounds.high + margin)
+        near = along @ bounds.axes
+        points.append(near[(near @ normals.T).argmax(axis=0)])
+    return np.concatenate(points)
+
+
+def floor_height(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array) -> float:
+    """Height [m] of a floor below the sheets' ``bounds``, on which the lowest obstacle stands."""
+    heights = [float((x @ bounds.axes[2]).min()) for x in _solid_positions(obstacles, times)]
+    return min([float(bounds.low[2]) - FLOOR_GAP * bounds.size, *heights])
+
+
+def _solid_positions(obstacles: Iterable[ObstacleSurface], times: Array) -> Iterator[Array]:
+    """Points (n, 3) [m] of each obstacle but planes, at each time [s] if it moves."""
     for obstacle in obstacles:
-        for time in times[:1] if obstacle.fixed else times:
-            if not obstacle.infinite:
-                x = obstacle.positions(float(time)) @ bounds.axes.T
-                boxes.append(np.array([x.min(axis=0), x.max(axis=0)]))
-    limits = np.clip(np.concatenate(boxes), bounds.low - margin, bounds.high + margin).reshape(-1, 2, 3)
-    corners = np.array(list(np.ndindex(2, 2, 2)))
-    return limits[:, corners, np.arange(3)].reshape(-1, 3)
+        if not obstacle.infinite:
+            for time in times[:1] if obstacle.fixed else times:
+                yield obstacle.positions(float(time))
 
 
 class SceneDrawing:
@@ -110,6 +125,8 @@ class SceneDrawing:
     wind : (3,) float64 or None
         Velocity of the wind [m/s], if it is drawn.
     obstacles : list of ObstacleSurface
+    floor : float
+        Height of the floor [m].
     """
 
     def __init__(
@@ -121,12 +138,14 @@ class SceneDrawing:
         limits: tuple[float, float],
         wind: Array | None,
         obstacles: list[ObstacleSurface],
+        floor: float,
     ) -> None:
         self._plan, self._bounds, self._quantity = plan, bounds, quantity
         self._triangles = plan.run.triangles
         self._pyvista = pyvista = import_pyvista()
         self._plotter = plotter = off_screen_plotter(plan.size)
         plotter.set_background(HORIZON, top=SKY)
+        plotter.renderer.SetDitherGradient(False)  # pictures would be twice as large
         # FXAA is as smooth as multisampling, with which a software renderer takes 1.5 times as long
         plotter.disable_anti_aliasing()
         plotter.renderer.SetUseFXAA(True)
@@ -135,12 +154,12 @@ class SceneDrawing:
         plotter.camera.SetWindowCenter(0.0, -view.raised)
         self._scale = plan.size[1] / 720.0
         key_light = self._add_lights(view)
-        self._add_sheet(limits)
+        self._add_sheets(limits)
         self._obstacles = [(each, self._add_obstacle(each)) for each in obstacles]
         self._ground = None
-        floor = plan.options.ground and not any(obstacle.infinite for obstacle in obstacles)
-        if floor and plan.scene.gravity is not None:
-            self._ground = Ground(bounds, self._triangles, len(plan.run.rest), key_light)
+        has_floor = plan.options.ground and not any(obstacle.infinite for obstacle in obstacles)
+        if has_floor and plan.scene.gravity is not None:
+            self._ground = Ground(bounds, floor, self._triangles, len(plan.run.rest), key_light)
             self._floor = plotter.add_mesh(self._ground.mesh(), color="white", lighting=False)
         self._held = HeldVertices(plan.run) if plan.options.handles else None
         if self._held is not None:
@@ -158,15 +177,16 @@ class SceneDrawing:
         """(height, width, 3) picture of a state, given by its number."""
         run = self._plan.run
         time, x = float(run.times[state]), run.positions[state]
-        self._sheet.points = x[self._source]
-        normals = vertex_normals(x, self._triangles)[self._source]
-        self._sheet.point_data.active_normals = normals.astype(np.float32)
+        normals = vertex_normals(x, self._triangles)[self._source].astype(np.float32)
+        for sheet in self._sheets:
+            sheet.points = x[self._source]
+            sheet.point_data.active_normals = normals
         if self._quantity is not None:
             values = self._quantity.values(state)
             if self._quantity.on_triangles:
-                self._sheet.cell_data["colour"] = values
+                self._sheets[0].cell_data["colour"] = values
             else:
-                self._sheet.point_data["colour"] = values[self._source]
+                self._sheets[0].point_data["colour"] = values[self._source]
         for obstacle, mesh in self._obstacles:
             if self._first or not obstacle.fixed:
                 mesh.points = obstacle.positions(time)
@@ -197,18 +217,24 @@ class SceneDrawing:
         if self._ground is not None:
             self._ground.close()
 
-    def _add_sheet(self, limits: tuple[float, float]) -> None:
+    def _add_sheets(self, limits: tuple[float, float]) -> None:
+        """Add all triangles as one mesh or, if each sheet has its colours, one for each pair of colours."""
         plan, quantity, triangles = self._plan, self._quantity, self._triangles
         self._source, corners, uv = np.arange(len(plan.run.rest)), triangles, None
         if plan.texture is not None:
             uv = plan.run.corner_uv
             corner_uv = _to_unit_square(material_coordinates(plan.run)) if uv is None else uv
             self._source, corners, uv = split_at_seams(triangles, corner_uv)
-        points = np.zeros((len(self._source), 3))
-        self._sheet = sheet = self._pyvista.PolyData.from_regular_faces(points, corners)
+        pair = np.zeros(len(triangles), dtype=np.int64)
+        if len(plan.colors) > 1:
+            pair = sheet_numbers(plan.run) % len(plan.colors)
+        pairs, points = np.unique(pair), np.zeros((len(self._source), 3))
+        make_sheet = self._pyvista.PolyData.from_regular_faces
+        self._sheets = [make_sheet(points, corners[pair == number]) for number in pairs]
+        sheet = self._sheets[0]
         light: dict[str, Any] = {"interpolation": "phong", "specular_power": 14.0}
         light |= {"ambient": 0.24, "diffuse": 0.8, "specular": 0.08}
-        look: dict[str, Any]
+        looks: list[dict[str, Any]]
         if quantity is not None:
             # brighter, so that colours can be distinguished in the shade
             light |= {"ambient": 0.45, "diffuse": 0.6, "specular": 0.05}
@@ -217,20 +243,21 @@ class SceneDrawing:
             else:
                 sheet.point_data["colour"] = np.zeros(sheet.n_points)
             colours = SIGNED_MAP if quantity.signed else MAP
-            look = {"scalars": "colour", "clim": limits, "cmap": colours, "show_scalar_bar": False}
+            looks = [{"scalars": "colour", "clim": limits, "cmap": colours, "show_scalar_bar": False}]
         elif uv is not None:
             sheet.active_texture_coordinates = uv
             texture = self._pyvista.Texture(plan.texture)
             texture.interpolate = True
             # a repeated texture would show its left edge at the right edge
             texture.repeat = bool(uv.min() < 0.0 or uv.max() > 1.0)
-            look = {"texture": texture, "color": "white"}
+            looks = [{"texture": texture, "color": "white"}]
         else:
-            front, back = plan.colors
-            look = {"color": front, "backface_params": {**light, "color": back}}
-        self._plotter.add_mesh(sheet, reset_camera=False, **light, **look)
+            shown = [plan.colors[number] for number in pairs]
+            looks = [{"color": front, "backface_params": {**light, "color": back}} for front, back in shown]
+        for sheet, look in zip(self._sheets, looks, strict=True):
+            self._plotter.add_mesh(sheet, reset_camera=False, **light, **look)
         if quantity is not None:
-            self._add_bar(quantity)
+            self._add_bar(quantity, limits)
 
     def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
         """Add an obstacle and return its mesh, whose points `image` moves."""
@@ -242,12 +269,14 @@ class SceneDrawing:
         )
         return mesh
 
-    def _add_bar(self, quantity: ColourQuantity) -> None:
+    def _add_bar(self, quantity: ColourQuantity, limits: tuple[float, float]) -> None:
         left = 0.64
         place = {"width": 0.32, "height": 0.07, "position_x": left, "position_y": 0.04}
         font = {"color": INK, "font_family": "arial", "label_font_size": round(20 * self._scale)}
         self._add_text(quantity.label, (left, 0.125), viewport=True)
-        self._plotter.add_scalar_bar(title="", vertical=False, n_labels=5, fmt="%.3g", **place, **font)
+        bar = self._plotter.add_scalar_bar(title="", vertical=False, fmt="%g", **place, **font)
+        bar.SetCustomLabels(self._pyvista.convert_array(round_numbers(*limits)))
+        bar.SetUseCustomLabels(True)
 
     def _add_text(self, text: str, position: tuple[float, float], **options: Any) -> Any:
         added = self._plotter.add_text(text, position=position, font_size=1, color=INK, **options)
@@ -288,15 +317,16 @@ class Ground:
     Parameters
     ----------
     bounds : Bounds
+    height : float
+        [m]
     triangles : (F, 3) int64
     n_vertices : int
     light : (3,) float64
         Unit vector towards the light.
     """
 
-    def __init__(self, bounds: Bounds, triangles: Ints, n_vertices: int, light: Array) -> None:
-        self._bounds = bounds
-        self._height = bounds.low[2] - FLOOR_GAP * bounds.size
+    def __init__(self, bounds: Bounds, height: float, triangles: Ints, n_vertices: int, light: Array) -> None:
+        self._bounds, self._height = bounds, height
         towards = bounds.axes @ light
         self._slope = towards[:2] / towards[2]
         # largest sideways displacement of the shadow

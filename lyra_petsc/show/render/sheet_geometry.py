@@ -6,6 +6,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.patches import connected_pieces
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.output.read_run import StoredRun
@@ -34,6 +35,11 @@ def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array
     rows = np.column_stack([triangles.ravel().astype(np.float64), corner_uv.reshape(-1, 2)])
     copies, corners = np.unique(rows, axis=0, return_inverse=True)
     return copies[:, 0].astype(np.int64), corners.reshape(triangles.shape).astype(np.int64), copies[:, 1:]
+
+
+def sheet_numbers(run: StoredRun) -> Ints:
+    """(F,) number of the sheet, a connected part of the mesh, that each triangle belongs to."""
+    return np.unique(connected_pieces(run.triangles), return_inverse=True)[1]
 
 
 def vertex_normals(x: Array, triangles: Ints) -> Array:

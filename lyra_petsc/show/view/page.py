@@ -381,8 +381,8 @@ class Page:
         if self._obstacles is None:
             self._find_obstacles()
         times = run.times[content.sample(len(run), MOTION_STATES)]
-        near = near_obstacle_points(self._obstacles or (), self._bounds, times)
-        support = np.maximum(support, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
+        near = near_obstacle_points(self._obstacles or (), self._bounds, times, fit.normals)
+        support = np.maximum(support, (near @ fit.normals.T).max(axis=0, initial=-np.inf))
         arrows = self._show_wind()
         if len(arrows):
             support = np.maximum(support, (arrows @ fit.normals.T).max(axis=0))

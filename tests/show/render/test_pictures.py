@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -15,11 +16,14 @@ from written_run import written, written_with_obstacles
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
+from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
 from lyra_petsc.show.render import opengl
 from lyra_petsc.show.render.draw import draw
 from lyra_petsc.show.render.image_files import film_writer
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
+from lyra_petsc.show.render.scene_drawing import FLOOR_GAP, Bounds, floor_height, near_obstacle_points
 from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 
 SIZE = "160x120"
@@ -138,6 +142,23 @@ def test_colours_distinguish_values_and_have_a_bar(ring, tmp_path):
         return np.abs(np.diff(shown[row, first : pixel(2.7, 2.6)[1], 1])).max()
 
     assert jumps(means) < 0.6 * jumps(image)
+
+
+def test_the_bar_has_round_labels(ring, tmp_path, monkeypatch):
+    import pyvista
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    added, labels = pyvista.Plotter.add_scalar_bar, []
+
+    def keep(*args: object, **options: object) -> object:
+        labels.append(added(*args, **options))
+        return labels[-1]
+
+    monkeypatch.setattr(pyvista.Plotter, "add_scalar_bar", keep)
+    picture(ring, tmp_path, field="stress", range="0,6.12")
+    (bar,) = labels
+    assert bar.GetUseCustomLabels()
+    np.testing.assert_allclose(vtk_to_numpy(bar.GetCustomLabels()), [0, 2, 4, 6])
 
 
 def test_handles_and_label_are_drawn_on_request(tmp_path):
@@ -321,6 +342,58 @@ def test_obstacles_are_in_the_picture(tmp_path):
     assert 0.3 * red[2] < red[1] < red[2]
     edge = near[:, [0, -1]].reshape(-1, 3)
     assert (np.ptp(edge, axis=1) < 30).all()
+
+
+@pytest.mark.parametrize("at", ["0", "0.5"])
+def test_a_single_picture_is_filled_by_its_state(ring, tmp_path, at):
+    """The sheet moves by its own size during the run; it has a margin of 7 % on the nearest sides."""
+    run = written(tmp_path / "run", states=30)
+    image = picture(run, tmp_path, at=at, settings=("render.camera.direction=[0,-1,1]",))
+    rows, columns = np.nonzero(image[:, :, 0] > 1.5 * image[:, :, 2])
+    assert max(np.ptp(rows) / 120, np.ptp(columns) / 160) == pytest.approx(0.86, abs=0.02)
+
+
+def test_each_sheet_has_its_own_colours(tmp_path):
+    run, apart = written(tmp_path / "run", fields=False), [0, 4]
+    mesh = ring_mesh()
+    write_mesh(
+        run,
+        replace(mesh, triangles=mesh.triangles[apart], triangle_uv=mesh.triangle_uv[apart]),
+        MPI.COMM_SELF,
+    )
+    own, given = (picture(run, tmp_path, colors=colors) for colors in (None, f"{FRONT},{BACK}"))
+    lower, upper = pixel(1.7, 0.3), pixel(1.3, 2.7)
+    assert [int(np.argmax(own[there])) for there in (lower, upper)] == [0, 2]
+    assert [int(np.argmax(given[there])) for there in (lower, upper)] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "lowest", "shown"),
+    [
+        ({"box": {"min": [0, 0, -4], "max": [3, 3, -1]}}, -4.0, -4.0),
+        ({"box": {"min": [0, 0, -9], "max": [3, 3, -1]}}, -9.0, -1.25),  # in part, as it is large
+        ({"sphere": {"center": [1, 1, 3], "radius": 1}}, -0.1, 2.0),
+        ({"plane": {"point": [0, 0, -9], "normal": [0, 0, 1]}}, -0.1, np.inf),
+    ],
+)
+def test_the_floor_is_below_what_stands_on_it(tmp_path, shape, lowest, shown):
+    run = StoredRun(written_with_obstacles(tmp_path / "run", obstacles={"one": shape}))
+    bounds = Bounds(np.eye(3), np.zeros(3), np.array([3.0, 4.0, 0.0]))
+    surfaces = obstacle_surfaces(run, bounds.middle, bounds.size)
+    assert FLOOR_GAP * bounds.size == pytest.approx(0.1)
+    assert floor_height(surfaces, bounds, run.times) == pytest.approx(lowest)
+    near = near_obstacle_points(surfaces, bounds, run.times, -np.eye(3))
+    assert near[:, 2].min(initial=np.inf) == pytest.approx(shown)
+
+
+def test_a_ball_is_framed_by_its_surface(tmp_path):
+    """Not by the corners of its bounding box."""
+    ball = {"sphere": {"center": [1, 1, 1], "radius": 2}}
+    run = StoredRun(written_with_obstacles(tmp_path / "run", obstacles={"ball": ball}))
+    bounds = Bounds(np.eye(3), np.zeros(3), np.array([3.0, 3.0, 0.0]))
+    normals = np.array([[1, 1, 1], [0, 1, -1]]) / np.sqrt([[3], [2]])
+    near = near_obstacle_points(obstacle_surfaces(run, bounds.middle, 1.0), bounds, run.times, normals)
+    np.testing.assert_allclose((near @ normals.T).max(axis=0), [np.sqrt(3) + 2, 2], rtol=0.01)
 
 
 def test_a_run_without_the_mesh_of_an_obstacle_is_refused(tmp_path):

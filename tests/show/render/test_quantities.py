@@ -16,6 +16,7 @@ from lyra_petsc.show.render.colour_quantities import (
     ColourRange,
     colour_limits,
     quantity,
+    round_numbers,
 )
 from lyra_petsc.show.render.draw import measure_states
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
@@ -145,3 +146,19 @@ def test_held_vertices_follow_the_windows_of_handles(tmp_path):
         tuple(sorted(t[[i, i - 1]])) for t in TRIANGLES for i in range(3)
     }
     assert len(REST) == 8
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(0.0, 6.12), (-0.371, 0.371), (0.046, 0.718), (1.2e-9, 7e-7), (-3e6, 1e5), (100.0, 101.3)],
+)
+def test_the_ticks_of_the_colours_are_round(low, high):
+    ticks = round_numbers(low, high)
+    steps = np.diff(ticks)
+    assert 3 <= len(ticks) <= 7
+    assert low <= ticks[0]
+    assert ticks[-1] <= high
+    np.testing.assert_allclose(steps, steps[0])
+    digits = steps[0] / 10 ** np.floor(np.log10(steps[0]) + 1e-9)
+    assert np.isclose(digits, [1, 2, 2.5, 5]).any()
+    np.testing.assert_allclose(ticks / steps[0], np.round(ticks / steps[0]), atol=1e-9)
