@@ -20,7 +20,7 @@ from lyra_petsc.errors import InputError
     "--mesh",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Your own .geo, .msh or .obj; its groups are listed.",
+    help="Your own mesh file; its groups are listed.",
 )
 @trust_mesh
 def new(comm: Any, name: str, mesh: Path | None, trust_mesh: bool) -> None:

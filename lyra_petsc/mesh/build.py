@@ -33,9 +33,8 @@ def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None)
     Raises
     ------
     InputError
-        No triangles, non-finite coordinates, a triangle that uses a vertex twice, duplicate triangles, or
-        vertices in no triangle. Triangles and vertices are counted from 0 in file order, quads as two
-        triangles.
+        No triangles, non-finite coordinates, a triangle that uses a vertex twice, or duplicate triangles.
+        Triangles and vertices are counted from 0 in file order, quads as two triangles.
     """
 
     def refuse(message: str) -> None:
@@ -52,10 +51,6 @@ def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None)
         refuse(f"degenerate triangles (a vertex used twice): {first_few(bad.tolist())} (counted from 0)")
     if (bad := _duplicates(triangles)).size:
         refuse(f"triangles that repeat another one: {first_few(bad.tolist())} (counted from 0)")
-    used = np.zeros(len(sheet.points), dtype=np.bool_)
-    used[triangles] = True
-    if (bad := np.flatnonzero(~used)).size:
-        refuse(f"vertices in no triangle have no mass: {first_few(bad.tolist())} (counted from 0)")
 
 
 def check_shape(corners: Array, shape: str, *, file: object | None, key: str | None = None) -> None:
@@ -287,14 +282,13 @@ def _read_surface(
     """The surface of an obstacle at t = 0, without unused points, and the notes of its file's reader."""
     try:
         sheet = _read(source, trust_scripts, report)
-        used, numbers = np.unique(sheet.triangles, return_inverse=True)
-        whole = Sheet(sheet.points[used], numbers.reshape(-1, 3).astype(np.int64))
-        check_topology(whole, file=source.file)
-        _, points = _transformed(whole.points, source.transform)
-        check_shape(points[whole.triangles], "start", file=source.file)
+        sheet.uv = None
+        check_topology(sheet, file=source.file)
+        _, points = _transformed(sheet.points, source.transform)
+        check_shape(points[sheet.triangles], "start", file=source.file)
     except MemoryError:
         raise InputError("the mesh does not fit into memory", file=source.file) from None
-    return TriangleSurface(points, whole.triangles), sheet.notes
+    return TriangleSurface(points, sheet.triangles), sheet.notes
 
 
 def _transformed(points: Array, transform: Transform) -> tuple[Array, ...]:
@@ -372,19 +366,21 @@ def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None]
         return grid_sheet(source.grid)
     assert source.file is not None
     suffix = source.file.suffix.lower()
-    if suffix == ".geo":
-        from lyra_petsc.mesh.geo_file import mesh_geo
-
-        return mesh_geo(
-            source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, report=report
-        )
     if suffix == ".msh":
         from lyra_petsc.mesh.msh_file import read_msh
 
         return read_msh(source.file)
-    from lyra_petsc.mesh.obj_file import read_obj
+    if suffix == ".obj":
+        from lyra_petsc.mesh.obj_file import read_obj
 
-    return read_obj(source.file)
+        return read_obj(source.file)
+    from lyra_petsc.mesh.library_file import mesh_geo, read_library_file
+
+    if suffix != ".geo":
+        return read_library_file(source.file)
+    return mesh_geo(
+        source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, report=report
+    )
 
 
 def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: object | None) -> Mesh:

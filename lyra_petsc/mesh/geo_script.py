@@ -383,6 +383,8 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
         return script.error(token.line, f"'{word}' {why}; {REMEDY}")
 
     if (why := REFUSED.get(word)) is not None:
+        if word == "Save":
+            why += ", of which none is needed: take it out"
         raise refuse(why)
     if word.endswith("FileName") and word != "CurrentFileName":
         raise refuse("reads what the scene does not name")

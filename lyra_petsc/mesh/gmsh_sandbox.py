@@ -1,6 +1,7 @@
-"""Sandbox of gmsh's process: seccomp (by libseccomp) and Landlock of the Linux kernel, through ctypes.
+"""Sandbox of the process in which gmsh and other libraries read meshes: seccomp (by libseccomp) and Landlock
+of the Linux kernel, through ctypes.
 
-The process enters the sandbox once gmsh and its libraries are loaded, and cannot leave it. It can then start
+The process enters the sandbox once the library is loaded, and cannot leave it. It can then start
 no program and no process, open no socket, and create, change or remove no file; it can write to files that
 are open. With Landlock it can read only the files it needs. Users rely on the list of allowed statements
 (`geo_script`); the sandbox is a second layer against gaps in this list. Where the kernel permits neither, or

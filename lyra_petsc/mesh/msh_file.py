@@ -16,10 +16,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
-from lyra_petsc.mesh.readers import first_few, printable, split_quads
+from lyra_petsc.mesh.readers import drop_loose_vertices, first_few, printable, split_quads
 from lyra_petsc.scene.text import read_bytes
 
 Names = dict[tuple[int, int], str]
@@ -45,6 +45,12 @@ ELEMENT_TYPES: dict[int, tuple[int, int, int]] = {
 }
 
 
+_WITHOUT_TRIANGLES = {
+    1: ", only curves: make a surface; beside other physical groups it must be in one to be saved by gmsh",
+    3: ", only solid elements: save the surface mesh",
+}
+
+
 class MshError(ValueError):
     """A section does not follow the format; the message is for the user."""
 
@@ -66,12 +72,13 @@ def read_msh(path: Path) -> Sheet:
         If the file is of another format, damaged, or holds no triangles.
     """
     content = _read_sections(read_bytes(path), path)
-    for section in ("Nodes", "Elements"):
+    nodes = "ParametricNodes" if "ParametricNodes" in content.sections else "Nodes"
+    for section in (nodes, "Elements"):
         if section not in content.sections:
             raise InputError(f"the mesh has no triangles: section ${section} is missing", file=path)
     section = ""
     try:
-        section = "Nodes"
+        section = nodes
         tags, points = _read_nodes(content)
         section = "Entities"
         physical = _read_entities(content)
@@ -158,9 +165,23 @@ def _read_nodes(content: _File) -> tuple[Ints, Array]:
             extra = dimension if parametric and 0 <= dimension <= 3 else 0
             points.append(values.rows(count, 0, 3 + extra)[1][:, :3])
         return np.concatenate(tags), np.concatenate(points)
+    if "ParametricNodes" in content.sections:
+        return _read_parametric_nodes(*_read_count(content, "ParametricNodes"))
     values, count = _read_count(content, "Nodes")
     rows, points_2 = values.rows(count, 1, 3)
     return rows[:, 0], points_2
+
+
+def _read_parametric_nodes(values: Values, count: int) -> tuple[Ints, Array]:
+    """Nodes of format 2 with their entities and the parameters on these: one on a curve, two on a surface."""
+    tags, points = [np.empty((0, 1), dtype=np.int64)], [np.empty((0, 3))]
+    for _ in range(count):
+        tag, point = values.rows(1, 1, 3)
+        dimension, _ = read_ints(values, 2)
+        values.rows(1, 0, dimension if dimension in (1, 2) else 0)
+        tags.append(tag)
+        points.append(point)
+    return np.concatenate(tags)[:, 0], np.concatenate(points)
 
 
 def _read_elements(content: _File, physical: dict[tuple[int, int], list[int]]) -> list[ElementBlock]:
@@ -445,7 +466,7 @@ def assemble_sheet(
     names : dict
         Names of physical groups by (dimension, tag).
     note_loose : bool
-        Add a note if nodes in no triangle are dropped.
+        Add a note if vertices in no triangle are dropped.
 
     Raises
     ------
@@ -457,34 +478,30 @@ def assemble_sheet(
     blocks = _resolve_tags(blocks, tags)
     triangles, entity, members = _triangles(points, [b for b in blocks if b.dimension == 2], notes)
     if len(triangles) == 0:
-        solid = any(block.dimension == 3 and len(block.nodes) for block in blocks)
-        hint = ", only solid elements: save the surface mesh" if solid else ""
-        raise NoTrianglesError("no triangles" + hint)
+        highest = max((block.dimension for block in blocks if len(block.nodes)), default=0)
+        raise NoTrianglesError("no triangles" + _WITHOUT_TRIANGLES.get(highest, ""))
     triangles, members = _drop_repeated(triangles, entity, members)
-    used = np.zeros(len(tags), dtype=np.bool_)
-    used[triangles] = True
-    new_number = np.cumsum(used) - 1
-    if note_loose and not used.all():
-        loose = tags[~used]
-        verb = "node that is in no triangle" if len(loose) == 1 else "nodes that are in no triangle"
-        notes.append(f"{len(loose)} {verb} dropped (tag {first_few(loose.tolist())})")
-    groups = [
-        NamedSet(names.get((2, tag), str(tag)), 2, inside) for tag, inside in members.items() if len(inside)
-    ]
+    groups = [NamedSet(names.get((2, tag), str(tag)), 2, inside) for tag, inside in members.items()]
     for dimension in (1, 0):
-        groups += _lower_groups(dimension, blocks, names, used, new_number)
-    empty = {name for (dimension, _), name in names.items() if dimension < 3} - {
-        group.name for group in groups
-    }
+        groups += _lower_groups(dimension, blocks, names)
+    counted_from_0 = np.array_equal(tags, np.arange(len(tags)))
+    sheet = Sheet(
+        points,
+        triangles,
+        groups=[group for group in groups if len(group.members)],
+        notes=notes,
+        tags=None if counted_from_0 else tags,
+    )
+    drop_loose_vertices(sheet, noted=note_loose)
+    empty = {name for (dimension, _), name in names.items() if dimension < 3}
+    empty -= {group.name for group in sheet.groups}
     if empty:
         notes.append(
             f"physical groups without elements on the triangles left out: {first_few(sorted(empty))}"
         )
-    kept = tags[used]
-    counted = np.array_equal(kept, np.arange(1, len(kept) + 1))
-    return Sheet(
-        points[used], new_number[triangles], groups=groups, notes=notes, tags=None if counted else kept
-    )
+    if sheet.tags is not None and np.array_equal(sheet.tags, np.arange(1, len(sheet.points) + 1)):
+        sheet.tags = None
+    return sheet
 
 
 def _resolve_tags(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
@@ -563,19 +580,14 @@ def _drop_repeated(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> t
     }
 
 
-def _lower_groups(
-    dimension: int, blocks: list[ElementBlock], names: Names, used: Mask, new_number: Ints
-) -> list[NamedSet]:
-    """Groups of points or curves, without elements whose nodes were dropped."""
+def _lower_groups(dimension: int, blocks: list[ElementBlock], names: Names) -> list[NamedSet]:
+    """Groups of points or curves."""
     chosen = [block for block in blocks if block.dimension == dimension]
     if not chosen:
         return []
     nodes = np.concatenate([block.nodes[block.groups[:, 0]] for block in chosen])
     tags = np.concatenate([block.groups[:, 1] for block in chosen])
-    groups = []
-    for tag, inside in _by_tag(nodes, tags).items():
-        kept = new_number[inside[used[inside].all(axis=1)]]
-        if len(kept):
-            members = kept if dimension == 1 else kept[:, 0]
-            groups.append(NamedSet(names.get((dimension, tag), str(tag)), dimension, members))
-    return groups
+    return [
+        NamedSet(names.get((dimension, tag), str(tag)), dimension, inside if dimension == 1 else inside[:, 0])
+        for tag, inside in _by_tag(nodes, tags).items()
+    ]

@@ -13,12 +13,12 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
-from lyra_petsc.mesh.readers import first_few, printable, split_polygon, split_quads
+from lyra_petsc.mesh.readers import drop_loose_vertices, first_few, printable, split_polygon, split_quads
 from lyra_petsc.scene.text import read_bytes
 
 # keywords that are ignored without a note
 _IGNORED = re.compile(
-    "v[np]|[lps]|usemtl|mtllib|maplib|usemap|bevel|[cd]_interp|lod|cstype|deg|bmat|step|curv2?|surf|parm|trim|"
+    "v[np]|[lps]|mtllib|maplib|usemap|bevel|[cd]_interp|lod|cstype|deg|bmat|step|curv2?|surf|parm|trim|"
     "hole|scrv|sp|end|con|mg|shadow_obj|trace_obj|[cs]tech"
 )
 
@@ -44,8 +44,9 @@ def read_obj(path: Path) -> Sheet:
     """Read an .obj file.
 
     It reads ``v``, ``vt``, ``f`` (``a``, ``a/b``, ``a//c``, ``a/b/c``, negative numbers, polygons), and
-    ``g`` and ``o`` as surface groups; a backslash continues a line. Other keywords are ignored, with a note
-    if they are unknown. Quads are split along the shorter diagonal, larger polygons into a fan.
+    ``g``, ``o`` and ``usemtl`` as surface groups; a backslash continues a line. Other keywords are ignored,
+    with a note if they are unknown. Quads are split along the shorter diagonal, larger polygons into a fan.
+    Vertices in no face are dropped with a note.
 
     Raises
     ------
@@ -84,13 +85,14 @@ def read_obj(path: Path) -> Sheet:
         for name, begin, end in raw.spans
         if end > begin
     ]
+    drop_loose_vertices(sheet)
     return sheet
 
 
 def _parse(text: str, path: Path) -> _Raw:
     raw = _Raw()
-    open_groups: dict[str, list[str]] = {"g": [], "o": []}
-    begin = {"g": 0, "o": 0}
+    open_groups: dict[str, list[str]] = {"g": [], "o": [], "usemtl": []}
+    begin = dict.fromkeys(open_groups, 0)
 
     def close(kind: str, names: list[str]) -> None:
         n_faces = len(raw.face_size)
@@ -112,16 +114,16 @@ def _parse(text: str, path: Path) -> _Raw:
                 raw.uv.extend((float(parts[1]), float(parts[2]) if len(parts) > 2 else 0.0))
             elif word == "g":
                 close("g", [printable(name) for name in parts[1:]])
-            elif word == "o":
-                close("o", [printable(" ".join(parts[1:]))] if len(parts) > 1 else [])
+            elif word in ("o", "usemtl"):
+                close(word, [printable(" ".join(parts[1:]))] if len(parts) > 1 else [])
             elif not _IGNORED.fullmatch(word):
                 raw.unknown[printable(word[:20])] = number
         except (ValueError, IndexError, OverflowError) as error:
             shown = printable(line.strip()[:60])
             reason = f" ({error})" if isinstance(error, _FaceError) else ""
             raise InputError(f"line {number}: '{shown}' cannot be read{reason}", file=path) from None
-    close("g", [])
-    close("o", [])
+    for kind in begin:
+        close(kind, [])
     return raw
 
 

@@ -1,4 +1,4 @@
-"""Functions that readers of mesh files share: text for messages; quads and polygons split into triangles."""
+"""Functions that readers of mesh files share: text for messages, splitting of polygons, loose vertices."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.mesh import NamedSet, Sheet
 
 _FIRST_DIAGONAL = np.array([[0, 1, 2], [0, 2, 3]])
 _SECOND_DIAGONAL = np.array([[0, 1, 3], [1, 2, 3]])
@@ -23,6 +24,34 @@ def first_few(indices: Iterable[object], limit: int = 5) -> str:
 def printable(name: str) -> str:
     """``name`` with control and null characters, which terminals and HDF5 cannot take, replaced."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+
+
+def drop_loose_vertices(sheet: Sheet, *, noted: bool = True) -> None:
+    """Drop vertices in no triangle, which have no mass, and points and curves of groups there; with a note if
+    ``noted``.
+    """
+    used = np.zeros(len(sheet.points), dtype=np.bool_)
+    used[sheet.triangles] = True
+    if used.all():
+        return
+    number = np.cumsum(used) - 1
+    if noted:
+        loose = np.flatnonzero(~used)
+        which = f"{first_few(loose.tolist())}, counted from 0"
+        if sheet.tags is not None:
+            which = f"tag {first_few(sheet.tags[loose].tolist())}"
+        which += "; later ones are numbered anew" if used[loose[0] :].any() else ""
+        verb = "vertex that is" if len(loose) == 1 else "vertices that are"
+        sheet.notes.append(f"{len(loose)} {verb} in no triangle dropped ({which})")
+    kept = []
+    for group in sheet.groups:
+        if group.dimension < 2:
+            inside = used[group.members].reshape(len(group.members), -1).all(axis=1)
+            group = NamedSet(group.name, group.dimension, number[group.members[inside]])
+        if len(group.members):
+            kept.append(group)
+    sheet.points, sheet.triangles, sheet.groups = sheet.points[used], number[sheet.triangles], kept
+    sheet.tags = None if sheet.tags is None else sheet.tags[used]
 
 
 def split_quads(corners: Array) -> Ints:

@@ -75,7 +75,7 @@ from lyra_petsc.scene.values import (
     vector,
 )
 
-MESH_SUFFIXES = (".geo", ".msh", ".obj")
+MESH_SUFFIXES = (".geo", ".msh", ".obj", ".stl", ".ply", ".off", ".vtk", ".inp", ".bdf", ".unv")
 
 _BY_KIND = Discriminator(lambda value: "[block]" if isinstance(value, (dict, Block)) else "[plain]")
 """Discriminator of values that may be a block or plain values; messages omit the tags."""
@@ -140,7 +140,9 @@ def _file(*endings: str) -> dict[str, Any]:
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
 
-MeshPath = Annotated[Path, file_beside("mesh file", *MESH_SUFFIXES), JsonSchema(_file("geo", "msh", "obj"))]
+MeshPath = Annotated[
+    Path, file_beside("mesh file", *MESH_SUFFIXES), JsonSchema(_file(*(end[1:] for end in MESH_SUFFIXES)))
+]
 
 
 class MeshSource(Block):
@@ -149,7 +151,8 @@ class MeshSource(Block):
     Attributes
     ----------
     file : Path or None
-        A .geo, .msh or .obj file; the path is relative to the scene file.
+        A mesh file (.geo, .msh, .obj, .stl, .ply, .off, .vtk, .inp, .bdf, .unv); the path is relative to the
+        scene file.
     grid : Grid or None
         A rectangular grid instead of a file.
     size : float [m] or None
@@ -896,7 +899,8 @@ class ObstacleMesh(Block):
     Attributes
     ----------
     file : Path
-        A .geo, .msh or .obj file; the path is relative to the scene file.
+        A mesh file (.geo, .msh, .obj, .stl, .ply, .off, .vtk, .inp, .bdf, .unv); the path is relative to the
+        scene file.
     transform : Transform
         Transform from the mesh to the position at t = 0.
     """

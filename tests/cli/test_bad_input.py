@@ -91,7 +91,7 @@ WORDS: list[tuple[list[str], str]] = [
     (["new", "a\nb"], "must be a name"),
     (["new"], "Missing argument"),
     (["new", "x", "--mesh", "none.geo"], "--mesh: no such file"),
-    (["new", "x", "--mesh", "a.stl"], "--mesh: 'a.stl' must end in"),
+    (["new", "x", "--mesh", "a.step"], "--mesh: 'a.step' must end in"),
     (["new", "x", "--mesh", "empty.obj"], "empty.obj"),
     (["stress", "--quick", "--full"], "--quick"),
     (["stress", "none.yaml"], "none.yaml"),

@@ -120,7 +120,7 @@ def warm(folder: Path) -> None:
     scene.write_text(WARM)
     from lyra_petsc.cli.app import run_command_line
 
-    for module in ("scene.original", "mesh.obj_file", "mesh.msh_file", "mesh.geo_file"):
+    for module in ("scene.original", "mesh.obj_file", "mesh.msh_file", "mesh.library_file"):
         importlib.import_module(f"lyra_petsc.{module}")
     with (
         (folder / "warm.txt").open("w") as output,
@@ -207,7 +207,7 @@ def _run(case: Case) -> int:
     from petsc4py import PETSc
 
     from lyra_petsc.cli.app import run_command_line
-    from lyra_petsc.mesh import geo_file as geo
+    from lyra_petsc.mesh import library_file as geo
 
     os.environ["LYRA_TRACEBACK"] = "1"
     geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 2, 3

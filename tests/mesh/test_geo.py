@@ -10,7 +10,7 @@ import pytest
 from mesh_sources import mesh_of, rest_areas
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh import geo_file
+from lyra_petsc.mesh import library_file
 from lyra_petsc.mesh.measures import mean_edge_length, triangle_sides
 from lyra_petsc.mesh.topology import boundary_edges
 
@@ -170,11 +170,11 @@ def test_another_algorithm_on_request_only(script: Path) -> None:
 
 
 def test_progress_of_gmsh_is_reported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(geo_file, "FIRST_REPORT", 0.01)
-    monkeypatch.setattr(geo_file, "MAX_INTERVAL", 0.1)
+    monkeypatch.setattr(library_file, "FIRST_REPORT", 0.01)
+    monkeypatch.setattr(library_file, "MAX_INTERVAL", 0.1)
     script.write_text(SQUARE)
     lines: list[str] = []
-    geo_file.mesh_geo(script, 0.006, report=lines.append)
+    library_file.mesh_geo(script, 0.006, report=lines.append)
     assert lines[0].startswith("script.geo: gmsh is ")
     assert any("gmsh is meshing, roughly 60,000 triangles, " in line for line in lines)
 

@@ -9,10 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from mesh_sources import mesh_of
+from mesh_sources import MeshSource, mesh_of
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh import geo_file as geo
+from lyra_petsc.mesh import library_file as geo
+from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.geo_script import check_script
 from lyra_petsc.mesh.gmsh_sandbox import supported_layers
 
@@ -115,6 +116,20 @@ def meshed(folder: Path, text: str, **options: object) -> str:
 )
 def test_refused_with_line_and_command(tmp_path: Path, text: str, message: str) -> None:
     assert message in meshed(tmp_path, text + "\n")
+
+
+def test_remedies_for_a_script_that_saves_its_mesh(tmp_path: Path) -> None:
+    save = 'Physical Surface(0) = {1};\nMesh 2;\nSave "square.msh";\n'
+    assert "'Save' writes files, of which none is needed: take it out" in meshed(tmp_path, save)
+    script = tmp_path / "script.geo"
+    trusted = build_mesh([MeshSource(file=script)], trust_scripts=True)
+    script.write_text(script.read_text().replace('Save "square.msh";', ""))
+    without = mesh_of(script)
+    assert trusted.n_triangles == without.n_triangles > 0
+    assert list(tmp_path.iterdir()) == [script]
+    script.write_text(SQUARE + 'Merge "square.msh";\n')
+    with pytest.raises(InputError, match=r"Unable to open file 'square\.msh'"):
+        build_mesh([MeshSource(file=script)], trust_scripts=True)
 
 
 def test_included_files_are_checked_with_a_note(tmp_path: Path) -> None:

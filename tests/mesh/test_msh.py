@@ -127,7 +127,9 @@ def test_shuffled_tags_keep_file_order_and_loose_nodes_are_dropped(tmp_path: Pat
     mesh = mesh_of(file)
     assert mesh.positions.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert mesh.notes == ["shuffled.msh: 1 node that is in no triangle dropped (tag 99)"]
+    assert mesh.notes == [
+        "shuffled.msh: 1 vertex that is in no triangle dropped (tag 99; later ones are numbered anew)"
+    ]
 
 
 def test_one_name_for_two_dimensions_gives_a_note(tmp_path: Path) -> None:
@@ -144,6 +146,30 @@ def test_equal_names_of_one_dimension_are_one_group(tmp_path: Path) -> None:
     file = tmp_path / "equal.msh"
     file.write_text(ascii_2(NODES, "1 2 2 1 1 40 7 3;2 2 2 -2 1 40 3 12", names))
     assert mesh_of(file).groups["cloth"].triangles.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("binary", [0, 1])
+def test_parametric_nodes_of_format_2(tmp_path: Path, two_squares: Callable[..., None], binary: int) -> None:
+    plain, parametric = tmp_path / "plain.msh", tmp_path / "parametric.msh"
+    two_squares(plain, 2.2, binary)
+    gmsh_module.option.setNumber("Mesh.SaveParametric", 1)
+    gmsh_module.write(str(parametric))
+    assert b"$ParametricNodes" in parametric.read_bytes()
+    one, other = mesh_of(plain), mesh_of(parametric)
+    assert np.array_equal(one.positions, other.positions)
+    assert np.array_equal(one.triangles, other.triangles)
+    assert sorted(one.groups) == sorted(other.groups)
+
+
+def test_a_file_with_curves_alone_says_what_gmsh_saves(tmp_path: Path, gmsh: ModuleType) -> None:
+    file, script = tmp_path / "curves.msh", tmp_path / "curves.geo"
+    file.write_text(ascii_2(NODES, "1 1 2 5 1 40 7;2 1 2 5 1 7 3"))
+    script.write_text(
+        'Point(1) = {0, 0, 0}; Point(2) = {1, 0, 0}; Line(1) = {1, 2}; Physical Curve("a") = {1};\n'
+    )
+    for path in (file, script):
+        with pytest.raises(InputError, match=r"no triangles, only curves: make a surface.*gmsh"):
+            mesh_of(path)
 
 
 @pytest.mark.parametrize(

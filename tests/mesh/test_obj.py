@@ -85,6 +85,25 @@ def test_groups_and_objects_name_surfaces(tmp_path: Path) -> None:
     assert groups["sail cloth"].triangles.tolist() == [0, 1]
 
 
+def test_materials_name_surfaces_beside_objects(tmp_path: Path) -> None:
+    text = "o Shirt\n" + SQUARE + "usemtl heavy denim\nf 1 2 3\ng collar\nusemtl cotton\nf 1 3 4\n"
+    groups = obj_mesh(tmp_path, text).groups
+    assert {name: group.triangles.tolist() for name, group in groups.items()} == {
+        "heavy denim": [0],
+        "cotton": [1],
+        "collar": [1],
+        "Shirt": [0, 1],
+    }
+
+
+def test_unused_vertices_are_dropped_with_a_note(tmp_path: Path) -> None:
+    mesh = obj_mesh(tmp_path, "v 9 9 9\n" + SQUARE + "v 8 8 8\ng low\nf 2 3 4\ng high\nf 2 4 5\n")
+    assert mesh.positions.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.groups["high"].vertices.tolist() == [0, 2, 3]
+    note = "2 vertices that are in no triangle dropped (0, 5, counted from 0; later ones are numbered anew)"
+    assert mesh.notes == [f"mesh.obj: {note}"]
+
+
 def test_quads_split_on_the_shorter_diagonal_inside(tmp_path: Path) -> None:
     kite = "v 0 0 0\nv 1 -0.2 0\nv 2 0 0\nv 1 0.2 0\nf 1 2 3 4\n"
     assert obj_mesh(tmp_path, kite).triangles.tolist() == [[0, 1, 3], [1, 2, 3]]
@@ -122,7 +141,6 @@ def test_windows_line_ends_byte_order_mark_and_latin_comments(tmp_path: Path) ->
         ("v 0 0\n", "line 1"),
         ("v 0 0 zero\n", "line 1"),
         (SQUARE, "no triangles"),
-        (SQUARE + "f 1 2 3\n", "in no triangle have no mass: 3 "),
         (SQUARE + "v nan 0 0\nf 1 2 3\nf 1 3 4 5\n", "not finite: vertices 4"),
         (SQUARE + "vt 0 0\nvt inf 0\nvt 1 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/1\n", "vt that are not finite"),
         ("\0\1\2", "no text file"),

@@ -1,4 +1,6 @@
-"""Meshing of gmsh scripts (.geo) by gmsh in a child process; `geo_script` checks the scripts before."""
+"""Meshes by libraries in a child process: gmsh meshes scripts (.geo), which `geo_script` checks before;
+meshio, VTK and gmsh read formats of other programs.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ import numpy as np
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.geo_script import check_script
+from lyra_petsc.mesh.library_formats import LIBRARIES
 from lyra_petsc.mesh.mesh import Sheet
-from lyra_petsc.mesh.msh_file import ElementBlock, MshError, assemble_sheet, element_type
+from lyra_petsc.mesh.msh_file import ElementBlock, MshError, NoTrianglesError, assemble_sheet, element_type
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
@@ -84,14 +87,16 @@ def mesh_geo(
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
         if trusted:
             read_bytes(path)  # raises if it cannot be read
-            _run_gmsh(path, path.absolute(), None, settings, Path(folder), meshed, report)
+            _run_library(path, path.absolute(), None, settings, Path(folder), meshed, report)
         else:
             checked = check_script(path)
             files = checked.files
             copies = Path(folder) / "script"
             copies.mkdir()
-            _run_gmsh(path, checked.write(copies), copies, settings, Path(folder), meshed, report)
-        sheet = _read_mesh(path, meshed)
+            _run_library(path, checked.write(copies), copies, settings, Path(folder), meshed, report)
+        # vertices in no triangle are construction points of the script, whose tags no file of the user's has
+        sheet = _read_mesh(path, meshed, note_loose=False)
+        sheet.tags = None
     if len(files) > 1:
         sheet.notes.append(f"the script includes {', '.join(file.name for file in files[1:])}")
     if size is not None:
@@ -105,7 +110,31 @@ def mesh_geo(
     return sheet
 
 
-def _run_gmsh(
+def read_library_file(path: Path) -> Sheet:
+    """Read a file by the library that knows its format (`library_formats.LIBRARIES`).
+
+    Vertices and triangles are in the order in which the library returns them. What `msh_file.read_msh` drops
+    or splits with a note this does, too. Groups are those of the file, if the library reads them.
+
+    Raises
+    ------
+    InputError
+        If the library is missing, cannot read the file or drops elements, or the file holds no triangles.
+    """
+    data = read_bytes(path)
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
+        # a copy, as libraries also read files beside it; its ending in the spelling that they know
+        inside = Path(folder) / "file"
+        inside.mkdir()
+        copy = inside / f"mesh{path.suffix.lower()}"
+        copy.write_bytes(data)
+        _run_library(path, copy, inside, {"size": None, "algorithm": None}, Path(folder), meshed, None)
+        sheet = _read_mesh(path, meshed, note_loose=True)
+    sheet.tags = None
+    return sheet
+
+
+def _run_library(
     path: Path,
     script: Path,
     readable: Path | None,
@@ -114,10 +143,10 @@ def _run_gmsh(
     meshed: BinaryIO,
     report: Callable[[str], None] | None,
 ) -> None:
-    """Mesh the script in a child process, which writes the mesh to ``meshed``.
+    """Mesh the script or read the file in a child process, which writes the mesh to ``meshed``.
 
-    ``path`` names the script in messages, ``script`` is the file that gmsh reads, and ``readable`` the folder
-    that gmsh may read, None for all.
+    ``path`` names the file in messages, ``script`` is the one that the library reads, and ``readable`` the
+    folder that it may read, None for all.
 
     Raises
     ------
@@ -142,7 +171,7 @@ def _run_gmsh(
     with tempfile.TemporaryFile() as outcome_file:
         descriptors = outcome_file.fileno(), meshed.fileno()
         process = subprocess.Popen(
-            [sys.executable, "-m", "lyra_petsc.mesh.gmsh_process", str(job_file), *map(str, descriptors)],
+            [sys.executable, "-m", "lyra_petsc.mesh.library_process", str(job_file), *map(str, descriptors)],
             cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -161,7 +190,7 @@ def _run_gmsh(
     if "refused" in outcome:
         raise InputError(one_line(outcome["refused"]), file=path)
     if outcome.get("stage") != "done" or process.returncode != 0:
-        message = _failure(outcome.get("stage", ""), process.returncode, errors, memory)
+        message = _failure(path, outcome.get("stage", ""), process.returncode, errors, memory)
         raise InputError(message, file=path)
 
 
@@ -194,41 +223,48 @@ def _read_outcome(file: BinaryIO) -> dict[str, Any]:
     return outcome
 
 
-def _read_mesh(path: Path, file: BinaryIO) -> Sheet:
-    """The mesh that gmsh's process wrote (`gmsh_process._write_mesh`)."""
+def _read_mesh(path: Path, file: BinaryIO, *, note_loose: bool) -> Sheet:
+    """The mesh that the process wrote (`library_process._write_mesh`); ``note_loose`` as `assemble_sheet`."""
     file.seek(0)
-    head = json.loads(np.load(file, allow_pickle=False).tobytes())
-    tags, points = np.load(file, allow_pickle=False), np.load(file, allow_pickle=False)
+
+    def load() -> Any:
+        return np.load(file, allow_pickle=False)
+
+    head = json.loads(load().tobytes())
+    tags, points = load(), load()
     blocks = []
     try:
-        for kind, entity, groups in head["blocks"]:
-            corners = np.load(file, allow_pickle=False)
+        for kind, entity in head["blocks"]:
             element_type(kind)
-            count, members = len(corners), np.array(groups, dtype=np.int64)
-            rows = np.column_stack([np.tile(np.arange(count), len(members)), np.repeat(members, count)])
-            blocks.append(ElementBlock(kind, corners, np.full(count, entity), rows))
+            corners, groups = load(), load()
+            blocks.append(ElementBlock(kind, corners, np.full(len(corners), entity), groups))
         names = {(dimension, tag): printable(name) for dimension, tag, name in head["names"]}
-        # nodes in no triangle are construction points of the script
-        sheet = assemble_sheet(tags, points, blocks, names, note_loose=False)
-    except MshError as error:
+        sheet = assemble_sheet(tags, points, blocks, names, note_loose=note_loose)
+    except NoTrianglesError as error:
         raise InputError(f"the mesh has {error}", file=path) from None
-    sheet.tags = None  # no file of the user's has these tags
+    except MshError as error:
+        raise InputError(f"damaged: it {error}", file=path) from None
+    sheet.notes = head["notes"] + sheet.notes
     return sheet
 
 
-def _failure(stage: str, code: int, errors: bytes, memory: int) -> str:
-    """Message on why gmsh did not finish."""
-    doing = "meshing" if stage == "mesh" else "reading the script"
+def _failure(path: Path, stage: str, code: int, errors: bytes, memory: int) -> str:
+    """Message on why the library did not finish."""
+    library = LIBRARIES.get(path.suffix.lower())
+    doing = "meshing" if stage == "mesh" else "reading the file" if library else "reading the script"
+    large, slow = "is a mesh size too small, or a loop too long?", "does it loop for ever?"
+    if library:
+        large = slow = "is the file damaged?"
+    elif stage == "mesh":
+        slow = "are its mesh sizes too small?"
+    library = library or "gmsh"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
-        return (
-            f"gmsh needs more than the {memory / 2**30:.3g} GiB there are, {doing}: "
-            "is a mesh size too small, or a loop too long?"
-        )
+        return f"{library} needs more than the {memory / 2**30:.3g} GiB there are, {doing}: {large}"
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
         seconds = MESH_SECONDS if stage == "mesh" else SCRIPT_SECONDS
-        what = "are its mesh sizes too small?" if stage == "mesh" else "does it loop for ever?"
-        return f"gmsh did not finish {doing} in {seconds} s of CPU time; {what}"
+        return f"{library} did not finish {doing} in {seconds} s of CPU time; {slow}"
     if code < 0:
-        return f"gmsh broke down ({signal.Signals(-code).name}) {doing}"
+        hint = "; is it damaged?" if doing == "reading the file" else ""
+        return f"{library} broke down ({signal.Signals(-code).name}) {doing}{hint}"
     last = one_line(errors.decode("utf-8", errors="replace")[-200:])
-    return f"gmsh ended early ({code}) {doing}{': ' + last if last else ''}"
+    return f"{library} ended early ({code}) {doing}{': ' + last if last else ''}"

@@ -1,9 +1,10 @@
-"""Child process in which gmsh meshes one script: ``python -m … JOB OUTCOME MESH``.
+"""Child process in which a library reads one mesh file, or gmsh meshes one script: ``python -m … JOB OUTCOME
+MESH``.
 
-A script may loop for ever, ask for more triangles than fit into memory, or end the process it runs in. In
-a child process this does not end the simulation; `geo_file` starts it and reads its results. Before it reads
-the script it enters a sandbox (`gmsh_sandbox`), in which it can open no file for writing: the results go to
-files that `geo_file` has opened.
+A script may loop for ever, ask for more triangles than fit into memory, or end the process it runs in; a
+damaged file may do so to the library that reads it. In a child process this does not end the simulation;
+`library_file` starts it and reads its results. Before it reads the file it enters a sandbox (`gmsh_sandbox`),
+in which it can open no file for writing: the results go to files that `library_file` has opened.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import ctypes
 import json
 import math
 import os
+import re
 import resource
 import signal
 import sys
@@ -25,8 +27,18 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
+from lyra_petsc.mesh.library_formats import (
+    LIBRARIES,
+    FileMesh,
+    ReadElements,
+    Refused,
+    count_announced,
+    read_format,
+    refuse_losses,
+)
 
 _EQUILATERAL = math.sqrt(3) / 4
+_UNOPENED = re.compile("Unable to open file '(.*)'")
 _MIN_FILL = 0.25
 """Fraction of its bounding box that a surface fills at least, for estimates of the number of triangles."""
 
@@ -37,18 +49,15 @@ _SYSTEM = (
 """Files and folders that libraries read."""
 
 
-class Refused(Exception):
-    """The script cannot be used; the message is for the user."""
-
-
 def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
-    """Mesh one script.
+    """Mesh one script, or read one file.
 
     Parameters
     ----------
     job : dict
-        ``script``, ``folder`` (may be read; null: all may), ``size`` (or null), ``algorithm`` (or null),
-        ``script_seconds``, ``mesh_seconds`` (limits on CPU time), ``memory`` [B] and ``max_triangles``.
+        ``script`` (or mesh file), ``folder`` (may be read; null: all may), ``size`` (or null), ``algorithm``
+        (or null), ``script_seconds``, ``mesh_seconds`` (limits on CPU time), ``memory`` [B] and
+        ``max_triangles``.
     outcome : int
         Descriptor of a file to which a line of JSON is written for each stage.
     mesh : int
@@ -58,35 +67,59 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
     def report(**entries: Any) -> None:
         os.write(outcome, json.dumps(entries).encode() + b"\n")
 
+    def enter(library: ModuleType) -> None:
+        """Enter the sandbox once the library is loaded."""
+        readable = [
+            *_SYSTEM,
+            sys.prefix,
+            sys.base_prefix,
+            # may be in other environments; libraries import parts of numpy when they return meshes
+            os.path.dirname(library.__file__ or ""),
+            os.path.dirname(os.path.dirname(np.__file__)),
+            job["folder"],
+        ]
+        report(sandbox=enter_sandbox(None if job["folder"] is None else readable))
+
     _set_limits(job["memory"])
     report(stage="script")
     _allow_seconds(job["script_seconds"])
     try:
-        with _session() as gmsh, open(mesh, "wb", closefd=False) as file:
-            readable = [
-                *_SYSTEM,
-                sys.prefix,
-                sys.base_prefix,
-                # may be in other environments; gmsh imports parts of numpy when it returns meshes
-                os.path.dirname(gmsh.__file__ or ""),
-                os.path.dirname(os.path.dirname(np.__file__)),
-                job["folder"],
-            ]
-            report(sandbox=enter_sandbox(None if job["folder"] is None else readable))
-            _set_size(gmsh, job["size"])
-            with _raise_refused(gmsh, job["script"]):
-                gmsh.merge(job["script"])
-            report(stage="mesh")
-            _allow_seconds(job["mesh_seconds"])
-            _generate_mesh(gmsh, job, lambda count: report(triangles=round(count)))
-            _write_mesh(gmsh, file)
+        suffix = Path(job["script"]).suffix
+        if LIBRARIES.get(suffix, "gmsh") == "gmsh":
+            with _session(suffix) as gmsh:
+                enter(gmsh)
+                found = _read_by_gmsh(gmsh, job, report)
+        else:
+            found = read_format(Path(job["script"]), enter)
+        with open(mesh, "wb", closefd=False) as file:
+            _write_mesh(found, file)
     except Refused as error:
         report(refused=str(error))
     except MemoryError:
         report(stage="memory")
     else:
         report(stage="done")
-    os._exit(0)  # nothing of gmsh outlives the process, so that it need not be finalised
+    os._exit(0)  # nothing of the library outlives the process, so that it need not be finalised
+
+
+def _read_by_gmsh(gmsh: ModuleType, job: dict[str, Any], report: Callable[..., None]) -> FileMesh:
+    """Mesh a script, or read a file of another format."""
+    script = Path(job["script"])
+    announced = count_announced(script.suffix, script.read_bytes()) if script.suffix in LIBRARIES else None
+    _set_size(gmsh, job["size"])
+    with _raise_refused(gmsh, job["script"]):
+        gmsh.merge(job["script"])
+    if announced is not None:
+        found, n_elements = _gmsh_mesh(gmsh), sum(len(tags) for tags in gmsh.model.mesh.getElements()[1])
+        refuse_losses("gmsh", announced, len(found.points), n_elements)
+        # elements without a group have the number 0
+        grouped = [block._replace(groups=block.groups[block.groups[:, 1] != 0]) for block in found.elements]
+        order = np.argsort(found.tags)  # gmsh sorts them by entity
+        return found._replace(tags=found.tags[order], points=found.points[order], elements=grouped)
+    report(stage="mesh")
+    _allow_seconds(job["mesh_seconds"])
+    _generate_mesh(gmsh, job, lambda count: report(triangles=round(count)))
+    return _gmsh_mesh(gmsh)
 
 
 def _set_limits(memory: int) -> None:
@@ -110,20 +143,20 @@ def _limit(kind: int, value: int) -> None:
 
 
 @contextmanager
-def _session() -> Iterator[ModuleType]:
+def _session(suffix: str) -> Iterator[ModuleType]:
     """gmsh, initialised without the user's configuration, that prints nothing."""
     try:
         import gmsh
     except (ImportError, OSError) as error:
         raise Refused(
-            f".geo files need gmsh ({error}); install it (apt install python3-gmsh or pip install gmsh) "
+            f"{suffix} files need gmsh ({error}); install it (apt install python3-gmsh or pip install gmsh) "
             "or give a .msh file"
         ) from None
     try:
         gmsh.initialize(readConfigFiles=False)
         gmsh.model.add("lyra_petsc")
     except Exception as error:  # gmsh's Python module and library may be of different versions
-        raise Refused(f"gmsh does not start ({error}); .geo files need a working gmsh") from None
+        raise Refused(f"gmsh does not start ({error}); {suffix} files need a working gmsh") from None
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.option.setNumber("General.Verbosity", 1)  # errors only
     gmsh.option.setNumber("General.AbortOnError", 0)
@@ -153,17 +186,11 @@ def _generate_mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[floa
             gmsh.model.mesh.generate(2)
 
 
-def _write_mesh(gmsh: ModuleType, file: BinaryIO) -> None:
-    """Write nodes, elements and physical groups as numpy arrays, in the order in which gmsh saves them.
-
-    The first array is a JSON text: ``names`` has rows (dimension, tag, name) of physical groups, ``blocks``
-    rows (element type, entity, tags of its groups). Then follow the tags (n,) and points (n, 3) of the nodes,
-    and for each block the corners (m, corners) of its elements.
-    """
+def _gmsh_mesh(gmsh: ModuleType) -> FileMesh:
+    """The mesh in gmsh, in the order in which gmsh saves it."""
     model = gmsh.model
-    entities = sorted(model.getEntities())
-    tags, points, blocks, corners = [], [], [], []
-    for entity in entities:
+    tags, points, elements = [np.empty(0, np.int64)], [np.empty((0, 3))], []
+    for entity in sorted(model.getEntities()):
         found, coordinates, _ = model.mesh.getNodes(*entity)
         tags.append(np.asarray(found, dtype=np.int64))
         points.append(np.asarray(coordinates, dtype=np.float64).reshape(-1, 3))
@@ -171,14 +198,30 @@ def _write_mesh(gmsh: ModuleType, file: BinaryIO) -> None:
         kinds, _, nodes = model.mesh.getElements(*entity)
         for kind, of_kind in zip(kinds, nodes, strict=True):
             _, _, _, each, _, primary = model.mesh.getElementProperties(int(kind))
-            blocks.append((int(kind), int(entity[1]), groups))
-            corners.append(np.asarray(of_kind, dtype=np.int64).reshape(-1, each)[:, :primary])
-    names = [(*map(int, group), _group_name(gmsh, *group)) for group in model.getPhysicalGroups()]
-    head = json.dumps({"names": [name for name in names if name[2]], "blocks": blocks}).encode()
-    all_tags = np.concatenate([np.empty(0, np.int64), *tags])
-    all_points = np.concatenate([np.empty((0, 3)), *points])
-    for array in (np.frombuffer(head, np.uint8), all_tags, all_points, *corners):
+            corners = np.asarray(of_kind, dtype=np.int64).reshape(-1, each)[:, :primary]
+            rows = np.column_stack(
+                [np.tile(np.arange(len(corners)), len(groups)), np.repeat(groups, len(corners))]
+            )
+            elements.append(ReadElements(int(kind), int(entity[1]), corners, rows.astype(np.int64)))
+    names = [(int(dim), int(tag), _group_name(gmsh, dim, tag)) for dim, tag in model.getPhysicalGroups()]
+    named = [name for name in names if name[2]]
+    return FileMesh(np.concatenate(tags), np.concatenate(points), elements, named, [])
+
+
+def _write_mesh(mesh: FileMesh, file: BinaryIO) -> None:
+    """Write a mesh as numpy arrays.
+
+    The first array is a JSON text with ``names`` and ``notes`` of the mesh, and for each of its blocks of
+    elements the type and the entity in ``blocks``. Then follow the tags and points of the nodes, and for each
+    block the corners and the groups of its elements.
+    """
+    blocks = [(block.kind, block.entity) for block in mesh.elements]
+    head = json.dumps({"names": mesh.names, "notes": mesh.notes, "blocks": blocks}).encode()
+    for array in (np.frombuffer(head, np.uint8), mesh.tags, mesh.points):
         np.save(file, array)
+    for block in mesh.elements:
+        np.save(file, block.corners)
+        np.save(file, block.groups)
     file.flush()
 
 
@@ -243,29 +286,29 @@ def _extent(box: tuple[float, ...]) -> tuple[float, float, float]:
 
 @contextmanager
 def _raise_refused(gmsh: ModuleType, script: str) -> Iterator[None]:
-    """Raise `Refused` for errors that gmsh raises or only logs."""
+    """Raise `Refused` for errors that gmsh raises or only logs, except where it may not save a file."""
+    raised = []
     try:
         yield
     except (Refused, MemoryError):
         raise
     except Exception as error:  # gmsh raises nothing more precise
-        raise Refused(f"gmsh: {_logged_error(gmsh, script) or ' '.join(str(error).split())}") from None
-    if message := _logged_error(gmsh, script):
-        raise Refused(f"gmsh: {message}")
-
-
-def _logged_error(gmsh: ModuleType, script: str) -> str:
-    """The first error in gmsh's log, on one line and without the path of the script; empty if none."""
+        raised.append(str(error))
     try:
-        lines = gmsh.logger.get()
+        logged = [line.split(":", 1)[1] for line in gmsh.logger.get() if line.startswith("Error")]
     except UnicodeDecodeError:  # an error message that quotes the script
-        return "the script has an error, in text that is not UTF-8"
-    for line in lines:
-        if line.startswith("Error"):
-            message = " ".join(line.split(":", 1)[1].split())
-            folder = os.path.dirname(script)  # holds copies, whose paths mean nothing to the user
-            return message.replace(f"'{script}', ", "").replace(f"{folder}/", "").removesuffix(" ()")
-    return ""
+        logged = ["the script has an error, in text that is not UTF-8"]
+    folder = os.path.dirname(script)  # holds copies, whose paths mean nothing to the user
+    for text in logged + raised:
+        message = " ".join(text.split()).replace(f"'{script}', ", "").replace(f"{folder}/", "")
+        unopened = _UNOPENED.fullmatch(message)
+        if unopened is None or not _saves(script, unopened[1]):
+            raise Refused(f"gmsh: {message.removesuffix(' ()')}")
+
+
+def _saves(script: str, name: str) -> bool:
+    """Whether the script saves the mesh to a file of this name; the mesh goes to `library_file` anyway."""
+    return re.search(rb'\bSave\s+"' + re.escape(name.encode()) + b'"', Path(script).read_bytes()) is not None
 
 
 if __name__ == "__main__":
