@@ -51,6 +51,7 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
         If the file exists or cannot be written, or the mesh cannot be used.
     """
     from lyra_petsc.cli.starter import starter
+    from lyra_petsc.output.file_operations import open_output
 
     given = Path(name)
     if not given.name or not name.isprintable():
@@ -61,8 +62,8 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
     text = starter(path, start_commands(), mesh, trust_mesh=trust_mesh)
     try:
         # exclusive creation: of two processes at the same time only one succeeds
-        with open(path, "x", encoding="utf-8") as file:
-            file.write(text)
+        with open_output(path, "xb") as file:
+            file.write(text.encode())
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=path) from None
     return path

@@ -1,11 +1,12 @@
-"""Atomic writes of small files, and file errors that all ranks raise together."""
+"""Opening files for writing, atomic writes of small files, and file errors that all ranks raise together."""
 
 from __future__ import annotations
 
 import errno
 import os
+import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TypeVar, cast
 
@@ -19,6 +20,8 @@ Result = TypeVar("Result")
 
 # the exceptions by which h5py reports a failure of HDF5, depending on the call and the version
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
+
+NOT_PLAIN = "it is a link, has a second name (a hard link) or is no plain file; remove it"
 
 
 def reason(error: BaseException) -> str:
@@ -43,6 +46,65 @@ def writing(path: Path, errors: tuple[type[Exception], ...] = (OSError,)) -> Ite
         raise cannot_write(path, error) from error
 
 
+def open_output(path: str | os.PathLike[str], mode: str = "wb", *, buffering: int = -1) -> BinaryIO:
+    """Open a file for writing; every result is opened here.
+
+    A folder from somebody else may hold a link in the place of a result, by which writing would change one of
+    the user's own files. Links are therefore not followed.
+
+    Parameters
+    ----------
+    path : path
+    mode : str
+        As of ``open``, but ``wb`` makes a new file, which takes the place of an existing one.
+    buffering : int
+        As of ``open``.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened, is not a regular one, or has a second name (a hard link).
+    """
+    if mode.startswith("w"):
+        with suppress(FileNotFoundError):
+            kind = os.lstat(path).st_mode
+            if stat.S_ISREG(kind) or stat.S_ISLNK(kind):
+                os.unlink(path)
+        mode = mode.replace("w", "x")
+    return cast(BinaryIO, open(path, mode, buffering, opener=open_regular_file))
+
+
+def open_regular_file(path: str | os.PathLike[str], flags: int) -> int:
+    """Descriptor of a regular file without a second name; see `open_output`."""
+    try:
+        # a pipe without a reader fails instead of blocking
+        descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.ENXIO):
+            raise
+        raise OSError(NOT_PLAIN) from None
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise OSError(NOT_PLAIN)
+    return descriptor
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder within a folder of results, unless it exists.
+
+    Raises
+    ------
+    OSError
+        If it cannot be created, or a link or a file is in its place.
+    """
+    try:
+        path.mkdir()
+    except FileExistsError:
+        if path.is_symlink() or not path.is_dir():
+            raise
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """A new file, open in the context, that replaces ``path`` atomically at its end. Call on one rank.
@@ -55,7 +117,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     part = path.with_name(path.name + ".part")
     with writing(path):
         try:
-            with open(part, "wb") as file:
+            with open_output(part) as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())

@@ -16,9 +16,8 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
-from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -29,6 +28,7 @@ from lyra_petsc.output.file_operations import (
     HDF5_ERRORS,
     cannot_write,
     on_every_rank,
+    open_output,
     raise_on_all_ranks,
     writing,
 )
@@ -265,34 +265,36 @@ def preallocate(
     shapes = [(count, *slab.shape[1:]) for count, slab in zip(rows, slabs.values(), strict=True)]
     data = sum(math.prod(shape) * slab.itemsize for shape, slab in zip(shapes, slabs.values(), strict=True))
     texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
-    with open(part, "wb") as raw:
+    with open_output(part, "w+b", buffering=0) as raw:
         os.posix_fallocate(raw.fileno(), 0, data + texts + MAX_OVERHEAD + DATASET_OVERHEAD * len(slabs))
-    file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=access)
-    try:
-        owners = {"/": file}
-        for (name, slab), shape in zip(slabs.items(), shapes, strict=True):
-            space, stored = h5py.h5s.create_simple(shape), h5py.h5t.py_create(slab.dtype, logical=True)
-            owners[name] = h5py.h5d.create(file, name.encode(), stored, space, early, links)
-        # a dataset without rows has no offset
-        offsets = [owners[name].get_offset() or 0 for name in slabs]
-        for path, values in attributes.items():
-            if path not in owners:
-                owners[path] = (h5py.h5g.open if path in file else h5py.h5g.create)(file, path.encode())
-            for key, value in values.items():
-                # fixed-length text: HDF5 stores text of variable length in a heap without check sums
-                raw_value = value.encode() if isinstance(value, str) else value
-                kind = (
-                    h5py.string_dtype("utf-8", max(1, len(raw_value)))
-                    if isinstance(raw_value, bytes)
-                    else np.dtype(type(raw_value))
-                )
-                stored = h5py.h5t.py_create(kind, logical=True)
-                attribute = h5py.h5a.create(owners[path], key.encode(), stored, scalar)
-                attribute.write(np.array(raw_value, dtype=kind), stored)
-    finally:
-        file.close()
-    with open(part, "r+b") as raw:
-        os.posix_fallocate(raw.fileno(), 0, part.stat().st_size)
+        raw.truncate(0)  # there is space for it; HDF5 takes a longer file for one of its own
+        access = access.copy()
+        access.set_fileobj_driver(h5py.h5fd.fileobj_driver, raw)
+        file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=access)
+        try:
+            owners = {"/": file}
+            for (name, slab), shape in zip(slabs.items(), shapes, strict=True):
+                space, stored = h5py.h5s.create_simple(shape), h5py.h5t.py_create(slab.dtype, logical=True)
+                owners[name] = h5py.h5d.create(file, name.encode(), stored, space, early, links)
+            # a dataset without rows has no offset
+            offsets = [owners[name].get_offset() or 0 for name in slabs]
+            for path, values in attributes.items():
+                if path not in owners:
+                    owners[path] = (h5py.h5g.open if path in file else h5py.h5g.create)(file, path.encode())
+                for key, value in values.items():
+                    # fixed-length text: HDF5 stores text of variable length in a heap without check sums
+                    raw_value = value.encode() if isinstance(value, str) else value
+                    kind = (
+                        h5py.string_dtype("utf-8", max(1, len(raw_value)))
+                        if isinstance(raw_value, bytes)
+                        else np.dtype(type(raw_value))
+                    )
+                    stored = h5py.h5t.py_create(kind, logical=True)
+                    attribute = h5py.h5a.create(owners[path], key.encode(), stored, scalar)
+                    attribute.write(np.array(raw_value, dtype=kind), stored)
+        finally:
+            file.close()
+        os.posix_fallocate(raw.fileno(), 0, os.fstat(raw.fileno()).st_size)
     return offsets
 
 
@@ -346,14 +348,14 @@ def _write_serial(path: Path, part: Path, pieces: Sequence[Piece], *, sync: bool
     """Write this rank's pieces, if there are any, with plain file writes."""
     if not pieces:
         return
-    with writing(path), open(part, "r+b", buffering=0) as file:
+    with writing(path), open_output(part, "r+b", buffering=0) as file:
         for offset, rows in pieces:
             _write_rows(file, offset, rows)
         if sync:
             os.fsync(file.fileno())
 
 
-def _write_rows(file: FileIO, offset: int, rows: NDArray[Any]) -> None:
+def _write_rows(file: BinaryIO, offset: int, rows: NDArray[Any]) -> None:
     file.seek(offset)
     remaining = rows.reshape(-1).view(np.uint8).data
     while remaining:  # one call writes at most 2 GiB
@@ -364,8 +366,9 @@ def _write_with_mpi_io(path: Path, part: Path, pieces: Sequence[Piece], comm: MP
     """Write all ranks' pieces by MPI-IO; ``False`` if no rank can open the file with MPI-IO."""
     problem: LyraError | None = None
     try:
+        open_output(part, "r+b").close()  # MPI-IO would follow a link
         file = MPI.File.Open(MPI.Intracomm(comm), os.fspath(part), MPI.MODE_RDWR)
-    except MPI.Exception as error:
+    except (OSError, MPI.Exception) as error:
         problem = cannot_write(path, error)
     if comm.allreduce(problem is not None, MPI.LAND):
         return False

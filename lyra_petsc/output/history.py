@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.file_operations import atomic_write, writing
+from lyra_petsc.output.file_operations import atomic_write, open_output, writing
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class History:
             continued = resume_after is not None and self.path.exists()
             if resume_after is not None and continued:
                 self._truncate(resume_after)
-            self._file = self.path.open("ab" if continued else "wb")
+            self._file = open_output(self.path, "ab" if continued else "wb")
             if not continued:
                 self._write([self.columns])
 

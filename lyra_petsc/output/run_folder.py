@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.file_operations import HDF5_ERRORS, reason
+from lyra_petsc.output.file_operations import HDF5_ERRORS, open_regular_file, reason
 from lyra_petsc.output.stored import check_folder, open_contained
 from lyra_petsc.parallel import on_root
 
@@ -193,11 +193,11 @@ def _choose_folder(
     key = "--out"
     if out is None:
         first = kind.parent / stem
-        if resume:
-            return FolderChoice(kind.newest(stem), resume=True, given=True, kind=kind)
-        path = first if force else free_name(first)
-        choice = FolderChoice(path, given=force, force=force, first=first, kind=kind)
+        path = kind.newest(stem) if resume else first if force else free_name(first)
+        choice = FolderChoice(path, resume, given=force or resume, force=force, first=first, kind=kind)
         key = "output folder"
+        if path.is_symlink():
+            raise InputError("is a link; name the folder to write to by --out", file=path, key=key)
     else:
         if not isinstance(out, str | os.PathLike):
             raise InputError(f"must be the path of a folder, not {out!r}", key=key)
@@ -416,7 +416,7 @@ class FolderLock:
     def __init__(self, folder: Path, name: str = LOCK_FILE) -> None:
         self.path = folder / name
         while True:
-            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self.descriptor = open_regular_file(self.path, os.O_RDWR | os.O_CREAT)
             try:
                 self.held = self._lock()
                 if self._is_current():
@@ -464,7 +464,7 @@ class FolderLock:
 def is_locked(folder: Path) -> bool:
     """Whether a process holds the lock of a folder; also True if the file system does not support locks."""
     try:
-        descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = open_regular_file(folder / LOCK_FILE, os.O_RDONLY)
     except OSError:
         return False
     try:

@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.file_operations import HDF5_ERRORS, cannot_write, reason, replace_text, writing
+from lyra_petsc.output.file_operations import (
+    HDF5_ERRORS,
+    cannot_write,
+    open_output,
+    reason,
+    replace_text,
+    writing,
+)
 from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, preallocate, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_attribute
@@ -205,7 +212,7 @@ class StateWriter:
             part = path.with_name(path.name + ".part")
             try:
                 offsets = preallocate(part, table | planned, [slots] * len(table) + rows * slots, attributes)
-                with open(part, "r+b", buffering=0) as file:
+                with open_output(part, "r+b", buffering=0) as file:
                     os.pwrite(file.fileno(), np.full(slots, -1, np.int64).tobytes(), offsets[0])
                     os.fsync(file.fileno())
                 os.replace(part, path)
@@ -298,7 +305,7 @@ class _PreallocatedFile:
     def record_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
         """Write a state's row of the table (rank 0)."""
         entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
-        with writing(self.path), open(self.path, "r+b", buffering=0) as file:
+        with writing(self.path), open_output(self.path, "r+b", buffering=0) as file:
             for offset, entry in zip(self.table.tolist(), entries, strict=True):
                 os.pwrite(file.fileno(), entry.tobytes(), offset + index * entry.nbytes)
 
@@ -310,7 +317,7 @@ def _discard_states_after(path: Path, last_step: int) -> None:
             return
         steps, offset = file[TABLE]["step"][()], file[TABLE]["step"].id.get_offset()
     steps[steps > last_step] = -1
-    with open(path, "r+b", buffering=0) as raw:
+    with open_output(path, "r+b", buffering=0) as raw:
         os.pwrite(raw.fileno(), steps.tobytes(), offset)
 
 

@@ -19,7 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from lyra_petsc.output.file_operations import atomic_write, cannot_write
+from lyra_petsc.output.file_operations import atomic_write, cannot_write, open_output
 
 XDMF_FILE = "states.xdmf"
 MESH_FILE = "mesh.h5"
@@ -195,7 +195,7 @@ class GrowingXdmf:
             if begin + len(text) + len(SEAM) + len(RESERVE_END) > self._size:
                 self._write_document([text], copied=self._seam)
                 return
-            with open(self.path, "r+b", buffering=0) as file:
+            with open_output(self.path, "r+b", buffering=0) as file:
                 os.pwrite(file.fileno(), text + SEAM, begin)
                 os.fdatasync(file.fileno())  # must be on disk before the write that makes it valid
                 os.pwrite(file.fileno(), b" " * len(SEAM), self._seam)

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.extras import require_packages
+from lyra_petsc.output.file_operations import open_output
 from lyra_petsc.output.read_run import StoredRun
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ class Media:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write ``data`` to a file."""
-        Path(path).write_bytes(self.data)
+        with open_output(path) as file:
+            file.write(self.data)
         return Path(path)
 
     def _repr_png_(self) -> bytes | None:

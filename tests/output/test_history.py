@@ -1,6 +1,7 @@
 """history.csv: columns, rows, resumption, failures."""
 
 import math
+from functools import partial
 
 import pytest
 
@@ -81,6 +82,8 @@ def test_write_failures_are_output_errors_on_every_rank(comm, shared_tmp):
         History(shared_tmp / "missing" / "history.csv", ("step", "time"), comm)
 
 
-def test_a_full_disk_is_an_output_error_on_every_rank(comm):
+def test_a_full_disk_is_an_output_error_on_every_rank(comm, shared_tmp, monkeypatch):
+    full = partial(open, "/dev/full", "wb")
+    monkeypatch.setattr("lyra_petsc.output.history.open_output", lambda *_: full())
     with pytest.raises(OutputError, match="No space left"):
-        History("/dev/full", ("step", "time"), comm)
+        History(shared_tmp / "history.csv", ("step", "time"), comm)

@@ -22,7 +22,7 @@ from lyra_petsc.errors import InputError, OutputError, SolverError
 from lyra_petsc.experiments.bench import failure_message, open_simulation
 from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
-from lyra_petsc.output.file_operations import reason
+from lyra_petsc.output.file_operations import make_folder, open_output, reason, writing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, existing_files
 from lyra_petsc.parallel import on_root
@@ -180,16 +180,17 @@ STUDY = FolderKind(
 
 
 def prepare_folder(folder: Path) -> None:
-    """Create an empty folder for a case; files of an interrupted one are removed.
+    """Create an empty folder for a case and the one above; files of an interrupted case are removed.
 
     Raises
     ------
     OutputError
     """
     try:
+        make_folder(folder.parent)
         if folder.exists():
             shutil.rmtree(folder)
-        folder.mkdir(parents=True)
+        folder.mkdir()
     except OSError as error:
         raise OutputError(f"{folder}: cannot be prepared: {reason(error)}") from error
 
@@ -314,7 +315,8 @@ def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
     """
     folder = Path(job.folder)
     job_file, progress = folder.with_name(f"{folder.name}.job.json"), folder / PROGRESS_FILE
-    folder.parent.mkdir(exist_ok=True)
+    with writing(folder.parent):
+        make_folder(folder.parent)
     save_record(job_file, job)
     try:
         _, message = launcher(["--job", str(job_file)], lambda: watch(_read_progress(progress)), (lock,))
@@ -325,7 +327,8 @@ def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
     result = read_result(folder, job.fingerprint)
     if result is None:
         result = Result(job.fingerprint, problem=message)
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            make_folder(folder)
         save_record(folder / RESULT_FILE, result)
     return result
 
@@ -362,6 +365,7 @@ def run_job(comm: MPI.Comm, path: Path, check_stop: Callable[[], None]) -> None:
         check_stop()
         if comm.rank == 0 and time.monotonic() - last > 0.3:
             last = time.monotonic()
-            progress.write_text(f"{fraction:.6f}", encoding="ascii")
+            with writing(progress), open_output(progress) as file:
+                file.write(f"{fraction:.6f}".encode())
 
     run_case(comm, job, watch, warm_up=True)

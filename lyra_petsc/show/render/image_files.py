@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.file_operations import reason, replace_bytes
+from lyra_petsc.output.file_operations import open_output, reason, replace_bytes
 
 Image = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
@@ -125,10 +125,11 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
     command += ["-c:v", codec, "-pix_fmt", pixels, *options, f"file:{part}"]
     with tempfile.TemporaryFile() as messages:
         try:
+            open_output(part).close()  # ffmpeg would follow a link
             # a session of its own, so that Ctrl-C reaches this process alone
             ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages, start_new_session=True)
         except OSError as error:
-            raise OutputError(f"{path}: ffmpeg cannot be started: {reason(error)}") from error
+            raise OutputError(f"{path}: cannot be written by ffmpeg: {reason(error)}") from error
         assert ffmpeg.stdin is not None
         pipe = ffmpeg.stdin
 

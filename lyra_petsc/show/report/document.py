@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.extras import install_hint, missing_packages
-from lyra_petsc.output.file_operations import replace_bytes, replace_text
+from lyra_petsc.output.file_operations import make_folder, replace_bytes, replace_text, writing
 
 
 def short(value: float, digits: int = 3) -> str:
@@ -287,6 +287,7 @@ def write_report(
     if packages:
         replace_text(folder / "report.md", report.markdown())
         return f"no {pictures} and no report.html: {install_hint(packages)}"
-    (folder / PLOTS).mkdir(exist_ok=True)
+    with writing(folder / PLOTS):
+        make_folder(folder / PLOTS)
     report.write(folder)
     return ""
