@@ -7,6 +7,7 @@ import json
 import math
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,11 +77,15 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
         if (entries := _count_entries(node, {})) > MAX_ENTRIES:
             grown = f"holds more than {MAX_ENTRIES} entries once its anchors are expanded"
             raise InputError("refers to itself" if entries == math.inf else grown, file=file, key=key)
+        for mistake in _mistaken_keys(node, set()):
+            raise InputError(mistake, file=file, key=key)
         return None if node is None else yaml.constructor.construct_document(node)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise InputError(one_line(f"{place}{error.problem or error.context}"), file=file, key=key) from None
+        message = str(error.problem or error.context)
+        if mark:
+            message = _mistake_near(text.splitlines(), mark.line, mark.column, message)
+        raise InputError(one_line(message), file=file, key=key) from None
     except RecursionError:
         raise InputError("is nested too deeply", file=file, key=key) from None
     except (YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
@@ -100,6 +105,54 @@ def _count_entries(node: Node | None, known: dict[int, float]) -> float:
         entries = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
         known[id(node)] = 1.0 + sum(_count_entries(entry, known) for entry in entries)
     return known[id(node)]
+
+
+_WITHOUT_COLON = re.compile(r"\s*(?:- +)*(\w[\w-]*)(?:[ \t]+[^\s:#].*|:[^\s:].*|[ \t]*)")
+"""A key that runs into its value, as in ``end 1`` or ``end:1``, or that stands alone."""
+
+_NO_COLON = "line {}: {!r} needs a colon and a blank after it"
+
+
+def _mistake_near(lines: list[str], at: int, column: int, message: str) -> str:
+    """What is wrong near the place, counted from 0, at which YAML cannot be read with this message."""
+    place = f"line {at + 1}, column {column + 1}: "
+    if r"'\t'" in message:
+        return f"{place}a tab, which YAML does not take here; use blanks"
+    if "mapping values" in message or "expected ':'" in message or "<block end>" in message:
+        before = lines[at][:column] if at < len(lines) else ""
+        # the last line with content before the place, too, unless this one has a colon
+        for number in range(at, -1 if ": " not in before else at - 1, -1):
+            content = lines[number] if number < len(lines) else ""
+            if word := _WITHOUT_COLON.fullmatch(content):
+                return _NO_COLON.format(number + 1, word[1])
+            if number < at and content.strip():
+                break
+        if ": " in before and "mapping" in message:
+            return f"{place}a second colon in one value; put text with colons in quotes"
+        if "mapping" in message:
+            return f"{place}indented differently from the keys beside it"
+    return place + message
+
+
+def _mistaken_keys(node: Node | None, seen: set[int]) -> Iterator[str]:
+    """What is wrong with each key below a node that is given twice, or runs into its value in braces."""
+    if node is None or isinstance(node.value, str) or id(node) in seen:
+        return
+    seen.add(id(node))
+    lines: dict[tuple[str, str], int] = {}
+    for entry in node.value:
+        parts = entry if isinstance(entry, tuple) else (entry,)
+        name = parts[0].value
+        if len(parts) == 2 and isinstance(name, str):
+            line = parts[0].start_mark.line + 1
+            if first := lines.get((parts[0].tag, name)):
+                yield f"line {line}: {name!r} is given twice, first in line {first}; keep one of them"
+            lines[parts[0].tag, name] = line
+            absent = parts[1].start_mark.index == parts[0].end_mark.index  # no colon in between
+            if absent and (word := _WITHOUT_COLON.fullmatch(name)) and word[1] != name:
+                yield _NO_COLON.format(line, word[1])
+        for part in parts:
+            yield from _mistaken_keys(part, seen)
 
 
 def parse_json(text: str, *, file: object | None) -> Any:
