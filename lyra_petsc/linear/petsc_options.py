@@ -8,8 +8,10 @@ set yet. The database is never cleared.
 from __future__ import annotations
 
 import ctypes
+import difflib
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 
 from petsc4py import PETSc
 
@@ -20,6 +22,10 @@ Value = str | int | float | bool | None
 
 READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidump", "get_total_flops"})
 """Options that PETSc only reads in its finalisation."""
+
+OWN_NAMES = ("contact_monitor", "pc_mg_w_from", "pc_mg_vertex_sweeps")
+OWN_PREFIXES = ("loads_", "arcs_", "verify_", "no_")
+"""Names and prefixes of options that PETSc's libraries do not contain as such; ``no_`` is PETSc's."""
 
 PYTHON_SUFFIXES = ("python_type", "monitor_python")
 """Suffixes of options that make PETSc call Python."""
@@ -126,3 +132,66 @@ def unused(defaults: list[str]) -> list[str]:
     restore.argtypes = [ctypes.c_void_p] * 4
     restore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
     return sorted(set(found) - set(defaults) - READ_AT_THE_END)
+
+
+def unknown(defaults: list[str]) -> list[str]:
+    """A note on each unused option whose name neither PETSc nor this program has, with the nearest name.
+
+    Names and prefixes of options stand as texts in PETSc's libraries: names with a dash before them, numbers
+    as %d. A prefix with a number counts without it, too, as it then stands for all numbers.
+    """
+    if not (given := unused(defaults)):
+        return []
+    texts = b"".join(file.read_bytes() for file in _libraries()).decode("latin-1")
+    names = set(re.findall(r"\0-([a-z][\w%]*)(?=\0)", texts))
+    if not names:
+        return []  # texts in another form
+    names.update(OWN_NAMES)
+    # a text may be the end of a longer one, as esteig_ of pc_gamg_esteig_
+    whole = set(re.findall(r"\0(?:%s)?([a-z][\w%]*_)(?=\0)", texts))
+    prefixes = {text[at.end() :] for text in whole for at in re.finditer("^|_(?=.)", text)} | {*OWN_PREFIXES}
+    prefixes |= {prefix.removesuffix("%d_") for prefix in prefixes}
+
+    def without_prefixes(name: str) -> Iterator[str]:
+        yield name
+        for mark in re.finditer("_", name):
+            if any(re.sub(r"\d+", form, name[: mark.end()]) in prefixes for form in ("%d", "%s")):
+                yield from without_prefixes(name[mark.end() :])
+
+    notes = []
+    for name in given:
+        stems = list(without_prefixes(name.lower()))
+        if not any(stem in names or re.sub(r"\d+", "%d", stem) in names for stem in stems):
+            similar = [
+                name.lower().removesuffix(stem) + other
+                for stem in stems
+                for other in difflib.get_close_matches(stem, names, n=1)
+            ]
+            for mark in re.finditer("_", name):
+                head, stem = name[: mark.end()].lower(), name[mark.end() :].lower()
+                if stem in names:
+                    similar += [one + stem for one in difflib.get_close_matches(head, prefixes, n=1)]
+            near = difflib.get_close_matches(name.lower(), similar, n=1)
+            hint = f", did you mean -{near[0]}?" if near else ""
+            notes.append(f"-{name}: PETSc has no option of this name{hint}")
+    return notes
+
+
+def _libraries() -> list[Path]:
+    """petsc4py's extension, and PETSc's library if it is another file."""
+
+    class Symbol(ctypes.Structure):
+        _fields_ = (
+            ("file", ctypes.c_char_p),
+            ("base", ctypes.c_void_p),
+            ("name", ctypes.c_char_p),
+            ("address", ctypes.c_void_p),
+        )
+
+    extension, symbol = Path(PETSc.__file__), Symbol()
+    try:
+        function = ctypes.cast(ctypes.CDLL(PETSc.__file__).PetscOptionsLeftGet, ctypes.c_void_p)
+        ctypes.CDLL(None).dladdr(function, ctypes.byref(symbol))
+    except (AttributeError, OSError):
+        return []
+    return list({extension: 0, Path((symbol.file or b"").decode() or extension): 0})

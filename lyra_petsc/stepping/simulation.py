@@ -16,9 +16,10 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
-from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number
+from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number, unknown
 from lyra_petsc.linear.refused_options import check_options, check_size
 from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping import term_states
@@ -183,6 +184,7 @@ class SteppedScene:
                     key="material",
                 )
             self.stepper = Stepper(scene, system, self.problem.surface, whole.spacing, floor)
+        self.notes += on_root(self.comm, lambda: unknown(self.stepper.our_options))
         self.roundoff = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()

@@ -38,6 +38,30 @@ def test_an_unused_option_of_the_scene_is_named_too(tmp_path: Path) -> None:
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo"]
 
 
+def unknown_options(text: str) -> list[str]:
+    return re.findall(r"note: -(\w+): PETSc has no option of this name(?:, did you mean -(\w+)\?)?", text)
+
+
+def test_options_that_nothing_knows_are_noted_before_the_first_step(tmp_path: Path) -> None:
+    """Those of the scene and of the command line; known ones that are used later, or never, are not."""
+    scene = write_scene(tmp_path, SCENE + "petsc: {kps_rtol: 1e-3}\n")
+    given = ["-snes_monitr", "-sub_pc_typ", "ilu", "-mg_level_ksp_type", "cg", "-Q7", "-pc_mg_w_from", "1",
+             "-mg_levels_2_ksp_type", "cg", "-ksp_view", "-loads_ksp_rtol", "0.1", "-log_view"]  # fmt: skip
+    expected = [
+        ("Q7", ""),
+        ("kps_rtol", "ksp_rtol"),
+        ("mg_level_ksp_type", "mg_levels_ksp_type"),
+        ("snes_monitr", "snes_monitor"),
+        ("sub_pc_typ", "sub_pc_type"),
+    ]
+    assert unknown_options(done(["check", scene, *given], tmp_path, ranks=2).out) == expected
+    left = done(["run", scene, "--out", "out", *given], tmp_path)
+    assert unknown_options(left.err.partition("step 1")[0]) == expected
+    assert set(read_json(tmp_path / "out" / "summary.json")["notes"]) >= {
+        "-kps_rtol: PETSc has no option of this name, did you mean -ksp_rtol?"
+    }
+
+
 def test_petsc_prints_requested_output(tmp_path: Path) -> None:
     left = ran(tmp_path, "-options_left", "-options_view", "-log_view", "-ts_view", "-help")
     for words in (

@@ -10,8 +10,10 @@ from types import ModuleType
 
 import pytest
 from module_of import module_of
+from petsc4py import PETSc
 
 from lyra_petsc.cli.verbs import verbs
+from lyra_petsc.linear.petsc_options import unknown
 from lyra_petsc.linear.presets import PRESETS
 
 ROOT = Path(__file__).parents[2]
@@ -69,3 +71,16 @@ def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     )
     assert built.returncode == 0, built.stdout + built.stderr
     assert (tmp_path / "site" / "tutorial.html").is_file()
+
+
+def test_no_option_of_the_reference_counts_as_unknown(reference: ModuleType) -> None:
+    database = PETSc.Options()
+    names = [name for name in reference.OPTIONS if not database.hasName(name)]
+    try:
+        for name in [*names, "ts_maximum_time"]:
+            database.setValue(name, "1")
+        (note,) = unknown(["ts_time_step"])  # of later versions of PETSc; the program always reads it
+        assert note.startswith("-ts_maximum_time: PETSc has no option of this name, did you mean -ts_max_")
+    finally:
+        for name in [*names, "ts_maximum_time"]:
+            database.delValue(name)
