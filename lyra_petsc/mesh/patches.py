@@ -53,9 +53,10 @@ def split_into_patches(centres: Array, piece: Ints | None = None) -> Ints:
 
 def connected_pieces(triangles: Ints, patch: Ints | None = None) -> Ints:
     """Number of the piece (F,) of each triangle (F, 3): triangles of a patch connected by vertices."""
-    patch_of = np.zeros(len(triangles), dtype=np.int64) if patch is None else patch
-    patch_corners = np.column_stack([np.repeat(patch_of, 3), triangles.ravel()])
-    node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    node = triangles
+    if patch is not None:
+        patch_corners = np.column_stack([np.repeat(patch, 3), triangles.ravel()])
+        node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([node[:, :2], node[:, 1:]])
     return _connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
 
@@ -181,14 +182,13 @@ def _add_second_neighbours(pairs: Ints, boxes: tuple[Array, Array], radius: floa
 def _connected_components(n: int, pairs: Ints) -> Ints:
     """Lowest number (n,) of the component of each of n nodes that are connected by pairs (m, 2)."""
     component: Ints = np.arange(n)
-    while True:
-        before = component.copy()
-        lowest = np.minimum(*component[pairs.T])
-        np.minimum.at(component, pairs[:, 0], lowest)
-        np.minimum.at(component, pairs[:, 1], lowest)
-        component = component[component]
-        if np.array_equal(before, component):
-            return component
+    while len(pairs):
+        low, high = np.sort(component[pairs], axis=1).T
+        np.minimum.at(component, high, low)  # joins whole components, as these are their lowest numbers
+        while not np.array_equal(component, shorter := component[component]):
+            component = shorter
+        pairs = pairs[component[pairs[:, 0]] != component[pairs[:, 1]]]
+    return component
 
 
 def _cross_interior(a: Array, b: Array, low: Array, high: Array) -> Mask:
