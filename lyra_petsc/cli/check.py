@@ -64,10 +64,14 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     if time.static:
         plan_of_steps = f"load factor to {control.end:g}, first increment {control.step:g}; a state at each"
     else:
-        steps = _count(control.end / control.step)
-        every = scene.output.every
-        states = 1 + (steps if every is None else _count(control.end / every))
-        plan_of_steps = f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"
+        steps, every = control.planned_steps(), scene.output.every
+        states = 1 + (steps if every is None else math.ceil(control.end / every - 1e-9))
+        cut = "at most " if steps > math.ceil(control.end / control.step - 1e-9) else ""
+        first = (
+            f"the first {simulation.max_steps} (-ts_max_steps) of " if simulation.max_steps < steps else ""
+        )
+        plan_of_steps = f"{first}{steps} of {cut}{control.step:g} s to t = {control.end:g} s, {states} states"
+        plan_of_steps += "; steps end at states and events" if cut else ""
         if time.adaptive:
             written = "a state at each" if every is None else f"{states} states"
             plan_of_steps = (
@@ -138,11 +142,6 @@ def _obstacles(scene: Scene, contact: Contact) -> list[tuple[str, str]]:
 def _friction(friction: float | Friction) -> str:
     static, kinetic = coefficients(friction)
     return f"{static:g}" if static == kinetic else f"{static:g} (sliding {kinetic:g})"
-
-
-def _count(ratio: float) -> float:
-    """Number of whole steps in a run of length ``ratio`` · Δt; inf if that overflows."""
-    return math.ceil(ratio - 1e-9) if math.isfinite(ratio) else ratio
 
 
 def _rank_table(ranks: Ints) -> Table:

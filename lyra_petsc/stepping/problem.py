@@ -33,6 +33,7 @@ from lyra_petsc.stepping.failure.near_pairs import nearest_pair
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.start_notes import nothing_holds
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
 from lyra_petsc.terms.handles.prescribed_handles import (
     ExactHandles,
@@ -204,7 +205,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     _check_sliding(rest, held)
     elements: dict[str, Elements] = {}
     names: list[str] = []
-    for entry in needed_terms(scene, rest.shells):
+    for entry in (needed := needed_terms(scene, rest.shells)):
         found = entry.module().elements(rest)
         if found is not None and len(found.stencil) == 0:
             continue
@@ -254,6 +255,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
             *rest.notes,
             *conflicts(scene, mesh, held),
             *clamps_without_edges(scene, mesh, held),
+            *nothing_holds(rest, needed, elements),
         ],
     )
     on_edges = any(each.edges is not None for each in elements.values())

@@ -34,6 +34,7 @@ from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackward
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times, refuse_contact
+from lyra_petsc.stepping.start_notes import nothing_acts
 from lyra_petsc.stepping.statics.equilibrium import Equilibrium
 from lyra_petsc.stepping.statics.stability import Stability
 from lyra_petsc.stepping.step_control import (
@@ -212,6 +213,7 @@ class SteppedScene:
         for term in system.active.elastic:
             if term.registration.element_vertices:  # friction has no contacts from an earlier step
                 term.initialise(system.x)
+        self.notes += nothing_acts(scene, system, event_times(scene), self.control.end, floor)
         self._equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor

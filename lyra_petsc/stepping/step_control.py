@@ -6,6 +6,8 @@ import bisect
 import math
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 SLACK = 1e-6
 """Fraction of Δt by which a step may be longer to avoid an extra tiny one."""
 
@@ -69,6 +71,12 @@ class StepControl:
         target = min(self._next_event(time), self._next_state(time))
         # end exactly at the event even if it is a round-off error beyond the step
         return target if target - time <= dt * (1.0 + SLACK) else time + self._partial_step(dt, target - time)
+
+    def planned_steps(self) -> int:
+        """Number of steps to the end, all of the full Δt but for those cut to end at states and events."""
+        every = self._every or self.end
+        stops = np.unique([0.0, *self._events, *np.arange(1.0, self.end / every) * every])
+        return int(np.ceil(np.diff(stops) / self.step - SLACK).sum())
 
     def _partial_step(self, dt: float, remaining: float) -> float:
         """Length [s] of a step of at most dt that ends before the next target, ``remaining`` [s] ahead."""

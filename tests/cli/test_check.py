@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from launch import done, lyra, refused, write_scene
+from launch import Left, done, lyra, refused, write_scene
 
 MEMBRANE = """
 mesh: {grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}
@@ -125,6 +125,81 @@ def test_titles_are_plain_text_and_all_numbers_of_steps_are_printed(tmp_path: Pa
     refused(
         ["check", "plain.yaml", "--set", "petsc.ts_dt=1e-310"], tmp_path, "-ts_dt: 1e-310 s makes inf steps"
     )
+
+
+@pytest.mark.parametrize(
+    ("settings", "plan"),
+    [
+        (["time.step=1"], "10 of at most 1 s to t = 1 s, 11 states; steps end at states and events"),
+        (["time.step=1", "output.every=1"], "1 of 1 s to t = 1 s, 2 states"),
+        (["time.step=0.04"], "30 of at most 0.04 s to t = 1 s, 11 states; steps end at states and events"),
+        (["petsc.ts_max_steps=7"], "the first 7 (-ts_max_steps) of 100 of 0.01 s to t = 1 s, 11 states"),
+    ],
+    ids=["cut at states", "one", "cut unevenly", "a part"],
+)
+def test_the_steps_that_a_run_takes_are_counted(tmp_path: Path, settings: list[str], plan: str) -> None:
+    words = ["check", write_scene(tmp_path, MEMBRANE), *(w for text in settings for w in ("--set", text))]
+    lines = [" ".join(line.split()) for line in done(words, tmp_path).out.splitlines()]
+    assert f"steps {plan}" in lines
+
+
+def notes(left: Left) -> list[str]:
+    return [line.removeprefix("note: ") for line in left.out.splitlines() if line.startswith("note: ")]
+
+
+HELD = MEMBRANE + "handles: [{group: left}]\n"
+MOVED = HELD.replace("}]", ", motion: m}]") + "motions: {m: [{time: 0}, {time: 1, translate: [0, 0, %s]}]}\n"
+
+
+@pytest.mark.parametrize(
+    ("scene", "idle"),
+    [
+        (MEMBRANE, True),
+        (HELD + "gravity: [0, 0, 0]\nwind: {velocity: [0, 0, 0], density: 1.2}\n", True),
+        (HELD + "loads: [{force: [0, 0, 1], nodes: [60], from: 2}]\n", True),
+        (MEMBRANE + "contact: {}\nobstacles: {p: {plane: {point: [0, 0, -1], normal: [0, 0, 1]}}}\n", True),
+        (MOVED % "0", True),
+        (MOVED % "0.1", False),
+        (MEMBRANE + "gravity: [0, 0, -9.81]\n", False),
+        (HELD + "loads: [{force: [0, 0, 1], nodes: [60], from: 0.5}]\n", False),
+        (MEMBRANE + "initial: {velocity: [0, 0, 1]}\n", False),
+        (MEMBRANE + "initial: {noise: 1.0e-3}\n", False),
+        (HELD + "wind: {velocity: [0, 1, 0], density: 1.2}\n", False),
+        (HELD.replace("c33: 40}", "c33: 40}, bending: 1e-3, rest_curvature: [1, 0, 0]"), False),
+        (MEMBRANE + CONTACT, False),
+    ],
+)
+def test_a_scene_in_which_nothing_acts_is_noted(tmp_path: Path, scene: str, *, idle: bool) -> None:
+    found = [note for note in notes(done(["check", write_scene(tmp_path, scene)], tmp_path))]
+    assert [note.startswith("nothing acts on the sheet") for note in found] == [True] * idle
+
+
+TWO = """
+mesh:
+  - {name: a, grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}
+  - {name: b, grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}, transform: {translate: [0, 0, 1]}}
+material: {density: 0.1, membrane: {c11: 100, c22: 100, c12: 20, c33: 40}}
+gravity: [0, 0, -10]
+time: {analysis: static}
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("", ["the piece of vertex 0 along z against loads of 1 N", "the piece of vertex 25 along z"]),
+        ("handles: [{nodes: [0, 4]}]\n", ["the piece of vertex 25 along z against loads of 1 N"]),
+        ("handles: [{group: a}, {group: b, axes: [x, y]}]\n", ["the piece of vertex 25 along z"]),
+        ("handles: [{group: a}, {group: b, stiffness: 10}]\n", []),
+        ("handles: [{group: a}]\ncontact: {}\n", []),
+    ],
+)
+def test_what_nothing_holds_in_a_static_analysis_is_noted(
+    tmp_path: Path, more: str, words: list[str]
+) -> None:
+    found = [note for note in notes(done(["check", write_scene(tmp_path, TWO + more)], tmp_path, ranks=2))]
+    assert len(found) == len(words)
+    assert all(f"nothing holds {word}" in note for word, note in zip(words, found, strict=True))
 
 
 def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -162,3 +163,15 @@ def test_round_off_of_the_time_causes_no_tiny_step() -> None:
     control = StepControl(0.1, 0.3, None, [], 1e-5)
     assert control.next_end(0.2 - 1e-9) == 0.3
     assert control.next_end(0.1 - 1e-9) == pytest.approx(0.2 - 1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize("every", [None, 0.04, 0.1, 0.03, 2.0])
+@pytest.mark.parametrize("step", [0.01, 0.03, 0.25, 1.0])
+def test_the_planned_number_of_steps_is_that_of_a_run(step: float, every: float | None) -> None:
+    control = StepControl(step, 1.0, every, [0.015, 0.5, 0.7, 3.0], 1e-5)
+    time, steps, states = 0.0, 0, 1
+    while not control.is_end(time):
+        time, steps = control.next_end(time), steps + 1
+        states += control.writes_at(time)
+    assert control.planned_steps() == steps
+    assert every is None or states == math.ceil(1.0 / every - 1e-9) + 1

@@ -1,0 +1,97 @@
+"""Notes on scenes in which nothing acts on the sheet, or nothing holds it against static loads."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.scene.schema import Keyframe, Scene
+from lyra_petsc.scene.values import AXES
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.registry import Registration, Role, make_term
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Load
+
+BALANCED = 1e-9
+"""Resultant of loads over the sum of their magnitudes up to which they are in balance."""
+
+
+def nothing_acts(
+    scene: Scene, system: StageEquations, times: Iterable[float], end: float, floor: float
+) -> list[str]:
+    """A note if the sheet starts at rest and nothing will ever move it, else none; collective.
+
+    Parameters
+    ----------
+    system : StageEquations
+        At the start.
+    times : iterable of float
+        Times [s] at which loads begin or end.
+    end : float
+        End of the run [s].
+    floor : float
+        Norm [N] of the round-off of internal forces.
+    """
+    motions = [*scene.motions.values(), *map(scene.keyframes, (scene.obstacles or {}).values())]
+    moves = any(frame != Keyframe(time=frame.time) for frames in motions for frame in frames)
+    if moves or (scene.wind is not None and any(scene.wind.velocity)):
+        return []
+    comm, stops = system.points.comm, sorted({0.0, end, *(t for t in times if 0.0 < t < end)})
+    acting = float(np.abs(system.v).max(initial=0.0))
+    for t0, t1 in itertools.pairwise(stops):
+        for load in system.active.loads:
+            load.add_force(system.x, t0, t1, force := np.zeros_like(system.x))
+            acting += float(np.abs(force).max(initial=0.0))
+    gradient = system.active.gradient(system.active.elastic, system.x, system.points)
+    acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
+    if acting > 0.0 or square > floor**2:
+        return []
+    return [
+        "nothing acts on the sheet: it starts at rest and free of stress, without gravity, loads, wind or "
+        "motions, so it stays as it is"
+    ]
+
+
+def nothing_holds(
+    rest: RestShape, terms: Sequence[Registration], elements: Mapping[str, Elements]
+) -> list[str]:
+    """A note on each piece of a sheet on which static loads are not in balance, and which no handle holds.
+
+    On rank 0, with all elements of the ``terms``. In contact obstacles may hold a piece, so there are none.
+    """
+    scene, mesh = rest.scene, rest.mesh
+    loads = [entry for entry in terms if entry.role is Role.LOAD]
+    if not scene.time.static or scene.contact is not None or not loads:
+        return []
+    from lyra_petsc.mesh.patches import connected_pieces  # with kernels; needed in statics only
+
+    piece = np.empty(mesh.n_vertices, dtype=np.int64)
+    piece[mesh.triangles] = np.unique(connected_pieces(mesh.triangles), return_inverse=True)[1][:, None]
+    force: Array = np.zeros((mesh.n_vertices, 3))
+    for entry in loads:
+        term = make_term(entry, elements.get(entry.name), scene, rest.mass)
+        assert isinstance(term, Load)
+        term.add_force_on_vertices(mesh.positions, 0.0, 1.0, force)
+    held = np.zeros((piece.max() + 1, 3), dtype=bool)
+    for number, handle in enumerate(scene.handles):
+        vertices = select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)
+        held[np.ix_(np.unique(piece[vertices]), handle.axis_numbers)] = True
+    sums, sizes = (
+        np.column_stack([np.bincount(piece, parts) for parts in each.T]) for each in (force, np.abs(force))
+    )
+    free = ~held & (np.abs(sums) > BALANCED * sizes.sum(axis=1, keepdims=True))
+    notes = []
+    for number in np.flatnonzero(free.any(axis=1)):
+        which = "the sheet" if len(held) == 1 else f"the piece of vertex {np.flatnonzero(piece == number)[0]}"
+        along = ", ".join(axis for axis, here in zip(AXES, free[number], strict=True) if here)
+        resultant = float(np.linalg.norm(sums[number][free[number]]))
+        notes.append(
+            f"nothing holds {which} along {along} against loads of {resultant:.3g} N: a static analysis "
+            "finds no equilibrium; add handles"
+        )
+    return notes
