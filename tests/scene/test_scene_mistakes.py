@@ -150,7 +150,7 @@ CASES = [
     ("mesh: []", "mesh", "at least one"),
     ("mesh: {name: a}", "mesh", "exactly one of file, grid"),
     ("mesh: {file: a.obj, grid: {width: 1, height: 1, nx: 2, ny: 2}}", "mesh", "exactly one of file, grid"),
-    ("mesh: {file: a.stl}", "mesh.file", ".geo, .msh, .obj"),
+    ("mesh: {file: a.step}", "mesh.file", ".geo, .msh, .obj"),
     ("mesh: {file: none.obj}", "mesh.file", "no such file"),
     ("mesh: [{file: none.obj}]", "mesh[0].file", "no such file"),
     ("mesh: [{grid: {width: 1, height: 1, nx: 1, ny: 1}, name: a}, "
