@@ -15,11 +15,13 @@ from rich.table import Table
 from lyra_petsc.arrays import Ints
 from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
+from lyra_petsc.mesh.weld import count_pieces
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
 from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
+from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.simulation import SteppedScene
 
 LISTED_RANKS = 16
@@ -84,7 +86,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
         ("scene", one_line(f"{path}" + (f" ({scene.title})" if scene.title else ""))),
-        ("mesh", f"{whole.n_vertices} vertices, {whole.n_triangles} triangles"),
+        ("mesh", f"{whole.n_vertices} vertices, {whole.n_triangles} triangles{_pieces(problem)}"),
         ("mean edge", f"{whole.spacing:.4g} m"),
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
@@ -108,6 +110,13 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     console.print(f"load imbalance {owned.max() / owned.mean():.3f} (most owned vertices over mean)")
     for note in simulation.notes:
         console.print(f"note: {note}")
+
+
+def _pieces(problem: Problem) -> str:
+    """Number of pieces of the mesh, if there are several."""
+    if problem.mesh is None or (pieces := count_pieces(problem.mesh.n_vertices, problem.mesh.triangles)) == 1:
+        return ""
+    return f", {pieces} pieces"
 
 
 def _sandbox(scene: Scene) -> list[tuple[str, str]]:

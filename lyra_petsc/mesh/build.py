@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleS
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.mesh.weld import coincident_with, count_pieces, weld
 from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
 
 # A triangle is degenerate if twice its area is below this fraction of its longest side squared. Slivers of
@@ -53,15 +55,17 @@ def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None)
         refuse(f"triangles that repeat another one: {first_few(bad.tolist())} (counted from 0)")
 
 
-def check_shape(corners: Array, shape: str, *, file: object | None, key: str | None = None) -> None:
+def check_shape(
+    corners: Array, shape: str, *, file: object | None, key: str | None = None, remedy: str = ""
+) -> None:
     """Refuse triangles without area.
 
     Parameters
     ----------
     corners : (F, 3, d) float64
         Corners of the triangles [m], d = 2 or 3.
-    shape : str
-        ``rest`` or ``start``, for the message.
+    shape, remedy : str
+        ``rest`` or ``start``, and what to do about it, for the message.
 
     Raises
     ------
@@ -84,7 +88,7 @@ def check_shape(corners: Array, shape: str, *, file: object | None, key: str | N
     ):
         if wrong.any():
             numbers = first_few(np.flatnonzero(wrong).tolist())
-            raise InputError(f"{text}: {numbers} (counted from 0)", file=file, key=key)
+            raise InputError(f"{text}: {numbers} (counted from 0){remedy}", file=file, key=key)
 
 
 def _duplicates(triangles: Ints) -> Ints:
@@ -355,8 +359,9 @@ def build_mesh(
         n_triangles += piece.n_triangles
     mesh = _join(pieces)
     mesh.groups, group_notes = _named_groups(members, mesh.triangles)
-    mesh.notes = notes + group_notes
     mesh.sources = listed
+    mesh.coincident, mesh.unconnected = _coincident(mesh)
+    mesh.notes = notes + group_notes + [mesh.unconnected] * (mesh.unconnected != "")
     mesh.tags = np.concatenate(tags) if any(each.any() for each in tags) else None
     return mesh
 
@@ -387,11 +392,17 @@ def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: objec
     # a grid has no file: messages name the scene and its key
     where = {"file": source.file} if source.file is not None else {"file": file, "key": f"{key}.grid"}
     check_topology(sheet, **where)
+    if source.weld is not None:
+        _weld(sheet, source, source.weld, where)
     orient(sheet, **where)
     rest, positions = _transformed(sheet.points, source.transform)
+    if source.uv is not None and sheet.uv is not None:
+        sheet.uv = None if source.uv == "ignore" else sheet.uv * source.uv
     uv = sheet.uv
     if uv is not None:
-        check_shape(uv, "rest", **where)
+        remedy = ", which the vt give: mesh: {uv: ignore} takes the mesh itself"
+        check_shape(uv, "rest", remedy=remedy, **where)
+        sheet.notes += _scale_notes(uv, rest[sheet.triangles])
         laid = np.zeros_like(rest)
         laid[sheet.triangles.reshape(-1), :2] = uv.reshape(-1, 2)
         seams = (laid[sheet.triangles][:, :, :2] != uv).any()
@@ -403,6 +414,70 @@ def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: objec
     with_uv = sheet.uv is not None
     flat = np.full(len(sheet.triangles), with_uv)
     return Mesh(positions, rest, sheet.triangles, uv, flat, has_uv=with_uv)
+
+
+def _weld(sheet: Sheet, source: MeshSource, distance: float, where: dict[str, Any]) -> None:
+    """Join coincident vertices of the scaled sheet, with a note."""
+    dropped = weld(sheet, _transformed(sheet.points, source.transform)[0], distance)
+    triangles = sheet.triangles
+    if (bad := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))).size:
+        raise InputError(
+            f"weld = {distance:g} m joins vertices of one triangle: {first_few(bad.tolist())} (counted from "
+            "0); give less",
+            **where,
+        )
+    check_topology(sheet, **where)
+    sheet.notes.append(f"{dropped} vertices welded to others; vertices are numbered anew")
+
+
+SCALE_RATIO = 1.5
+"""Ratio of lengths by the vt and in space, in the mean over all edges, from which on a note says so."""
+
+
+def _scale_notes(uv: Array, corners: Array) -> list[str]:
+    """A note if lengths by ``uv`` (F, 3, 2) and in space (F, 3, 3) [m] are hardly those of one sheet."""
+    pattern, space = (np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2).ravel() for at in (uv, corners))
+    with np.errstate(divide="ignore"):
+        factor = np.abs(np.log(pattern / space))
+    ratio = float(np.exp(factor[np.isfinite(factor)].mean())) if np.isfinite(factor).any() else 1.0
+    if ratio <= SCALE_RATIO:
+        return []
+    return [
+        f"edges are {pattern.mean():.3g} m long by vt and {space.mean():.3g} m in space, and differ by a "
+        f"factor of {ratio:.2g} in the mean: vt are the rest shape in metres; if these are not, take mesh: "
+        "{uv: ignore}, or their scale: mesh: {uv: [width, height]}"
+    ]
+
+
+SAME_PLACE = 1e-6
+"""Distance over the mean edge up to which vertices coincide."""
+
+WELD = 1e-9
+"""Distance [m] that notes recommend for `weld`, unless it is too small or too large."""
+
+
+def _coincident(mesh: Mesh) -> tuple[Ints, str]:
+    """`Mesh.coincident` and `Mesh.unconnected`."""
+    x = mesh.positions
+    corners = x[mesh.triangles]
+    edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+    same = coincident_with(x, SAME_PLACE * edge)
+    others = np.flatnonzero(same != np.arange(len(x)))
+    pairs = np.column_stack([others, same[others]])
+    if not len(pairs):
+        return pairs, ""
+    apart = float(np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]).max())
+    distance = "1e-9" if apart <= WELD < 1e-3 * edge else f"{2 * SAME_PLACE * edge:.1g}"
+    source = np.repeat(np.arange(len(mesh.sources)), [each.n_vertices for each in mesh.sources])
+    remedy = f"mesh: {{weld: {distance}}} joins them"
+    if (source[pairs[:, 0]] != source[pairs[:, 1]]).any():
+        remedy += " within one file; put sheets that belong together into one, or move them apart"
+    pieces, n = count_pieces(len(x), mesh.triangles), len(pairs)
+    verb = "vertex coincides with another one" if n == 1 else "vertices coincide with others"
+    return pairs, (
+        f"the mesh is in {pieces} piece{'s' * (pieces > 1)}; {n} {verb} without being connected "
+        f"(first: {pairs[0, 0]} and {pairs[0, 1]}): {remedy}"
+    )
 
 
 def _join(pieces: list[Mesh]) -> Mesh:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+
 from lyra_petsc.arrays import Array, Ints, Mask
 
 
@@ -77,6 +79,10 @@ class Mesh:
         Node tags of .msh files, 0 for other sources; None if all tags are 1, 2, 3, ….
     obstacles : dict of str to TriangleSurface
         Obstacles of the scene that are meshes, at t = 0; not part of the sheets.
+    coincident : (n, 2) int64
+        Vertices that coincide at the start without being connected: each with the lowest one there.
+    unconnected : str
+        Text on these for the user; empty if there are none.
     """
 
     positions: Array
@@ -90,6 +96,8 @@ class Mesh:
     sources: list[Source] = field(default_factory=list)
     tags: Ints | None = None
     obstacles: dict[str, TriangleSurface] = field(default_factory=dict)
+    coincident: Ints = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    unconnected: str = ""
 
     @property
     def n_vertices(self) -> int:

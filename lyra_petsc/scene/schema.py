@@ -62,6 +62,7 @@ from lyra_petsc.scene.values import (
     StepLength,
     Text,
     Until,
+    UvScale,
     Vec3,
     Vector,
     axes,
@@ -162,6 +163,11 @@ class MeshSource(Block):
     transform : Transform
         Transform from the mesh to the start positions. Its scaling applies to the rest shape, too, unless
         ``vt`` give the rest shape.
+    uv : "ignore", or float or (2,) [m]
+        Size of one unit of the ``vt`` of an .obj file, or of one unit of each of their axes; 1 if they are in
+        metres. With ``ignore`` the mesh itself is the rest shape, as without ``vt``.
+    weld : float [m] or None
+        Vertices at most so far from each other, in each coordinate, are joined to one.
     name : str or None
         Name of the sheet, and of a surface group with its triangles.
     """
@@ -176,6 +182,7 @@ class MeshSource(Block):
             )
             for key in ("size", "algorithm")
         ),
+        Rule(when(given("uv"), given(file=_file("obj"))), "is for .obj files only (others have no vt)", "uv"),
     )
 
     file: MeshPath | None = None
@@ -183,6 +190,8 @@ class MeshSource(Block):
     size: Positive | None = None
     algorithm: Literal["automatic", "mesh-adapt", "delaunay", "frontal-delaunay"] | None = None
     transform: Transform = Field(default_factory=Transform)
+    uv: UvScale | None = None
+    weld: Positive | None = None
     name: Name | None = None
 
 

@@ -162,6 +162,17 @@ def _pair(value: Any) -> tuple[float, float]:
     return one, two
 
 
+def _uv_scale(value: Any) -> tuple[float, float] | Literal["ignore"]:
+    """``ignore``, or one number, which is used twice, or two; all above zero."""
+    if value == "ignore":
+        return "ignore"
+    values = value if isinstance(value, (list, tuple)) else (value, value)
+    if isinstance(value, str) or len(values) != 2:
+        raise problem(f"must be ignore, a number, or two, not {shown(value)}")
+    one, two = map(_POSITIVE.check, values)
+    return one, two
+
+
 def _axis(value: Any) -> Vec3:
     axis = vector(value)
     if math.hypot(*axis) < 1e-150:
@@ -299,6 +310,20 @@ _ENTRY: Condition = FINITE | {"minimum": 0}
 Pair = Annotated[
     tuple[float, float],
     Value({"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 2, "maxItems": 2}]}, _pair),
+]
+_ABOVE: Condition = FINITE | {"exclusiveMinimum": 0}
+UvScale = Annotated[
+    tuple[float, float] | Literal["ignore"],
+    Value(
+        {
+            "anyOf": [
+                {"const": "ignore"},
+                _ABOVE,
+                {"type": "array", "items": _ABOVE, "minItems": 2, "maxItems": 2},
+            ]
+        },
+        _uv_scale,
+    ),
 ]
 Bending = Annotated[float | Vec3, _one_or_three(({"minimum": 0}, "must be >= 0 [N·m], not VALUE"))]
 Count = Annotated[int, _whole(1, LARGEST_INDEX)]

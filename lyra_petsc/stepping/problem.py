@@ -18,7 +18,7 @@ from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.linear.petsc_options import petsc_number
-from lyra_petsc.mesh.build import build_scene_mesh
+from lyra_petsc.mesh.build import SAME_PLACE, build_scene_mesh
 from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import mean_edge_length
@@ -238,6 +238,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
         positions = data.get("start", mesh.positions)
+        _refuse_unconnected(scene, mesh, positions)
         refuse_crossings(scene, mesh, positions, build_obstacles(scene, mesh.obstacles, Motion))
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
@@ -261,6 +262,15 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
     return whole, GlobalMesh(mesh.n_vertices, mesh.triangles, elements, data, edges, positions=positions)
+
+
+def _refuse_unconnected(scene: Scene, mesh: Mesh, positions: Array) -> None:
+    """Refuse contact of vertices that coincide without being connected, at ``positions`` (V, 3) [m]."""
+    assert scene.contact is not None
+    apart = np.linalg.norm(positions[mesh.coincident[:, 0]] - positions[mesh.coincident[:, 1]], axis=1)
+    least = scene.contact.thickness + SAME_PLACE * mean_edge_length(mesh)
+    if scene.contact.self and apart.min(initial=np.inf) <= least:
+        raise InputError(f"{mesh.unconnected}, and they cannot touch", file=scene.source, key="mesh")
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
