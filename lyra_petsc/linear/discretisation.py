@@ -220,7 +220,7 @@ class Discretisation:
     @property
     def limits_motion(self) -> bool:
         """Whether displacements must be checked before points move, since a term detects collisions."""
-        return any(math.isfinite(term.approach_limit) for term in self._changing)
+        return any(term.detects_collisions for term in self._changing)
 
     def searched_fraction(self, x: Array, displacement: Array) -> float:
         """Fraction ≤ 1 of a displacement (n_owned, 3) [m] from x that the last search covers; collective."""

@@ -34,6 +34,8 @@ class ActiveTerms:
         Terms that limit the length of Newton's steps.
     changing : list of Elastic
         Terms whose stencils change (pairs that are near).
+    separating : list of Elastic
+        Terms of ``changing`` that keep parts from passing through each other (contact).
     with_edges : list of Elastic
         Terms with unknowns of edges.
     coarse : dict of Elastic → Elastic
@@ -54,6 +56,7 @@ class ActiveTerms:
         self.pushing = [term for term in self.moving if term.pushes]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
         self.changing = [term for term in self.elastic if term.registration.neighbours]
+        self.separating = [term for term in self.changing if term.detects_collisions]
         self.with_edges = [term for term in self.elastic if term.registration.edge_state]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)

@@ -68,6 +68,7 @@ class Collisions:
     def __init__(self, system: StageEquations) -> None:
         self._system, self._discretisation = system, system.discretisation
         self._limiting, self._pushing = system.active.limiting, system.active.pushing
+        self._separating = system.active.separating
 
     def begin_step(self) -> None:
         """Forget what was found in the step before."""
@@ -100,11 +101,9 @@ class Collisions:
             if done > 0.0 or maximum < 1.0:
                 start, rest = v + done * increment, (maximum - done) * increment
             x, displacement, known = self.known_displacement(start, rest)
-            fraction = known
-            if self._discretisation.has_near_elements:
-                frozen = self._system.active.frozen
-                allowed = [term.largest_step(x, displacement, frozen[term]) for term in self._limiting]
-                fraction = self._global_minimum(min([fraction, *allowed]))
+            frozen, present = self._system.active.frozen, self._system.present(self._limiting)
+            allowed = [term.largest_step(x, displacement, frozen[term]) for term in present]
+            fraction = self._global_minimum(min([known, *allowed])) if present else known
             if fraction == 1.0:
                 return maximum
             done += fraction * (maximum - done)
@@ -136,13 +135,13 @@ class Collisions:
         (Nocedal & Wright, Numerical Optimization, 2nd ed., sec. 15.6.)
         """
         system = self._system
-        if not self._limiting:
+        if not self._separating:
             return None
         x, displacement, _ = self.known_displacement(v, increment, 1.0)
         if not self._discretisation.has_near_elements:
             return None
         n, frozen, changed = len(increment), system.active.frozen, False
-        targets = {t: t.target_distances(x, displacement, frozen[t]) for t in self._limiting}
+        targets = {t: t.target_distances(x, displacement, frozen[t]) for t in self._separating}
         for _ in range(MAX_SEPARATIONS):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
             found = [t.add_corrections(x, displacement, frozen[t], targets[t], out, count) for t in targets]
@@ -222,7 +221,7 @@ class Collisions:
             displacement *= known
             part = StepInterval(begin + done, begin + (1.0 if known == 1.0 else done + known * (1.0 - done)))
             frozen = self._system.active.frozen
-            free = [t.is_collision_free(x, displacement, frozen[t], part) for t in self._limiting]
+            free = [t.is_collision_free(x, displacement, frozen[t], part) for t in self._separating]
             if not self._global_minimum(float(all(free))):
                 break
             if known == 1.0:
@@ -267,11 +266,11 @@ class Collisions:
         collective.
         """
         system = self._system
-        if not (self._limiting and self._discretisation.has_near_elements):
+        if not (self._separating and self._discretisation.has_near_elements):
             return False
         largest = system.stage.c * np.abs(system.evaluated[1][: system.points.n_vertices]).max(initial=0.0)
         return system.points.global_max(float(largest))[0] > IMPACT_STEP * min(
-            term.skin for term in self._limiting
+            term.skin for term in self._separating
         )
 
     def may_collide(self, approach: float) -> bool:
@@ -284,7 +283,7 @@ class Collisions:
         ):
             return False
         x, displacement, frozen = system.x, system.expected_displacement(), system.active.frozen
-        found = any(t.may_collide(x, displacement, frozen[t], approach) for t in self._limiting)
+        found = any(t.may_collide(x, displacement, frozen[t], approach) for t in self._separating)
         return any(system.points.global_max(found))
 
     def _global_minimum(self, number: float) -> float:

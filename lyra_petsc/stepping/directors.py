@@ -42,7 +42,7 @@ class Directors:
         self._end_frames: dict[Term, Any] = {}  # at the end of the last step
         stiffness = np.zeros((points.n_local, 3))
         for term in self._terms:
-            stiffness.reshape(-1)[term.edge_indices] = MIN_EDGE_STIFFNESS * term.edge_stiffness()
+            stiffness.reshape(-1)[term.edge_indices] += MIN_EDGE_STIFFNESS * term.edge_stiffness()
         self.min_stiffness = stiffness[points.n_vertices : points.n_owned].max(axis=1)
 
     def begin_step(self) -> bool:

@@ -98,7 +98,7 @@ def remove_surplus(
     impulses on vertices, (n_owned,), for friction.
     """
     n = system.points.n_owned
-    terms, frozen = system.active.limiting, system.active.frozen
+    terms, frozen = system.active.separating, system.active.frozen
     moved, work, after = system.x[:n] - x_before, 0.0, 0.0
     for term in terms:
         term.add_gradient(system.stage_positions, frozen[term], pull := np.zeros_like(system.x))
@@ -156,7 +156,8 @@ def damp_impacts(system: StageEquations, normal_force: Array) -> ContactImpulses
     layout, n, dt = system.points, system.points.n_owned, system.dt
     last = _last_times(system)
     all_pairs = [
-        term.dashpots(system.x, system.v, system.active.frozen[term], last) for term in system.active.limiting
+        term.dashpots(system.x, system.v, system.active.frozen[term], last)
+        for term in system.active.separating
     ]
     if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
         reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)

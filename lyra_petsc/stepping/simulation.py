@@ -437,7 +437,8 @@ class SteppedScene:
         """Time [s] in which the fastest vertex crosses the skin of the contact search; collective."""
         system = self.problem.system
         fastest = float(self.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
-        return min(term.skin for term in system.active.limiting) / max(fastest, 1e-300)
+        skins = (term.skin for term in system.active.changing if term.search_distance > 0.0)
+        return min(skins, default=math.inf) / max(fastest, 1e-300)
 
     def _conserves_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
         """Whether the energy guard accepts the step just taken; if so, `energy_balance` records it."""

@@ -299,10 +299,13 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_end_velocity(rate)
         self.state.set(moved, rate)
-        if self.active.limiting and self.integrator.dynamic:
+        if not self.integrator.dynamic:
+            return
+        if self.active.changing and self.stage.offset < self.dt:
+            # pairs that come near between the stage and the end
+            self.update_stencils(self._xs, self.x - self._xs)
+        if self.active.separating:
             self._past_velocity = rate_before
-            if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
-                self.update_stencils(self._xs, self.x - self._xs)
             if not self.discretisation.has_near_elements:
                 self.integrator.surplus, self.contact_impulses = max(self.integrator.surplus, 0.0), None
                 return
@@ -407,10 +410,10 @@ class StageEquations:
         """Energy [J] of this rank's contact; None if what a step adds to it is not known, as with moving
         obstacles, and so not removed.
         """
-        if not self.integrator.exact_work or not self.active.limiting or self.active.pushing:
+        if not self.integrator.exact_work or not self.active.separating or self.active.pushing:
             return None
         frozen = self.active.frozen
-        return sum(float(term.energies(self.x, frozen[term]).sum()) for term in self.active.limiting)
+        return sum(float(term.energies(self.x, frozen[term]).sum()) for term in self.active.separating)
 
     def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
         """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].
@@ -477,7 +480,7 @@ class StageEquations:
         self._squares = []
         yield self._with_square("inertia", self.mass[:, None] * vdot)
         del vdot
-        constraints = self._present(self.active.constraints)
+        constraints = self.present(self.active.constraints)
         for name, slips in (("springs", False), ("friction", True)):
             if terms := [term for term in constraints if term.slips is slips]:
                 yield self._with_square(name, self._sum(terms, x))
@@ -495,7 +498,7 @@ class StageEquations:
         self._squares.append(squared_norm_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
 
-    def _present(self, terms: Sequence[Elastic]) -> list[Elastic]:
+    def present(self, terms: Sequence[Elastic]) -> list[Elastic]:
         """Those of ``terms`` that have elements on any rank: all while something is near."""
         near = self.discretisation.has_near_elements
         return [term for term in terms if near or not term.registration.neighbours]

@@ -98,8 +98,9 @@ class StartAcceleration:
         edges, free = slice(layout.n_vertices, layout.n_owned), system.prescribed.free
         diagonal, increment = np.zeros_like(v), np.zeros_like(v)
         for term in system.active.with_edges:
-            damping = term.elements.data["damping"]
-            diagonal.reshape(-1)[term.edge_indices] = term.edge_stiffness(damping)
+            if term.registration.damped:
+                damping = term.elements.data["damping"]
+                diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
         scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
         residual = system.out_of_balance(v)[edges]
         direction = scale * residual

@@ -62,7 +62,7 @@ class Registration:
     neighbours : bool
         Whether stencils change as points come near each other.
     limits_step : bool
-        Whether the term limits the length of Newton's steps.
+        Whether the term limits the length of Newton's steps and of their first guess.
     state, edge_state : tuple of str
         Names of the arrays on vertices, and on edges with an unknown, that a checkpoint holds for the term.
     element_vertices : int

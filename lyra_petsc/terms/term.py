@@ -307,6 +307,11 @@ class Elastic(Term):
     """Part [m] of ``search_distance`` by which points may approach each other before the next search."""
 
     @property
+    def detects_collisions(self) -> bool:
+        """Whether the term keeps parts from passing through each other, however long a step is."""
+        return bool(np.isfinite(self.approach_limit))
+
+    @property
     def moving(self) -> bool:
         """Whether the energy depends on moving targets or obstacles, which thereby do work on the sheet."""
         return self.registration.moving
@@ -398,7 +403,10 @@ class Elastic(Term):
         return np.ones(self.n_elements, dtype=np.bool_)
 
     def largest_step(self, x: Array, dx: Array, frozen: Any) -> float:
-        """Largest fraction, up to 1, of Newton's increment dx (n_local, 3) [m] of x that may be applied."""
+        """Largest fraction, up to 1, of Newton's increment dx (n_local, 3) [m] of x that may be applied.
+
+        The first guess is an increment of positions where all free vertices stay.
+        """
         return 1.0
 
     def springs(self, x: Array, approach: float, frozen: Any) -> Springs | None:

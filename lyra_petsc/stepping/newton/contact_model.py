@@ -38,7 +38,7 @@ def springs_along(system: StageEquations, v: Array, increment: Array) -> dict[El
     x, displacement, _ = system.collisions.known_displacement(v, increment, 1.0)
     moved = np.linalg.norm(displacement[: system.points.n_vertices], axis=1).max(initial=0.0)
     approach = 2.0 * system.points.global_max(float(moved))[0]
-    found = {term: term.springs(x, approach, system.active.frozen[term]) for term in system.active.limiting}
+    found = {term: term.springs(x, approach, system.active.frozen[term]) for term in system.active.separating}
     return {term: springs for term, springs in found.items() if springs is not None}
 
 
@@ -131,7 +131,7 @@ class ContactModel:
 
         It is empty where another increment is taken.
         """
-        for term in self._system.active.limiting:
+        for term in self._system.active.separating:
             term.release_springs(length.get(term))
 
     def _set_springs(self, springs: list[Springs]) -> None:

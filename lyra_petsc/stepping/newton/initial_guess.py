@@ -32,12 +32,13 @@ def first_guess(system: StageEquations, out: Array) -> bool:
         return True
     moving = system.v[:n].copy()
     system.prescribe(moving)
+    still = system.collisions.start_velocity()
+    if system.collisions.limits_steps:
+        fraction = system.collisions.largest_step(still, moving - still)
+        moving = moving if fraction == 1.0 else still + fraction * (moving - still)
     if integrator.order > 1 and not system.discretisation.limits_motion:
         out[:] = moving
         return False
-    still = system.collisions.start_velocity()
-    if system.discretisation.limits_motion:
-        moving = still + system.collisions.largest_step(still, moving - still) * (moving - still)
     use_still = system.objective(still)[0] < system.objective(moving)[0]
     out[:] = still if use_still else moving
     return False

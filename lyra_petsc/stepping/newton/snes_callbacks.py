@@ -104,7 +104,7 @@ class Newton:
         self._linear, self._blend, self._iterates = linear, blend, iterates
         self.convergence, self.globalisation = convergence, Globalisation(snes, system, convergence)
         self._shape = (system.points.n_owned, 3)
-        skin = min((term.skin for term in system.active.limiting), default=np.inf)
+        skin = min((term.skin for term in system.active.separating), default=np.inf)
         self._contact: ContactModel | None = None
         if iterates and skin < SMALL_GAP * convergence.spacing:
             from lyra_petsc.stepping.newton.contact_model import ContactModel  # needed with small gaps only
