@@ -35,6 +35,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     ``/groups/<number>`` with an attribute ``name`` and its non-empty arrays ``vertices`` (n,),
     ``edges`` (k, 2) and ``triangles`` (m,); for each obstacle that is a mesh ``/obstacles/<number>``
     with an attribute ``name``, ``points`` (n, 3) [m] at t = 0 and ``triangles`` (m, 3).
+    Lengths have an attribute ``units``.
 
     Parameters
     ----------
@@ -63,6 +64,9 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
             names[f"obstacles/{number}"] = {"name": name}
             datasets |= {f"obstacles/{number}/{part}": rows for part, rows in surface._asdict().items()}
         names |= {name: {SUM: str(check_sum(rows))} for name, rows in datasets.items()}
+        for name, rows in datasets.items():
+            if rows.dtype.kind == "f":  # all but numbers of vertices and triangles are lengths
+                names[name]["units"] = "m"
         write_collective([NewFile(Path(folder) / MESH_FILE, datasets, names)], MPI.COMM_SELF)
 
     on_root(comm, work)

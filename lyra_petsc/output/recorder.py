@@ -271,6 +271,7 @@ class Recorder:
             n_triangles=self._simulation.problem.whole.n_triangles,
             resume_after=resume_after,
             vtkhdf=self._simulation.scene.output.vtkhdf,
+            time_unit="1" if self._simulation.scene.time.static else "s",
             background=self._background,
         )
         self._tables = {

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from lyra_petsc.output.file_operations import (
     replace_text,
     writing,
 )
-from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, preallocate, write_collective
+from lyra_petsc.output.hdf5 import Background, NewFile, preallocate, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_attribute
 from lyra_petsc.output.tensors import TENSORS
@@ -48,6 +48,7 @@ from lyra_petsc.output.xdmf import (
     group_name,
 )
 from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.schema import FIELD_UNITS
 
 MIN_STATES, MAX_STATES = 4, 512
 """Bounds of the number of states that a file can hold."""
@@ -57,6 +58,9 @@ MAX_BYTES = 1 << 26
 
 MAX_LAG = 0.1
 """During a run, states missing in ``states.vtkhdf``, relative to the states in it."""
+
+UNITS = {**FIELD_UNITS, "position": "m", "residual": "N"}
+"""Units of the datasets of a state by name, stored as their attribute ``units``."""
 
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
@@ -82,6 +86,8 @@ class StateWriter:
         next number. Otherwise the first state is number 0.
     vtkhdf : bool
         Announce the states in ``states.vtkhdf``, too.
+    time_unit : str
+        Unit of the states' times.
     background : Background, optional
         Completes and announces states while the run continues.
 
@@ -106,6 +112,7 @@ class StateWriter:
         n_triangles: int,
         resume_after: int | None = None,
         vtkhdf: bool = False,
+        time_unit: str = "s",
         background: Background | None = None,
     ) -> None:
         self.folder = Path(folder)
@@ -118,7 +125,7 @@ class StateWriter:
         self._n_in_vtkhdf = 0
         self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
-        self._vtkhdf, self._background = vtkhdf, background
+        self._vtkhdf, self._time_unit, self._background = vtkhdf, time_unit, background
         if vtkhdf:
             on_root(self._comm, lambda: write_cells(self.folder))
         self.in_plane: frozenset[str] = frozenset()
@@ -206,7 +213,11 @@ class StateWriter:
         }
         planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
         columns = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
-        attributes: Attributes = {TABLE: {"first": first, "columns": columns}}
+        attributes: dict[str, dict[str, int | float | str]] = {
+            TABLE: {"first": first, "columns": columns},
+            f"{TABLE}/time": {"units": self._time_unit},
+            **_units(planned),
+        }
 
         def work() -> list[int]:
             part = path.with_name(path.name + ".part")
@@ -308,6 +319,12 @@ class _PreallocatedFile:
         with writing(self.path), open_output(self.path, "r+b", buffering=0) as file:
             for offset, entry in zip(self.table.tolist(), entries, strict=True):
                 os.pwrite(file.fileno(), entry.tobytes(), offset + index * entry.nbytes)
+
+
+def _units(datasets: Iterable[str]) -> dict[str, dict[str, int | float | str]]:
+    """Attributes of a file that give the units of datasets of states, by their paths."""
+    names = {path: path.rpartition("/")[2] for path in datasets}
+    return {path: {"units": UNITS[name]} for path, name in names.items() if name in UNITS}
 
 
 def _discard_states_after(path: Path, last_step: int) -> None:
@@ -447,6 +464,7 @@ def write_failure(
             for name, values in state.fields.items()
         )
         written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
+    attributes |= _units(datasets)
     write_collective([NewFile(folder / FAILURE_DATA, datasets, attributes)], vertices.comm)
     document = TimeSeries(vertices.n_global, n_triangles).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
