@@ -16,6 +16,7 @@ from launch import FORKS, RANK, environment
 
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.verbs import verbs
+from lyra_petsc.scene.json_schema import FILE
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml
 
@@ -177,6 +178,16 @@ def test_named_files_exist() -> None:
         for name in NAMED.findall(page.read_text(encoding="utf-8")):
             places = ROOT / name, ROOT / "lyra_petsc" / name
             assert any(place.exists() for place in places), f"{shown(page)}: {name}"
+
+
+def test_the_index_names_every_page() -> None:
+    docs = ROOT / "docs"
+    linked = set(re.findall(r"\]\(([\w/.-]+\.md)", (docs / "index.md").read_text(encoding="utf-8")))
+    assert linked == {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")} - {"index.md"}
+
+
+def test_the_page_on_editors_names_the_schema_of_this_version() -> None:
+    assert FILE in (ROOT / "docs" / "howto" / "editor.md").read_text(encoding="utf-8")
 
 
 def test_code_blocks_are_found() -> None:
