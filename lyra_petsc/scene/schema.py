@@ -673,7 +673,8 @@ class Handle(Selector):
         along the others in the plane of the sheet; needs ``midedge``.
     symmetry : "x", "y" or "z", or None
         The vertices are in a symmetry plane normal to this axis: they stay in the plane, and the sheet stays
-        normal to it. Replaces ``axes``; needs ``midedge``.
+        normal to it. At the start it may be off by 10° and half the angle to the next triangle. Replaces
+        ``axes``; needs ``midedge``.
     motion : str or None
         Name in ``motions``; without it the vertices keep their positions.
     interpolation : str

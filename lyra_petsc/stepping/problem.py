@@ -21,7 +21,7 @@ from lyra_petsc.linear.petsc_options import petsc_number
 from lyra_petsc.mesh.build import SAME_PLACE, build_scene_mesh
 from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.measures import mean_edge_length
+from lyra_petsc.mesh.measures import largest_folds, mean_edge_length, unit_normals
 from lyra_petsc.mesh.mesh import Mesh, Source
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.mesh.select import FLAT, select_vertices
@@ -273,8 +273,16 @@ def _refuse_unconnected(scene: Scene, mesh: Mesh, positions: Array) -> None:
         raise InputError(f"{mesh.unconnected}, and they cannot touch", file=scene.source, key="mesh")
 
 
+LARGEST_TILT = 10.0
+"""Largest angle [°] between a symmetry plane and the normal of a flat sheet there."""
+
+
 def _check_symmetry(rest: RestShape, held: Selection) -> None:
-    """Refuse symmetry handles off a plane, and those at which hinges end or a sheet lies in the plane."""
+    """Refuse symmetry handles off a plane, and those at which hinges end, or a sheet is not normal to the
+    plane.
+
+    A facet of a curved sheet that is normal to the plane is off by half the angle to the next facet.
+    """
     scene, mesh = rest.scene, rest.mesh
     tolerance = FLAT * float(np.ptp(mesh.positions, axis=0).max())
     for number, vertices in held.items():
@@ -299,6 +307,19 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
                 f"triangle {flat[0]} lies in the plane {axis} = {np.median(coordinate):.6g} m, to which the "
                 "sheet must be normal; take another axis, or hold axes instead"
             )
+        elif at_plane.any():
+            facets, normals = np.flatnonzero(at_plane), unit_normals(mesh.positions, mesh.triangles)
+            tilt = np.degrees(np.arcsin(np.minimum(np.abs(normals[facets, AXES.index(axis)]), 1.0)))
+            excess = tilt - LARGEST_TILT
+            steep = np.flatnonzero(excess > 0.0)
+            excess[steep] -= 0.5 * largest_folds(normals, mesh.triangles, facets[steep])
+            if (excess > 0.0).any():
+                worst = int(np.where(excess > 0.0, tilt, 0.0).argmax())
+                problem = (
+                    f"the sheet is off the normal of the plane {axis} = {np.median(coordinate):.6g} m by up "
+                    f"to {tilt[worst]:.3g}° (triangle {facets[worst]}), so that its image would make a fold; "
+                    "choose the plane to which it is normal, or hold axes instead"
+                )
         if problem:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
 

@@ -857,6 +857,37 @@ def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
+    ("arc", "cells", "incline", "off"),
+    [
+        (np.pi / 2, 2, 0, 0),  # at the plane a cell is off by half the angle between two cells
+        (np.pi / 2, 3, 5, 0),
+        (1e-9, 3, 9, 0),
+        (1e-9, 3, 11, 11),
+        (1e-9, 3, 40, 40),
+        (0.7, 8, 20, 22.5),
+    ],
+)
+def test_symmetry_needs_a_sheet_normal_to_its_plane(
+    tmp_path: Path, arc: float, cells: int, incline: float, off: float
+) -> None:
+    """Arcs [rad] that are inclined by some degrees where they meet the plane x = 0."""
+    flat, faces = rectangle(cells, 2, 1.0, 0.5)
+    angle, turn = arc * flat[:, 0], np.radians(incline)
+    x, z = np.sin(angle) / arc, (np.cos(angle) - 1.0) / arc
+    vertices = np.column_stack(
+        [x * np.cos(turn) + z * np.sin(turn), flat[:, 1], z * np.cos(turn) - x * np.sin(turn)]
+    )
+    content = vault(obj_file(tmp_path / "sheet.obj", vertices, faces), symmetry_planes("x"))
+    content["handles"] = content["handles"][1:]
+    if not off:
+        Run(MPI.COMM_SELF, scene_of(content))
+        return
+    with pytest.raises(InputError, match=rf"off the normal of the plane x = 0 m by up to {off:g}") as raised:
+        Run(MPI.COMM_SELF, scene_of(content))
+    assert raised.value.key == "handles[0].symmetry"
+
+
+@pytest.mark.parametrize(
     ("group", "axis", "words"),
     [("left", "y", "beside the plane y"), ("sheet", "x", "beside"), ("left", "z", "lies in the plane z")],
 )
