@@ -21,7 +21,7 @@ from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleS
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.mesh.topology import edge_table
-from lyra_petsc.mesh.weld import coincident_with, count_pieces, weld
+from lyra_petsc.mesh.weld import coincident_with, piece_of_triangles, weld
 from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
 
 # A triangle is degenerate if twice its area is below this fraction of its longest side squared. Slivers of
@@ -472,7 +472,7 @@ def _coincident(mesh: Mesh) -> tuple[Ints, str]:
     remedy = f"mesh: {{weld: {distance}}} joins them"
     if (source[pairs[:, 0]] != source[pairs[:, 1]]).any():
         remedy += " within one file; put sheets that belong together into one, or move them apart"
-    pieces, n = count_pieces(len(x), mesh.triangles), len(pairs)
+    pieces, n = int(piece_of_triangles(mesh.triangles).max()) + 1, len(pairs)
     verb = "vertex coincides with another one" if n == 1 else "vertices coincide with others"
     return pairs, (
         f"the mesh is in {pieces} piece{'s' * (pieces > 1)}; {n} {verb} without being connected "

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lyra_petsc.arrays import Ints
+from lyra_petsc.arrays import Array, Ints
 
 
 class Hinges(NamedTuple):
@@ -94,6 +94,19 @@ def hinges(triangles: Ints) -> Hinges:
         [side_vertices(triangles, first), side_vertices(triangles, second)[:, 2:]], axis=1
     )
     return Hinges(vertices, np.stack([first // 3, second // 3], axis=1))
+
+
+def enclosed_volumes(points: Array, triangles: Ints, piece: Ints) -> Array:
+    """Volume (n,) [m³] that each closed ``piece`` (F,), numbered from 0, of triangles (F, 3) encloses.
+
+    It is negative where normals point inwards, and 0 for pieces with a boundary, and for flat ones.
+    """
+    corners = points[triangles] - points.mean(axis=0)
+    sixth = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    volume = np.bincount(piece, sixth) / 6.0
+    volume[np.abs(volume) < 1e-12 * np.bincount(piece, np.abs(sixth))] = 0.0  # round-off
+    volume[piece[boundary_edges(triangles).triangles]] = 0.0
+    return volume
 
 
 def junctions(triangles: Ints) -> list[Ints]:

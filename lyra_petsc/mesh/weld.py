@@ -54,9 +54,9 @@ def weld(sheet: Sheet, points: Array, distance: float) -> int:
     return dropped
 
 
-def count_pieces(n_vertices: int, triangles: Ints) -> int:
-    """Number of pieces of triangles (F, 3) that no common vertex joins."""
-    lowest: Ints = np.arange(n_vertices)
+def piece_of_triangles(triangles: Ints) -> Ints:
+    """Number (F,), from 0 on, of the piece of each of triangles (F, 3): those that common vertices join."""
+    lowest: Ints = np.arange(int(triangles.max(initial=-1)) + 1)
     while True:
         before = lowest.copy()
         of_triangle = lowest[triangles].min(axis=1)
@@ -64,4 +64,4 @@ def count_pieces(n_vertices: int, triangles: Ints) -> int:
             np.minimum.at(lowest, corner, of_triangle)
         lowest = lowest[lowest]
         if np.array_equal(before, lowest):
-            return len(np.unique(lowest[triangles]))
+            return np.unique(lowest[triangles[:, 0]], return_inverse=True)[1]

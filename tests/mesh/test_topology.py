@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mesh_sources import grid_mesh
 
-from lyra_petsc.mesh.topology import boundary_edges, hinges, junctions
+from lyra_petsc.mesh.topology import boundary_edges, enclosed_volumes, hinges, junctions
 
 
 def test_hinge_of_two_triangles() -> None:
@@ -51,6 +51,16 @@ def test_three_triangles_on_an_edge_are_a_junction_and_no_hinge() -> None:
     assert hinges(triangles).triangles.tolist() == [[1, 3]]
     assert [found.tolist() for found in junctions(triangles)] == [[0, 1, 2]]
     assert junctions(triangles[1:]) == []
+
+
+def test_volumes_of_a_tetrahedron_one_turned_inside_out_an_open_and_a_flat_one() -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + 5.0
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    flat = corners * [1.0, 1.0, 0.0]
+    points = np.concatenate([corners, corners, corners, flat])
+    triangles = np.concatenate([faces, faces[:, ::-1] + 4, faces[:3] + 8, faces + 12])
+    piece = np.repeat([0, 1, 2, 3], [4, 4, 3, 4])
+    np.testing.assert_allclose(enclosed_volumes(points, triangles, piece), [1 / 6, -1 / 6, 0, 0], atol=1e-15)
 
 
 def test_no_triangles_no_edges() -> None:

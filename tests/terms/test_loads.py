@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from oracle import frozen_by, gradient
-from physics import Simulation, grid, rotation
+from physics import Simulation, grid, obj_file, rotation
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.terms.term import Load, Viscous
@@ -43,6 +43,25 @@ def geo(tmp_path: Path) -> dict[str, Any]:
     path = tmp_path / "square.geo"
     path.write_text(GEO, encoding="utf-8")
     return {"file": str(path), "size": 0.4}
+
+
+@pytest.mark.parametrize(
+    ("faces", "pressure", "words"),
+    [
+        ([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)], 20, None),
+        ([(1, 2, 0), (3, 1, 0), (3, 2, 1), (2, 3, 0)], 20, "so that 20 Pa compress it; -20 would"),
+        ([(1, 2, 0), (3, 1, 0), (3, 2, 1), (2, 3, 0)], -20, "so that -20 Pa inflate it; 20 would"),
+        ([(1, 2, 0), (3, 1, 0), (3, 2, 1)], 20, None),
+    ],
+)
+def test_normals_that_point_into_a_closed_surface_are_noted(
+    tmp_path: Path, faces: list[tuple[int, ...]], pressure: float, words: str | None
+) -> None:
+    mesh = obj_file(tmp_path / "mesh.obj", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], faces)
+    with loaded(mesh, {"pressure": pressure}) as simulation:
+        found = [note for note in simulation.problem.whole.notes if "point inwards" in note]
+        assert len(found) == (words is not None)
+        assert not words or words in found[0]
 
 
 TOTAL = [3.0, -2.0, 1.0]

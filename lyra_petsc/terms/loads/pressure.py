@@ -13,6 +13,8 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vector3 import area_normal, scaled
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_triangles
+from lyra_petsc.mesh.topology import enclosed_volumes
+from lyra_petsc.mesh.weld import piece_of_triangles
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.handles.motion import Window
 from lyra_petsc.terms.rest import RestShape
@@ -48,7 +50,15 @@ def elements(rest: RestShape) -> Elements:
             chosen = select_triangles(
                 rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
             )
-            stencils.append(rest.mesh.triangles[chosen])
+            triangles = rest.mesh.triangles[chosen]
+            volumes = enclosed_volumes(rest.mesh.positions, triangles, piece_of_triangles(triangles))
+            if load.pressure and volumes.min(initial=0.0) < 0.0:
+                effect = "compress" if load.pressure > 0.0 else "inflate"
+                rest.notes.append(
+                    f"loads[{number}].pressure: the normals of a closed surface point inwards, so that "
+                    f"{load.pressure:g} Pa {effect} it; {-load.pressure:g} would do the opposite"
+                )
+            stencils.append(triangles)
             pressures.append(np.full(len(chosen), load.pressure))
             loads.append(np.full(len(chosen), float(number)))
     data = {"pressure": np.concatenate(pressures), "load": np.concatenate(loads)}
