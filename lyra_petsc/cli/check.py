@@ -23,6 +23,8 @@ from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.units_check import figures
 
 LISTED_RANKS = 16
 """Number of ranks up to which all are listed; of more only the extremes are."""
@@ -88,6 +90,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
         ("scene", one_line(f"{path}" + (f" ({scene.title})" if scene.title else ""))),
         ("mesh", f"{whole.n_vertices} vertices, {whole.n_triangles} triangles{_pieces(problem)}"),
         ("mean edge", f"{whole.spacing:.4g} m"),
+        *_sizes(simulation),
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
         *_contact(scene),
@@ -117,6 +120,17 @@ def _pieces(problem: Problem) -> str:
     assert problem.mesh is not None
     pieces = piece_of_triangles(problem.mesh.triangles).max() + 1
     return f", {pieces} pieces" if pieces > 1 else ""
+
+
+def _sizes(simulation: SteppedScene) -> list[tuple[str, str]]:
+    """Rows of the plan by which wrong units are seen."""
+    mesh, scene = simulation.problem.mesh, simulation.scene
+    assert mesh is not None
+    rest = RestShape(scene, mesh)
+    extent = " x ".join(f"{length:.4g}" for length in np.ptp(mesh.positions, axis=0))
+    rows = [("size", f"{extent} m"), ("mass", f"{rest.mass.sum():.4g} kg")]
+    names = [f"material {block.group}" if block.group else "material" for block in scene.material]
+    return [*rows, *((one_line(name), str(each)) for name, each in zip(names, figures(rest), strict=True))]
 
 
 def _sandbox(scene: Scene) -> list[tuple[str, str]]:

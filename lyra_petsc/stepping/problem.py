@@ -48,6 +48,7 @@ from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
+from lyra_petsc.terms.units_check import unit_notes
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
@@ -254,6 +255,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         notes=[
             *mesh.notes,
             *rest.notes,
+            *unit_notes(rest),
             *conflicts(scene, mesh, held),
             *clamps_without_edges(scene, mesh, held),
             *nothing_holds(rest, needed, elements),
