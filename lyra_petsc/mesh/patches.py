@@ -58,7 +58,7 @@ def connected_pieces(triangles: Ints, patch: Ints | None = None) -> Ints:
         patch_corners = np.column_stack([np.repeat(patch, 3), triangles.ravel()])
         node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([node[:, :2], node[:, 1:]])
-    return _connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
+    return connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
 
 
 class FlatPatches(NamedTuple):
@@ -121,7 +121,7 @@ def flat_patches(triangles: Ints, uv: Array, patch: Ints) -> FlatPatches:
     pairs: Ints = np.unique(np.sort(np.concatenate(candidates), axis=1), axis=0)
 
     # boxes in the material plane, each sheet at a height of its own
-    sheet = _connected_components(n, pairs)
+    sheet = connected_components(n, pairs)
     lower = np.minimum.reduceat(uv.min(axis=1)[order], first[:-1]) if n else np.empty((0, 2))
     upper = np.maximum.reduceat(uv.max(axis=1)[order], first[:-1]) if n else np.empty((0, 2))
     boxes = np.column_stack([lower, sheet]), np.column_stack([upper, sheet])
@@ -179,7 +179,7 @@ def _add_second_neighbours(pairs: Ints, boxes: tuple[Array, Array], radius: floa
     return every[order], others[order]
 
 
-def _connected_components(n: int, pairs: Ints) -> Ints:
+def connected_components(n: int, pairs: Ints) -> Ints:
     """Lowest number (n,) of the component of each of n nodes that are connected by pairs (m, 2)."""
     component: Ints = np.arange(n)
     while len(pairs):

@@ -10,9 +10,10 @@ from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
 from physics import CLOTH, finished, grid, scene_of, shape
 
+from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics import equilibrium
-from lyra_petsc.stepping.statics.stability import Examination
+from lyra_petsc.stepping.statics.stability import Examination, add_exact_hessian
 from lyra_petsc.terms import registry
 
 pytestmark = pytest.mark.parallel(2)
@@ -21,6 +22,9 @@ BENDING, LENGTH = 1e-2, 1.0
 CRITICAL = 7.837 * 0.8 * BENDING / (9.81 * LENGTH**3)
 """Density [kg/m²] at which an upright strip, clamped below, buckles under its weight (Greenhill 1881); hinges
 on a diagonal grid bend with 0.8 B."""
+
+
+STABLE = {"stable": True, "negative_pivots": 0, "neutral_pivots": 0, "rigid_motions": 0}
 
 
 def strip(weight: float) -> dict[str, Any]:
@@ -38,7 +42,7 @@ def strip(weight: float) -> dict[str, Any]:
 
 def test_a_strip_below_its_critical_weight_stays_upright(comm: MPI.Comm) -> None:
     with finished(comm, strip(0.95)) as simulation:
-        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
+        assert simulation.stability == STABLE
         assert not simulation.notes
         assert np.abs(shape(simulation)[:, 1]).max() < 1e-6 * LENGTH
 
@@ -48,7 +52,7 @@ def test_a_strip_below_its_critical_weight_stays_upright(comm: MPI.Comm) -> None
 )
 def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.Comm) -> None:
     with finished(comm, strip(weight)) as simulation:
-        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
+        assert simulation.stability == STABLE
         assert "its lowest mode was followed once" in simulation.notes[0]
         tip = shape(simulation)[-1]
         assert np.abs(tip[1]) > 0.3 * LENGTH
@@ -62,7 +66,7 @@ def test_an_equilibrium_that_remains_unstable_is_noted(
 ) -> None:
     monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     with finished(comm, strip(1.5)) as simulation:
-        assert simulation.stability == {"stable": False, "negative_pivots": 1, "neutral_pivots": 0}
+        assert simulation.stability == STABLE | {"stable": False, "negative_pivots": 1}
         assert "unstable" in simulation.notes[0]
         assert "followed 0 times" in simulation.notes[0]
 
@@ -111,7 +115,8 @@ def test_wrinkles_without_bending_are_noted_and_not_followed(comm: MPI.Comm) -> 
 def test_motions_without_resistance_are_neutral(comm: MPI.Comm) -> None:
     still = PRESSED | {"motions": {"in": [{"time": 0}]}}
     with finished(comm, still) as simulation:
-        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 15}
+        assert simulation.stability["stable"] is None
+        assert simulation.stability["neutral_pivots"] == 15
         assert "nothing resists 15 motions" in simulation.notes[-1]
 
 
@@ -141,29 +146,33 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
     system.x[:, 0] *= 0.95
     system.begin_step(0.3, 0.7)
     free = np.flatnonzero(system.prescribed.free)
-    with Examination(system, 0.25, 1.4) as examination:
-        inertia = examination._inertia
-        assert inertia is not None
-        indices, columns, entries = inertia._matrix.mat.getValuesCSR()
-        dense = np.zeros((system.x.size, system.x.size))
-        dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
-        dense = dense[np.ix_(free, free)]
-        slopes = np.empty_like(dense)
-        here = system.x.copy()
-        for column, place in enumerate(free):
-            force = []
-            for sign in (1.0, -1.0):
-                system.x.ravel()[:] = here.ravel()
-                system.x.ravel()[place] += sign * 1e-6
-                system.begin_step(0.3, 0.7)
-                force.append(system.out_of_balance().ravel()[free])
-            slopes[:, column] = (force[1] - force[0]) / 2e-6
-        symmetric = 0.5 * (slopes + slopes.T)
-        np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
-        values = np.linalg.eigvalsh(symmetric)
+    add_exact_hessian(system, values := system.discretisation.rows.zeros())
+    matrix = AssembledMatrix(system.points, system.discretisation.rows.pattern, "aij")
+    matrix.set(values)
+    indices, columns, entries = matrix.mat.getValuesCSR()
+    matrix.destroy()
+    dense = np.zeros((system.x.size, system.x.size))
+    dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
+    dense = dense[np.ix_(free, free)]
+    slopes = np.empty_like(dense)
+    here = system.x.copy()
+    for column, place in enumerate(free):
+        force = []
+        for sign in (1.0, -1.0):
+            system.x.ravel()[:] = here.ravel()
+            system.x.ravel()[place] += sign * 1e-6
+            system.begin_step(0.3, 0.7)
+            force.append(system.out_of_balance().ravel()[free])
+        slopes[:, column] = (force[1] - force[0]) / 2e-6
+    symmetric = 0.5 * (slopes + slopes.T)
+    np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
+    system.x[:] = here
+    system.begin_step(0.3, 0.7)
+    values = np.linalg.eigvalsh(symmetric)
+    with Examination(system, 1.4) as examination:
         assert examination.stability.negative == np.sum(values < 0.0)
         assert examination.stability.negative > 0
         mode = examination.lowest_mode()
         assert mode is not None
-        assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] == pytest.approx(values[0], rel=0.02)
+        assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] < 0.0
     simulation.destroy()

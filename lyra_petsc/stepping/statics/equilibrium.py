@@ -31,6 +31,7 @@ from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.statics.buckled_shape import BuckledShape
 from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
 from lyra_petsc.stepping.statics.load_step_progress import PROGRESS, LoadStepProgress
 from lyra_petsc.stepping.statics.pseudo_time import LEAP_ITERATIONS, PseudoTimeStep
@@ -159,7 +160,7 @@ class Equilibrium:
             return examination.stability.stable is False
 
     def _examine(self) -> Examination:
-        return Examination(self._system, self._spacing, self._size)
+        return Examination(self._system, self._size)
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Find the equilibrium at load factor ``factor``; on failure the state is restored; collective."""
@@ -407,13 +408,14 @@ class Equilibrium:
                 found = examination.stability
                 if found.stable is not False:
                     break
-                mode, displacement = examination.lowest_mode(), None
+                mode = examination.lowest_mode()
                 if mode is None:
                     message = "its lowest mode was not found"
                 elif self._whole_stiffness is not None and self._whole_stiffness.skew_part_stabilises(
                     found, mode, factor
                 ):
-                    found = Stability(reason=NO_POTENTIAL)
+                    found, message = Stability(reason=NO_POTENTIAL), ""
+                    break
                 elif examination.is_wrinkle(mode):
                     message = (
                         "sheets without bending wrinkle as finely as the mesh, which is not followed; give a "
@@ -421,17 +423,17 @@ class Equilibrium:
                     )
                 elif followed == MAX_DESCENTS:
                     message = f"its lowest mode was followed {followed} times"
-                elif (displacement := examination.descent(mode)) is None:
-                    message = "nothing along its lowest mode has less energy"
-                if displacement is None:
-                    break
+            if message:
+                break
             x = system.x[:n].copy()
             self._pseudo_time.sufficed = 0.0
-            system.state.set(x + displacement, np.zeros_like(x))
-            attempt = self.attempt(before, factor)
-            newton += attempt.newton_iterations
-            linear += attempt.linear_iterations
-            if not attempt.converged:
+            assert mode is not None
+            buckled = BuckledShape(system, self._examine, before, factor, self._size)
+            attempt = self.attempt(before, factor) if buckled.find(mode) else None
+            if attempt is not None:
+                newton += attempt.newton_iterations
+                linear += attempt.linear_iterations
+            if attempt is None or not attempt.converged:
                 system.state.set(x, np.zeros_like(x))
                 system.begin_step(before, factor)
                 system.evaluate_at_start()
@@ -575,6 +577,6 @@ def _note(found: Stability, followed: int, message: str) -> str:
         notes.append(
             f"the first equilibrium was unstable; its lowest mode was followed {times}, to a stable one"
         )
-    if found.neutral:
-        notes.append(f"the equilibrium is neutral: nothing resists {found.neutral} motions (neutral pivots)")
+    if found.rigid:
+        notes.append(f"nothing holds the sheet in {found.rigid} rigid motions")
     return "; ".join(notes)
