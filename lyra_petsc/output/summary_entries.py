@@ -13,7 +13,7 @@ class _Key(BaseModel):
 
 class _Motion(BaseModel):
     motion: list[dict[str, Any]] = []
-    interpolation: str = "hermite"
+    interpolation: str = "monotone"
 
 
 class _Resumption(BaseModel):

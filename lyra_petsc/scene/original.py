@@ -418,5 +418,5 @@ def _handle(
         "stiffness": HANDLE_STIFFNESS,
     }
     if handle.motion is not None:
-        block["motion"] = f"motion{handle.motion}"
+        block |= {"motion": f"motion{handle.motion}", "interpolation": "hermite"}
     return block

@@ -661,6 +661,9 @@ def _window_ends_later(block: Any) -> Any:
     return block
 
 
+Interpolation = Literal["monotone", "hermite", "linear"]
+
+
 class Handle(Selector):
     """Vertices whose motion is prescribed, or which springs pull.
 
@@ -678,7 +681,9 @@ class Handle(Selector):
     motion : str or None
         Name in ``motions``; without it the vertices keep their positions.
     interpolation : str
-        Interpolation of the motion between keyframes.
+        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
+        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
+        ``linear``.
     start, until : float [s]
         The handle acts for from ≤ t ≤ until; by default always.
     fade : float [s]
@@ -721,7 +726,7 @@ class Handle(Selector):
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
-    interpolation: Literal["hermite", "linear"] = "hermite"
+    interpolation: Interpolation = "monotone"
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
     fade: NonNegative = 0.0
@@ -943,7 +948,9 @@ class Obstacle(Block):
     motion : str or list of Keyframe or None
         Name in ``motions``, or keyframes, without ``scale``; by default the obstacle is at rest.
     interpolation : str
-        Interpolation of the motion between keyframes.
+        Interpolation of the motion between keyframes. ``monotone``: smooth, and never beyond two neighbouring
+        keyframes; ``hermite``: smooth, as the original Lyra's, but swings beyond keyframes before a hold;
+        ``linear``.
     friction : float or Friction or None
         Friction coefficient, instead of that of ``contact``.
     """
@@ -970,7 +977,7 @@ class Obstacle(Block):
         ]
         | None
     ) = None
-    interpolation: Literal["hermite", "linear"] = "hermite"
+    interpolation: Interpolation = "monotone"
     friction: _AnyFriction | None = None
 
     @property

@@ -92,7 +92,7 @@ def test_shipped_scene(folder: Path, name: str) -> None:
     (handle,) = scene.handles
     assert handle.nodes == [2, 3]
     assert (handle.start, handle.until, handle.fade, handle.stiffness) == (0.0, 10.0, 0.0, 1000.0)
-    assert handle.motion == "motion0"
+    assert (handle.motion, handle.interpolation) == ("motion0", "hermite")
     first, second = scene.motions["motion0"]
     assert first.rotate is None
     assert second.rotate is not None

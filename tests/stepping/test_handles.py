@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, Simulation, grid, rotation
+from physics import CLOTH, Simulation, grid, rotation, scene_of
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.scene.schema import Keyframe
+from lyra_petsc.scene.schema import Keyframe, Obstacle
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
 from lyra_petsc.terms.handles.spring import Spring
 
@@ -69,7 +69,7 @@ def test_a_keyframe_velocity_replaces_the_tangent() -> None:
 
 
 @pytest.mark.parametrize("degrees", [45.0, -120.0, 200.0, 300.0])
-@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("kind", ["linear", "hermite", "monotone"])
 def test_half_of_a_rotation_is_half_the_angle(degrees: float, kind: str) -> None:
     motion = Motion(keyframes({"time": 0}, {"time": 2, "rotate": turn(degrees, [1, 1, 0])}), kind)
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
@@ -80,7 +80,7 @@ def test_half_of_a_rotation_is_half_the_angle(degrees: float, kind: str) -> None
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), np.linalg.norm(points, axis=1), rtol=1e-13)
 
 
-@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("kind", ["linear", "hermite", "monotone"])
 @pytest.mark.parametrize("degrees", [(0, 50, -90), (0, 500, 300)])
 def test_velocity_is_the_derivative(degrees: tuple[float, ...], kind: str) -> None:
     rows = [
@@ -121,7 +121,7 @@ def test_a_motion_is_relative_to_the_start_of_the_handle() -> None:
     np.testing.assert_allclose(motion.moved(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
 
 
-@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("kind", ["linear", "hermite", "monotone"])
 @pytest.mark.parametrize(
     "degrees", [[0, 360], [0, 450], [0, -3600], [10, 3610, -90], [0, 90, 630], [0, 720, 0, 30]]
 )
@@ -140,7 +140,63 @@ def test_angles_beyond_one_turn_are_kept(degrees: list[float], kind: str) -> Non
         np.testing.assert_allclose(middle, [[np.cos(half), np.sin(half), 0.0]], atol=1e-12)
     rates = np.diff(angles) / np.diff(times)
     jumps = np.abs(np.diff(rates)).max() / np.abs(rates).max()
-    assert jumps < (0.05 if kind == "hermite" else 3.0)
+    assert jumps < (3.0 if kind == "linear" else 0.05)
+
+
+@pytest.mark.parametrize("turns", [170.0, 2000.0])
+def test_a_monotone_motion_stays_between_neighbouring_keyframes(turns: float) -> None:
+    """Also a rotation by its angle, and exactly at rest through a hold; the original's swings beyond."""
+    random = np.random.default_rng(3)
+    places, scales = random.uniform(-1.0, 1.0, (8, 3)), random.uniform(0.5, 2.0, 8)
+    angles = random.uniform(-turns, turns, 8)
+    for values in (places, scales, angles):
+        values[4:6] = values[3]  # a hold
+    times = np.cumsum(random.uniform(0.1, 1.0, 8))
+    rows = [
+        {"time": t, "translate": place.tolist(), "scale": scale, "rotate": turn(angle, [0, 0, 3])}
+        for t, place, scale, angle in zip(
+            times.tolist(), places, scales.tolist(), angles.tolist(), strict=True
+        )
+    ]
+    overshoot = {}
+    for kind in ("monotone", "hermite"):
+        motion = Motion(keyframes(*rows), kind)
+        worst = 0.0
+        for i in range(7):
+            fine = [motion.transform(t) for t in np.linspace(times[i], times[i + 1], 200)]
+            size = np.array([np.linalg.norm(a[:, 0]) for a, _ in fine])
+            turned = np.unwrap([np.arctan2(a[1, 0], a[0, 0]) for a, _ in fine])
+            found = np.column_stack([np.array([d for _, d in fine]), size, np.degrees(turned - turned[0])])
+            ends = np.column_stack([places, scales, angles - angles[i]])[i : i + 2]
+            found[:, 4] += ends[0, 4]
+            worst = max(worst, (ends.min(axis=0) - found).max(), (found - ends.max(axis=0)).max())
+            if 3 <= i < 5 and kind == "monotone":
+                assert np.ptp(found, axis=0).max() < 1e-12
+        overshoot[kind] = worst
+    assert overshoot["monotone"] < 1e-9
+    assert overshoot["hermite"] > 0.01
+
+
+def test_a_monotone_motion_without_turning_points_is_smooth() -> None:
+    """Where neighbouring rates differ by less than a factor of three, the tangents are those of hermite."""
+    rows = [{"time": t, "translate": [t + 0.1 * t * t, 0, 0]} for t in range(5)]
+    smooth, original = Motion(keyframes(*rows), "monotone"), Motion(keyframes(*rows), "hermite")
+    for t in np.linspace(0, 4, 33):
+        np.testing.assert_array_equal(smooth.transform(t)[1], original.transform(t)[1])
+
+
+def test_a_handle_and_an_obstacle_do_not_swing_beyond_a_hold_unless_told() -> None:
+    frames = [{"time": 0}, {"time": 1, "rotate": turn(90)}, {"time": 2, "rotate": turn(178)}]
+    frames.append({"time": 3, "rotate": turn(178)})
+    content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "fold"}], "motions": {"fold": frames}}
+    for interpolation in ("monotone", "hermite"):
+        if interpolation == "hermite":
+            content["handles"][0]["interpolation"] = interpolation
+        motion = motion_of(scene_of(content), 0)
+        angle = np.degrees([np.arctan2(*motion.transform(t)[0][1::-1, 0]) for t in np.linspace(1, 3, 201)])
+        beyond = (angle[angle > 0.0].max() > 178.0 + 1e-9) | (angle < 0.0).any()
+        assert beyond == (interpolation == "hermite")
+    assert Obstacle.model_validate({"box": {"min": [0, 0, 0], "max": [1, 1, 1]}}).interpolation == "monotone"
 
 
 def test_several_turns() -> None:
@@ -149,7 +205,7 @@ def test_several_turns() -> None:
     Simulation(content, MPI.COMM_SELF)
 
 
-@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("kind", ["linear", "hermite", "monotone"])
 @pytest.mark.parametrize("extra", [[], [turn(30, [0, 1, 0]), turn(750, [0, 1, 0])]])
 def test_rotations_about_different_axes_are_interpolated_by_the_shortest_rotation(
     extra: list[dict[str, Any]], kind: str

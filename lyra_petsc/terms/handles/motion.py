@@ -104,16 +104,26 @@ def _hermite(s: float, h: float, p: Any, q: Any, m: Any, n: Any) -> tuple[Any, A
     return value, rate
 
 
+def _without_overshoot(rate: Any, before: Any, after: Any) -> Any:
+    """The rate at a keyframe between intervals with mean rates ``before`` and ``after``, limited such that
+    values on both intervals stay between those of the keyframes (F. N. Fritsch, R. E. Carlson, SIAM J. Numer.
+    Anal. 17 (1980) 238-246).
+    """
+    largest = 3.0 * np.minimum(np.abs(before), np.abs(after))
+    return np.where(np.sign(before) == np.sign(after), np.clip(rate, -largest, largest), 0.0)
+
+
 class Motion:
     """T(t) = translate ∘ rotate ∘ scale through keyframes.
 
     Translation, scale and the quaternion of the rotation are interpolated component by component, either
     linearly or by the cubic Hermite polynomial with central-difference tangents that vanish at both ends (as
-    the original Lyra does; a keyframe's ``velocity`` replaces the tangent of the translation). Before the
+    the original Lyra does; a keyframe's ``velocity`` replaces the tangent of the translation). ``monotone``
+    limits the tangents such that no component leaves the range of the neighbouring keyframes. Before the
     first and after the last keyframe the transform is constant. Between keyframes with the same axis the
     rotation angle changes by the difference of their angles. Since quaternions represent at most 180°, the
-    angles of the whole motion are interpolated instead if one difference is larger. Between different axes
-    the rotation takes the shortest path.
+    angles of the whole motion are interpolated instead if one difference is larger, and by ``monotone`` also
+    if the axis does not change. Between different axes the rotation takes the shortest path.
 
     Raises
     ------
@@ -158,15 +168,19 @@ class Motion:
                 key=key,
             )
         self._tangents = np.zeros_like(self._values)
-        self._linear = interpolation == "linear"
+        self._linear, self._monotone = interpolation == "linear", interpolation == "monotone"
         if not self._linear and n > 2:
             spans = (self._times[2:] - self._times[:-2])[:, None]
             self._tangents[1:-1] = (self._values[2:] - self._values[:-2]) / spans
+        if self._monotone and n > 2:
+            slopes = np.diff(self._values, axis=0) / np.diff(self._times)[:, None]
+            self._tangents[1:-1] = _without_overshoot(self._tangents[1:-1], slopes[:-1], slopes[1:])
         for i, k in enumerate(keyframes):
             if k.velocity is not None:
                 self._tangents[i, :3] = k.velocity
         self._rotations: list[tuple[Array, float, float, float]] | None = None
-        if any(turn is not None and abs(turn) > HALF_TURN for turn in turns):
+        same_axis = self._monotone and None not in turns and any(turns)
+        if same_axis or any(turn is not None and abs(turn) > HALF_TURN for turn in turns):
             self._set_rotations(keyframes, turns)
 
     def _set_rotations(self, keyframes: Sequence[Keyframe], turns: list[float | None]) -> None:
@@ -185,8 +199,11 @@ class Motion:
             for i in range(1, len(turns)):
                 along = float(axes[i - 1] @ axes[i])
                 if along**2 > 1.0 - SAME_AXIS:  # else the rotation stops before the axis changes
-                    span = self._times[i + 1] - self._times[i - 1]
-                    rates[i] = (angles[i - 1] * math.copysign(1.0, along) + angles[i]) / span
+                    spans = np.diff(self._times[i - 1 : i + 2])
+                    turned = np.array([angles[i - 1] * math.copysign(1.0, along), angles[i]])
+                    rates[i] = float(turned.sum() / spans.sum())
+                    if self._monotone:
+                        rates[i] = float(_without_overshoot(rates[i], *(turned / spans)))
         signs = [1.0 if i == 0 or axes[i - 1] @ axes[i] > 0.0 else -1.0 for i in range(len(turns))]
         self._rotations = []
         for i, angle in enumerate(angles):
