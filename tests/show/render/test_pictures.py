@@ -225,7 +225,7 @@ def test_a_film_that_cannot_be_finished_leaves_the_old_one(tmp_path):
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
     for frames in (0, 1, 1000):
-        with pytest.raises(OutputError, match=r"nowhere/a\.mp4: cannot be written: No such file"):
+        with pytest.raises(OutputError, match=r"nowhere/a\.mp4: cannot be written by ffmpeg: No such file"):
             film(tmp_path / "nowhere" / "a.mp4", frames, stop=False)
 
 
