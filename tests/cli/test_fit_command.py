@@ -10,7 +10,11 @@ from launch import done, finish, lyra, read_csv, start, wait_until, write_scene
 
 STRIP = """\
 mesh: {grid: {width: 0.08, height: 0.02, nx: 4, ny: 1}}
-material: {density: 0.15, membrane: {c11: 500, c22: 500, c12: 100, c33: 100}, bending: 4.2e-5}
+material:
+  density: 0.15
+  membrane: {c11: 500, c22: 500, c12: 100, c33: 100}
+  bending: 4.2e-5
+  bending_model: midedge
 gravity: [0, 0, -9.81]
 handles: [{box: [[-1, -1, -1], [0.021, 1, 1]]}]
 probes: {tip: {nodes: [4, 9]}}

@@ -32,11 +32,15 @@ from lyra_petsc.experiments.fit.estimate import (
     search,
 )
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
-from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
+from lyra_petsc.experiments.fit.readings import HangingAngle, Reading, readings_of, readings_without_values
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.patches import connected_pieces
+from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder, existing_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
+from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.overrides import plain
 from lyra_petsc.scene.schema import Scene
@@ -46,6 +50,9 @@ TRIALS_FILE = "trials.json"
 
 LARGEST_RESIDUAL = 1e8
 """Largest residual of the start in uncertainties; beyond it round-off of a simulation would matter."""
+
+STRIP = 2.0
+"""Length over width of a strip."""
 
 
 FIT = FolderKind(
@@ -217,6 +224,7 @@ def fit_scene(
     assert scene.fit is not None
     readings = on_root(comm, lambda: readings_of(scene, scene.fit.measurements if scene.fit else ()))
     model = Model(comm, scene, {unknown.key: unknown.size for unknown in unknowns}, readings, watch)
+    mesh_bends = on_root(comm, lambda: _bending_of_mesh(scene, unknowns, model))
     if measured is not None:
         for reading, values in zip(model.readings, measured, strict=True):
             reading.measured = np.asarray(values, dtype=np.float64)
@@ -265,9 +273,11 @@ def fit_scene(
         if evaluation.numbers.tobytes() not in shapes:
             model.evaluate(evaluation.numbers.tolist(), derivatives=False)
             shapes[evaluation.numbers.tobytes()] = model.shape
+    conclusion = conclude(unknowns, best)
+    conclusion.notes += mesh_bends
     return Fitted(
         unknowns,
-        conclude(unknowns, best),
+        conclusion,
         model.readings,
         first.residuals * sigma + target,
         best.residuals * sigma + target,
@@ -278,6 +288,52 @@ def fit_scene(
         model.runs,
         time.monotonic() - began,
     )
+
+
+def _bending_of_mesh(scene: Scene, unknowns: Sequence[Unknown], model: Model) -> list[str]:
+    """Notes on numbers that change the bending of hinges, which depends on the shape of the cells.
+
+    Raises
+    ------
+    InputError
+        On a strip, where it is another stiffness than the one that is found.
+    """
+    notes = []
+    for unknown in unknowns:
+        ends = [scene.changed({unknown.key: value}) for value in (unknown.low, unknown.high)]
+        for number, blocks in enumerate(zip(*(end.material for end in ends), strict=True)):
+            one, other = (resolve_material(block, file=scene.source)[0] for block in blocks)
+            if one.model != "hinge" or one.bending == other.bending:
+                continue
+            assert model.mesh is not None
+            hangs = any(isinstance(reading, HangingAngle) for reading in model.readings)
+            if hangs or _has_strip(model.mesh, blocks[0].group):
+                scaled = blocks[0].bending_scale != 1.0 and "bending_scale" not in unknown.key
+                raise InputError(
+                    "hinges bend a strip by the shape of its cells, so that the number would be wrong; add "
+                    f"'bending_model: midedge' to material[{number}]"
+                    + (", and take out bending_scale" if scaled else ""),
+                    file=scene.source,
+                    key=f"fit.parameters.{unknown.key}",
+                )
+            notes.append(
+                f"{unknown.key} is that of hinges on this mesh: they bend by the shape of the cells; "
+                "'bending_model: midedge' does not"
+            )
+    return notes
+
+
+def _has_strip(mesh: Mesh, group: str | None) -> bool:
+    """Whether a piece of a group of triangles, by default of all, is a strip."""
+    triangles = mesh.triangles[select_triangles(mesh, group, key="material.group")]
+    piece = connected_pieces(triangles)
+    for number in np.unique(piece):
+        points = mesh.rest[np.unique(triangles[piece == number])]
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        length, width = np.ptp(points @ axes[:2].T, axis=0)
+        if length >= STRIP * width:
+            return True
+    return False
 
 
 def _refuse_large_residuals(readings: Sequence[Reading], evaluation: Evaluation, scene: Scene) -> None:

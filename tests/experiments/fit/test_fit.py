@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
@@ -26,6 +28,7 @@ STRIP: dict[str, Any] = {
         "density": 0.15,
         "membrane": {"c11": 500.0, "c22": 500.0, "c12": 100.0, "c33": 100.0},
         "bending": TRUE,
+        "bending_model": "midedge",
     },
     "gravity": [0.0, 0.0, -9.81],
     "handles": [{"box": [[-1, -1, -1], [0.0101, 1, 1]]}],
@@ -298,7 +301,89 @@ def test_any_number_of_ranks() -> None:
               {"probe": "tip", "value": [0.035, 0.01, -0.06], "uncertainty": 1e-3})
     )  # fmt: skip
     fitted = fit_scene(MPI.COMM_WORLD, scene)
-    assert fitted.parameters["material.bending"] == pytest.approx(2.8765785e-05, rel=1e-5)
+    assert fitted.parameters["material.bending"] == pytest.approx(2.6226479e-05, rel=1e-5)
+
+
+def elastica(stiffness: float, weight: float, length: float, s: np.ndarray) -> np.ndarray:
+    """Positions x, z (n, 2) [m] at arc lengths s (n,) [m] of a strip that hangs from a horizontal clamp.
+
+    With B [N m] and weight per area [Pa]: B θ'' = weight (length − s) cos θ, θ(0) = 0, θ'(length) = 0.
+    """
+
+    def shot(curvature: float) -> Any:
+        def rate(at: float, y: Any) -> list[float]:
+            turn = weight * (length - at) * np.cos(y[0]) / stiffness
+            return [y[1], turn, np.cos(y[0]), np.sin(y[0])]
+
+        return solve_ivp(
+            rate, (0.0, length), [0.0, curvature, 0.0, 0.0], rtol=1e-9, atol=1e-12, dense_output=True
+        )
+
+    lowest = -weight * length**2 / stiffness
+    curvature = brentq(lambda each: shot(each).y[1, -1], lowest, 0.0)
+    return np.asarray(shot(curvature).sol(s)[2:].T)
+
+
+PAGE = Path(__file__).parents[3] / "docs" / "howto" / "fit.md"
+
+
+def test_the_points_of_the_page_are_those_of_the_elastica() -> None:
+    """But for half a millimetre."""
+    rows = re.findall(r"^(\d+),([\d.-]+),([\d.-]+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    vertices, points = np.array(rows)[:, 0].astype(int), np.array(rows)[:, 1:].astype(float)
+    exact = elastica(4.2e-5, 0.15 * 9.81, 0.08, 0.005 * (vertices % 17))
+    assert 2e-4 < (points - exact).std() < 8e-4
+
+
+@pytest.mark.parametrize(("stiffness", "cells"), [(3.6e-5, 24), (1.2e-4, 16)])
+def test_intervals_of_an_overhang_hold_the_stiffness_of_the_elastica(stiffness: float, cells: int) -> None:
+    tip = elastica(stiffness, 0.245 * 9.81, 0.06, np.array([0.06]))[0]
+    angle = float(np.degrees(np.arctan2(-tip[1], tip[0])))
+    overhang = {"overhang": {"edge": "edge", "tip": "tip"}, "value": angle, "uncertainty": 0.1}
+    clamped = [[-1, -1, -1], [0, 1, 1]]
+    content = strip(
+        overhang,
+        mesh={"grid": {"width": 0.06, "height": 0.025, "nx": cells, "ny": 4, "pattern": "alternating"}},
+        material=STRIP["material"] | {"density": 0.245},
+        handles=[{"box": clamped, "clamp": True}],
+        probes={"edge": {"box": clamped}, "tip": {"box": [[0.06, -1, -1], [1, 1, 1]]}},
+        petsc={},
+    )
+    fitted = lyra_petsc.fit(content)
+    low, high = fitted.intervals["material.bending"]
+    assert low < stiffness < high
+    assert high - low < 0.05 * stiffness
+
+
+HINGES = STRIP["material"] | {"bending_model": "hinge"}
+TIP = {"probe": "tip", "axes": ["z"], "value": -0.03, "uncertainty": 1e-3}
+SQUARE = {"grid": {"width": 0.08, "height": 0.06, "nx": 8, "ny": 2, "pattern": "alternating"}}
+
+
+@pytest.mark.parametrize(
+    ("key", "number", "words"),
+    [
+        ("material.bending", 2e-5, "add 'bending_model: midedge' to material[0]"),
+        ("material.bending_scale", 1.0, "add 'bending_model: midedge' to material[0]"),
+        ("material[0].bending[1]", 2e-5, "add 'bending_model: midedge' to material[0]"),
+    ],
+)
+def test_bending_of_hinges_on_a_strip_is_refused(key: str, number: float, words: str) -> None:
+    bending = {"bending": [TRUE] * 3} if key.endswith("]") else {}
+    parameters = {key: {"start": number, "bounds": [0.5 * number, 2.0 * number]}}
+    content = strip(TIP, material=HINGES | bending, parameters=parameters)
+    with pytest.raises(InputError, match=re.escape(words)) as refused:
+        lyra_petsc.fit(content)
+    assert refused.value.key == f"fit.parameters.{key}"
+
+
+def test_other_numbers_and_other_sheets_of_hinges_are_fitted() -> None:
+    density = {"material.density": {"start": 0.14, "bounds": [0.1, 0.2]}}
+    fitted = lyra_petsc.fit(strip(TIP, material=HINGES, parameters=density))
+    assert not any("hinges" in note for note in fitted.conclusion.notes)
+    nodes = {"edge": {"nodes": [0]}, "tip": {"nodes": [8]}}
+    fitted = lyra_petsc.fit(strip(TIP, material=HINGES, mesh=SQUARE, probes=nodes))
+    assert any("hinges on this mesh" in note for note in fitted.conclusion.notes)
 
 
 @pytest.mark.slow
