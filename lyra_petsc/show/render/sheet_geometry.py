@@ -6,11 +6,11 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.mesh.patches import connected_pieces
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.show.render.opengl import import_pyvista
 from lyra_petsc.terms.handles.motion import Window
 
 
@@ -38,8 +38,11 @@ def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array
 
 
 def sheet_numbers(run: StoredRun) -> Ints:
-    """(F,) number of the sheet, a connected part of the mesh, that each triangle belongs to."""
-    return np.unique(connected_pieces(run.triangles), return_inverse=True)[1]
+    """(F,) number of the sheet, a connected part of the mesh, of each triangle; in the order of the file."""
+    surface = import_pyvista().PolyData.from_regular_faces(run.rest, run.triangles)
+    regions = surface.connectivity("all").cell_data["RegionId"]
+    _, first, sheet = np.unique(regions, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[sheet]
 
 
 def vertex_normals(x: Array, triangles: Ints) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -24,7 +25,7 @@ from lyra_petsc.show.render.draw import draw
 from lyra_petsc.show.render.image_files import film_writer
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
 from lyra_petsc.show.render.scene_drawing import FLOOR_GAP, Bounds, floor_height, near_obstacle_points
-from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
+from lyra_petsc.show.render.sheet_geometry import sheet_numbers, split_at_seams, vertex_normals
 
 SIZE = "160x120"
 FRONT, BACK = "#ff0000", "#0000ff"
@@ -351,6 +352,14 @@ def test_a_single_picture_is_filled_by_its_state(ring, tmp_path, at):
     image = picture(run, tmp_path, at=at, settings=("render.camera.direction=[0,-1,1]",))
     rows, columns = np.nonzero(image[:, :, 0] > 1.5 * image[:, :, 2])
     assert max(np.ptp(rows) / 120, np.ptp(columns) / 160) == pytest.approx(0.86, abs=0.02)
+
+
+def test_sheets_are_numbered_in_the_order_of_the_file():
+    """Five strips of two triangles, of which the second one has two triangles more."""
+    strips = np.arange(20).reshape(5, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    triangles = np.concatenate([strips, [[5, 20, 6], [20, 21, 6]]])
+    run = SimpleNamespace(rest=np.random.default_rng(1).normal(size=(22, 3)), triangles=triangles)
+    np.testing.assert_array_equal(sheet_numbers(run), [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 1, 1])
 
 
 def test_each_sheet_has_its_own_colours(tmp_path):
