@@ -93,7 +93,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
         *_sizes(simulation),
         ("active terms", ", ".join(whole.terms)),
         ("handles", str(len(scene.handles))),
-        *_contact(scene),
+        *_contact(scene, whole.barrier.gap if whole.barrier else 0.0),
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
         (
             "nonzeros",
@@ -140,13 +140,17 @@ def _sandbox(scene: Scene) -> list[tuple[str, str]]:
     return [("gmsh's sandbox", describe_sandbox(supported_layers(), trusted=scene.trusts_meshes))]
 
 
-def _contact(scene: Scene) -> list[tuple[str, str]]:
-    """Rows of the plan about contact and obstacles; none without contact."""
+def _contact(scene: Scene, gap: float) -> list[tuple[str, str]]:
+    """Rows of the plan about contact with a ``gap`` [m], and obstacles; none without contact."""
     contact = scene.contact
     if contact is None:
         return []
-    gap = f"gap {contact.gap:g} m" if contact.gap is not None else "gap by the mesh"
-    parts = [gap, f"thickness {contact.thickness:g} m", f"friction {_friction(contact.friction)}"]
+    by = "" if contact.gap else " by the mesh"
+    parts = [
+        f"gap {gap:.4g} m{by}",
+        f"thickness {contact.thickness:g} m",
+        f"friction {_friction(contact.friction)}",
+    ]
     parts += [] if contact.self else ["with obstacles alone"]
     return [("contact", ", ".join(parts)), *_obstacles(scene, contact)]
 

@@ -470,11 +470,12 @@ def _coincident(mesh: Mesh) -> tuple[Ints, str]:
     distance = "1e-9" if apart <= WELD < 1e-3 * edge else f"{2 * SAME_PLACE * edge:.1g}"
     source = np.repeat(np.arange(len(mesh.sources)), [each.n_vertices for each in mesh.sources])
     remedy = f"mesh: {{weld: {distance}}} joins them"
-    if (source[pairs[:, 0]] != source[pairs[:, 1]]).any():
+    same_source = source[pairs[:, 0]] == source[pairs[:, 1]]
+    if not same_source.all():
         remedy += " within one file; put sheets that belong together into one, or move them apart"
     pieces, n = int(piece_of_triangles(mesh.triangles).max()) + 1, len(pairs)
     verb = "vertex coincides with another one" if n == 1 else "vertices coincide with others"
-    return pairs, (
+    return pairs[same_source], (
         f"the mesh is in {pieces} piece{'s' * (pieces > 1)}; {n} {verb} without being connected "
         f"(first: {pairs[0, 0]} and {pairs[0, 1]}): {remedy}"
     )

@@ -80,9 +80,10 @@ class Mesh:
     obstacles : dict of str to TriangleSurface
         Obstacles of the scene that are meshes, at t = 0; not part of the sheets.
     coincident : (n, 2) int64
-        Vertices that coincide at the start without being connected: each with the lowest one there.
+        Vertices of one source that coincide at the start without being connected: each with the lowest one
+        there.
     unconnected : str
-        Text on these for the user; empty if there are none.
+        Text for the user on these and those of different sources; empty if there are none.
     """
 
     positions: Array

@@ -821,7 +821,8 @@ class Contact(Block):
     ----------
     gap : float [m] or None
         Distance of surfaces below which contact forces act; by default the least of a quarter of the mean
-        edge, half of the shortest edge, and 0.7 times the smallest height of a triangle.
+        edge, half of the short edges, and 0.7 times the small heights of triangles, without the worst
+        twentieth. At vertices of triangles with shorter edges or heights it is less, with a note.
     thickness : float [m]
         Distance of mid-surfaces at which surfaces touch.
     self : bool

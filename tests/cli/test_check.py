@@ -67,6 +67,15 @@ def test_contact_and_obstacles_are_shown(tmp_path: Path) -> None:
     ]
 
 
+def test_pieces_and_the_gap_that_follows_the_mesh(tmp_path: Path) -> None:
+    one = "{grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}"
+    two = f"mesh: [{one}}}, {one}, transform: {{translate: [0, 0, 1]}}}}]"
+    (tmp_path / "two.yaml").write_text(MEMBRANE.replace(f"mesh: {one}}}", two) + "contact: {}\n")
+    plan = done(["check", "two.yaml"], tmp_path).out
+    assert "242 vertices, 400 triangles, 2 pieces" in plan
+    assert "gap 0.02845 m by the mesh, thickness 0 m" in plan
+
+
 def test_obstacles_without_contact_are_refused(tmp_path: Path) -> None:
     """On every rank, with the line to add to the scene."""
     text = MEMBRANE + CONTACT.replace("contact: {gap: 0.01, friction: {static: 0.4, kinetic: 0.3}}", "")

@@ -6,11 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mpi4py import MPI
 from physics import Simulation, grid, obj_file
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 pytestmark = pytest.mark.parallel(2)
@@ -39,19 +41,58 @@ def refusal(comm: MPI.Comm, scene: dict[str, Any]) -> str:
 
 @pytest.mark.parallel(1)
 def test_a_sheet_of_obtuse_triangles_does_not_repel_itself(tmp_path: Path) -> None:
-    """Their heights are 0.16 of the shortest edge; a gap given that is larger is told."""
+    """Their heights are 0.16 of the shortest edge; a gap given that is larger is less there, with a note."""
     vertices = [(i + 0.5 * (j % 2), 0.08 * j, 0.0) for j in range(3) for i in range(4)]
     faces = [corners for a in (0, 1, 2) for corners in ((a, a + 1, a + 4), (a + 1, a + 5, a + 4))]
     faces += [corners for a in (4, 5, 6) for corners in ((a, a + 1, a + 5), (a, a + 5, a + 4))]
     mesh = obj_file(tmp_path / "obtuse.obj", vertices, faces)
-    for contact, gap in (({}, 0.7 * 0.08), ({"gap": 0.1}, 0.1)):
+    for contact, gap in (({}, 0.7 * 0.08), ({"gap": 0.1}, 0.1), ({"gap": 0.05, "thickness": 0.05}, 0.05)):
         with Simulation({"mesh": mesh, "contact": contact}) as simulation:
             term = simulation.problem.terms["contact"]
             assert isinstance(term, ContactBarrier)
             assert term.barrier.gap == pytest.approx(gap)
-            repels = gap > 0.08
-            assert (simulation.energy("contact") > 0.0) == repels
-            assert any("even at rest" in note for note in simulation.problem.whole.notes) == repels
+            assert simulation.energy("contact") == 0.0
+            assert any("but less at" in note for note in simulation.problem.whole.notes) == bool(contact)
+
+
+def with_sliver(path: Path, distance: float = 0.0) -> dict[str, Any]:
+    """A sheet of 6 × 5 cells of 0.1 m, two vertices of which are 1e-4 m apart; above it another sheet."""
+    flat, faces = rectangle(6, 5, 0.6, 0.5)
+    vertices = np.column_stack([flat[:, :2], 0.0 * flat[:, 0]])
+    vertices[17] = vertices[16] + [1e-4, 0.0, 0.0]
+    if distance:
+        above = vertices[[0, 4, 32]] + [0.05, 0.03, distance]
+        vertices, faces = np.concatenate([vertices, above]), np.concatenate([faces, [[42, 43, 44]]])
+    return obj_file(path, vertices, faces)
+
+
+@pytest.mark.parallel(1)
+def test_one_sliver_does_not_decide_the_gap(tmp_path: Path) -> None:
+    mesh = with_sliver(tmp_path / "sliver.obj")
+    for contact, gap in (({}, 0.027), ({"gap": 0.06}, 0.06)):
+        with Simulation({"mesh": mesh, "contact": contact}) as simulation:
+            whole = simulation.problem.whole
+            assert whole.barrier is not None
+            assert whole.barrier.gap == pytest.approx(gap, rel=0.1)
+            assert simulation.energy("contact") == 0.0
+            (note,) = (note for note in whole.notes if "but less at" in note)
+            assert "m at vertex 16" in note
+    with pytest.raises(
+        InputError, match=r"gap \+ thickness = 0\.11 m is not below the shorter edges, 0\.1 m"
+    ):
+        Simulation({"mesh": mesh, "contact": {"gap": 0.11}})
+
+
+def test_contact_beside_a_sliver_on_two_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    mesh = with_sliver(shared_tmp / "sliver.obj", 0.01) if comm.rank == 0 else None
+    scene = {"mesh": comm.bcast(mesh), "contact": {}, "gravity": [0, 0, 0]}
+    results = []
+    for each in (comm, MPI.COMM_SELF):
+        with Simulation(scene, each) as simulation:
+            results.append((simulation.energy("contact"), simulation.run(1e-3, 2)))
+    assert results[1][0] > 0.0
+    assert results[0][0] == pytest.approx(results[1][0], rel=1e-12)
+    np.testing.assert_allclose(results[0][1], results[1][1], rtol=0.0, atol=1e-10)
 
 
 OVERLAPS: dict[str, tuple[dict[str, Any], str]] = {

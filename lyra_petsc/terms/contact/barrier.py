@@ -89,6 +89,9 @@ the triangles."""
 MIN_AREA_FACTOR, MAX_AREA_FACTOR = 1e-3, 1e3
 """Bounds of the area factors."""
 
+MAX_NARROWING = 1e6
+"""Bound of the factor by which the gap is smaller at small triangles."""
+
 
 class Barrier(NamedTuple):
     """Constants of the barrier, the same on all ranks.
@@ -165,14 +168,14 @@ class ContactBarrier(Elastic):
         Triangles of this rank, in local rows.
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
-    marks : (F, 5 + walls)
+    marks : (F, 8 + walls)
         Code of the triangles' surroundings (`surface_shares.rings`), and of their corners the `area_factors`,
-        a code of their symmetry planes (`_plane_codes`), and for each of `Barrier.walls` bits i: whether it
-        acts on corner i.
+        the `narrowing`, a code of their symmetry planes (`_plane_codes`), and for each of `Barrier.walls`
+        bits i: whether it acts on corner i.
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
-        empty = {"what": np.empty((0, 8)), "number": np.empty((0, 4))}
+        empty = {"what": np.empty((0, 9)), "number": np.empty((0, 4))}
         self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
@@ -183,6 +186,7 @@ class ContactBarrier(Elastic):
         self._capacity = 0
         self._searched: Ints | None = None  # triangles that the search has
         self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
+        self._narrowing = np.empty(0, dtype=np.int64)  # in the same units, by vertex
         self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
         self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
         self._remembered = Remembered(self._find_active)
@@ -207,18 +211,20 @@ class ContactBarrier(Elastic):
 
     def set_elements(self, elements: Elements) -> None:
         super().set_elements(elements)
-        what = elements.data["what"].reshape(-1, 8).astype(np.int64)
+        what = elements.data["what"].reshape(-1, 9).astype(np.int64)
         self.number = elements.data["number"].astype(np.int64)
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
-        self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+        narrowing = what[:, 8] / AREA_UNITS
+        self.offset = self.barrier.thickness / narrowing + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
         self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
         self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
         # distance from the image in a wall over that from the wall: k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
-        self._image_scale = np.where(self.obstacle >= self.obstacles.first_wall, 2.0, 1.0)
-        self.gap /= self._image_scale
-        self.pair_stiffness *= self._image_scale**2
+        image_scale = np.where(self.obstacle >= self.obstacles.first_wall, 2.0, 1.0)
+        self._scale = image_scale * narrowing
+        self.gap /= self._scale
+        self.pair_stiffness *= image_scale**2 * narrowing
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
         largest = np.append(np.abs(self._obstacle_search.x).max(axis=(0, 2)), 0.0)
@@ -272,10 +278,12 @@ class ContactBarrier(Elastic):
             self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
             self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
             self._vertex_units[triangles[:, :3]] = triangles[:, 4:7]
+            self._narrowing = np.full(len(x), AREA_UNITS)
+            self._narrowing[triangles[:, :3]] = triangles[:, 7:10]
             self._on_planes = np.zeros((len(x), 3), dtype=np.bool_)
-            codes = triangles[:, 7, None] >> np.arange(9)
+            codes = triangles[:, 10, None] >> np.arange(9)
             self._on_planes[triangles[:, :3]] = (codes & 1).astype(np.bool_).reshape(-1, 3, 3)
-            codes = triangles[:, None, 8:] >> np.arange(3)[:, None]
+            codes = triangles[:, None, 11:] >> np.arange(3)[:, None]
             self._walled = np.zeros((len(x), codes.shape[2]), dtype=np.bool_)
             self._walled[triangles[:, :3]] = (codes & 1).astype(np.bool_)
             self._searched = triangles
@@ -306,7 +314,8 @@ class ContactBarrier(Elastic):
         if self._on_planes.any():
             edges = np.flatnonzero(kind == EDGE_EDGE)
             units[edges] >>= self._symmetry_planes(x, points[edges])
-        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units])
+        narrowing = np.where(obstacle < 0, self._narrowing[np.maximum(points, 0)].max(axis=1), AREA_UNITS)
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units, narrowing])
         return np.where(sheet, points, first[:, None]), what
 
     def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
@@ -474,7 +483,7 @@ class ContactBarrier(Elastic):
         return out - self.offset
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
-        return (self._image_scale * self.distances(x, frozen.stage))[: self.n_owned]
+        return (self._scale * self.distances(x, frozen.stage))[: self.n_owned]
 
     def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
         """The collision-free fractions (n,) of the first n pairs in a motion of `ObstaclePositions`."""
@@ -616,7 +625,7 @@ class ContactBarrier(Elastic):
 
     def history(self, x: Array, frozen: ObstaclePositions) -> Mapping[str, float]:
         active, n = self.active_pairs(x, frozen.stage), self.n_owned
-        scale = self._image_scale[:n]
+        scale = self._scale[:n]
         bound = scale * active.lower_bound[:n]
         exact = bound < scale * self.gap[:n]
         smallest = bound[exact].min(initial=np.inf)
@@ -638,7 +647,8 @@ def elements(rest: RestShape) -> Elements:
         acts = np.zeros(rest.mesh.n_vertices, dtype=np.int64)
         acts[wall.vertices] = 1
         walled.append(acts[triangles] @ (1 << np.arange(3)))
-    marks = np.column_stack([rings, areas, _plane_codes(rest), *walled])
+    narrow = np.rint(AREA_UNITS * _gap_and_narrowing(rest)[1]).astype(np.int64)[triangles]
+    marks = np.column_stack([rings, areas, narrow, _plane_codes(rest), *walled])
     uv = rest.mesh.triangle_uv.reshape(-1, 6)
     return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
 
@@ -678,26 +688,24 @@ def barrier(rest: RestShape) -> Barrier:
     Raises
     ------
     InputError
-        If the gap is so large that neighbours in the mesh would repel each other.
+        If the gap is so large that neighbours in most of the mesh would repel each other.
     """
     scene = rest.scene
     assert scene.contact is not None
     length, thickness = edge_lengths(rest.mesh), scene.contact.thickness
-    shortest = float(length.min())
-    height = _least_height(rest, length) if scene.contact.self else np.inf
-    gap = scene.contact.gap or min(0.25 * float(length.mean()), 0.5 * shortest, 0.7 * height)
+    (gap, narrowing), shortest = _gap_and_narrowing(rest), _low(length.min(axis=1))
     if gap + thickness >= shortest:
         raise InputError(
-            f"gap + thickness = {gap + thickness:.3g} m is not below the shortest edge, {shortest:.3g} m: "
-            "neighbours in the mesh would touch; give smaller ones, or a mesh without such short edges",
+            f"gap + thickness = {gap + thickness:.3g} m is not below the shorter edges, {shortest:.3g} m: "
+            "neighbours in the mesh would touch; give smaller ones, or a coarser mesh",
             file=scene.source,
             key="contact",
         )
-    if gap + thickness >= height:
+    if (narrowing > 1.0).any():
         rest.notes.append(
-            f"contact: gap + thickness = {gap + thickness:.3g} m is not below the smallest height of a "
-            f"triangle, {height:.3g} m: vertices repel the triangle behind their opposite edge even at rest; "
-            "give smaller ones, or a mesh with rounder triangles"
+            f"contact: gap {gap:.3g} m, but less at {np.count_nonzero(narrowing > 1.0)} vertices of "
+            f"triangles with short sides or heights, down to {gap / narrowing.max():.3g} m at vertex "
+            f"{narrowing.argmax()}"
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
     stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
@@ -706,9 +714,36 @@ def barrier(rest: RestShape) -> Barrier:
     return Barrier(gap, thickness, stiffness, PARALLEL, flat, walls)
 
 
-def _least_height(rest: RestShape, length: Array) -> float:
-    """Least distance [m] of a vertex from the triangles behind the opposite side of one of its own, in the
-    flat rest shape; infinite if there are none. ``length`` (F, 3) [m] are the sides.
+def _gap_and_narrowing(rest: RestShape) -> tuple[float, Array]:
+    """The gap [m] of a scene with contact, and for each vertex (V,) the factor >= 1 by which gap and
+    thickness are less.
+
+    Vertices of triangles that are smaller than gap and thickness would else repel their neighbours in the
+    mesh at rest.
+    """
+    contact, factor = rest.scene.contact, np.ones(rest.mesh.n_vertices)
+    assert contact is not None
+    length = edge_lengths(rest.mesh)
+    side = length.min(axis=1)
+    height = _least_heights(rest, length) if contact.self else np.full(len(side), np.inf)
+    gap = contact.gap or min(0.25 * float(length.mean()), 0.5 * _low(side), 0.7 * _low(height))
+    if contact.self:
+        reach = gap + contact.thickness
+        small = np.flatnonzero(np.minimum(side, height) <= reach)
+        needed = np.minimum(reach / np.minimum(0.5 * side, 0.7 * height)[small], MAX_NARROWING)
+        np.maximum.at(factor, rest.mesh.triangles[small], needed[:, None])
+    return gap, factor
+
+
+def _low(values: Array) -> float:
+    """A low percentile of the values (F,) of triangles, which few bad ones do not decide."""
+    order = max(len(values) // 20, min(2, len(values) // 4))
+    return float(np.partition(values, order)[order])
+
+
+def _least_heights(rest: RestShape, length: Array) -> Array:
+    """Least distance (F,) [m] of a corner of each triangle from those behind its opposite side, in the flat
+    rest shape; infinite if there are none. ``length`` (F, 3) [m] are the sides.
     """
     table = edge_table(rest.mesh.triangles.astype(np.int64))
     at_side = np.empty(length.size, dtype=np.int64)
@@ -716,7 +751,7 @@ def _least_height(rest: RestShape, length: Array) -> float:
     square, height = length**2, 2.0 * rest.area[:, None] / length
     others = np.abs(np.roll(square, 1, axis=1) - np.roll(square, -1, axis=1))
     inner = (at_side.reshape(-1, 3) > 1) & (others <= square)  # the foot of the height is on the side
-    return float(height[inner].min(initial=np.inf))
+    return np.where(inner, height, np.inf).min(axis=1)
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
