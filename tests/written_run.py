@@ -23,6 +23,60 @@ REST = np.array(
 TRIANGLES = np.array([[0, 2, 6], [0, 6, 4], [2, 1, 5], [2, 5, 6], [1, 3, 7], [1, 7, 5], [3, 0, 4], [3, 4, 7]])
 
 
+# entries of a checkpoint, as of a run by backward Euler
+ENTRIES = {
+    "time": 0.1 + 0.2,
+    "step": 7,
+    "last_state": 6,
+    "scheme": "beuler",
+    "budget": {
+        "kinetic": 1e-3,
+        "membrane": 0.0,
+        "bending": 0.0,
+        "potential": -2e-3,
+        "external_work": -0.0,
+        "dissipation": 0.0,
+        "more": {"contact_energy": 1e-9},
+    },
+    "totals": {"newton_iterations": 12, "linear_iterations": 24, "rejected": 1},
+    "stability": {},
+    "repeated": {"ü": 2},
+    "least": 1e-3,
+    "notes": ["ü"],
+    "told": [],
+    "factor": 1.0,
+    "good": 0,
+    "patience": 2,
+    "nominal": 0.05,
+    "estimated_error": 0.0,
+    "integrator": {},
+    "preset": "mumps",
+    "convex": True,
+    "tolerance": 0.01,
+    "usual": 1.5,
+    "blend": 0.0,
+    "too_little": 0.0,
+    "enough": 0.0,
+    "shift": 0.01,
+    "energy": {
+        "start": 0.0,
+        "scale": 1e-3,
+        "total": -1e-9,
+        "lost": 1e-9,
+        "won": 0.0,
+        "work": 0.0,
+        "heat": 0.0,
+        "inertia": 1e-5,
+        "bracket": 1e-5,
+        "recent": [1e-10, -1e-9],
+        "repeated": 0,
+        "noise": 1e-15,
+    },
+    "late_starts": [],
+    "obstacles": {"floor": (0, 0)},
+}
+
+
 def ring(vt: str = "each vertex") -> Mesh:
     """The ring with ``vt``:
 

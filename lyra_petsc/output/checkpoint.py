@@ -6,17 +6,18 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.checkpoint_entries import LARGEST, OPTIONAL_ARRAYS, check_entries
 from lyra_petsc.output.file_operations import writing
 from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
@@ -24,10 +25,7 @@ from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_
 from lyra_petsc.output.stored import check_sums, open_stored, text_attribute
 from lyra_petsc.parallel import on_root
 
-FORMAT = 2
-
-FIRST_FORMAT = 1
-"""Format of older versions, in which only the arrays have check sums."""
+FORMAT = 3
 
 Scalars = dict[str, Any]
 
@@ -38,8 +36,8 @@ class Checkpoint:
 
     Attributes
     ----------
-    arrays : dict of str to (n_owned, ...) array
-        Vertex arrays by name, in this rank's numbering.
+    arrays : dict of str to array
+        Vertex arrays (n_owned, 3) by name, in this rank's numbering.
     scalars : dict
         As given to `checkpoint_file`.
     file : Path
@@ -77,7 +75,7 @@ def checkpoint_file(
         The run's folder.
     order : FileOrder
         File order of the vertices that each rank owns; collective over its ranks.
-    arrays : mapping of str to (n_owned, ...) array of float64 or int64
+    arrays : mapping of str to (n_owned, 3) array of float64
         Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
     edge_order : FileOrder or None
         File order of the edges with an unknown that each rank owns; None without such edges.
@@ -86,8 +84,7 @@ def checkpoint_file(
     elements : mapping of str to (n, m) array of float64
         Rows of this rank's changing elements, in any order.
     scalars : mapping
-        Values that JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
-        works, …; the same on every rank.
+        The entries of `CheckpointEntries`; the same on every rank.
     """
     folder = Path(folder)
     slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
@@ -96,13 +93,13 @@ def checkpoint_file(
     slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
     sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
     text = json.dumps(dict(scalars))
-    facts = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
+    facts = {name: Stored(slab.dtype.str, slab.shape, sums[name]) for name, slab in slabs.items()}
     attributes: dict[str, dict[str, int | float | str]] = {
         "/": {
             "format": FORMAT,
             "n_vertices": order.n_global,
             "scalars": text,
-            "digest": _digest(FORMAT, order.n_global, text, facts),
+            "digest": _digest(order.n_global, text, facts),
         },
         **{name: {"sum": str(value)} for name, value in sums.items()},
     }
@@ -116,8 +113,41 @@ def _rotate(folder: Path) -> None:
         os.replace(folder / NEXT, folder / CHECKPOINT)
 
 
+class Stored(NamedTuple):
+    """Type, shape and check sum of an array of the file."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    total: int
+
+
+class TermArrays(NamedTuple):
+    """The arrays of a scene's terms.
+
+    Attributes
+    ----------
+    vertices : set of str
+        Names of those on vertices; a term that the checkpoint does not know has none there.
+    edges : set of str
+        Names of those on edges.
+    elements : mapping of str to (int, int)
+        For each term with changing elements the number of vertices of an element, with whose numbers its row
+        begins, and the length of the row.
+    """
+
+    vertices: Set[str] = frozenset()
+    edges: Set[str] = frozenset()
+    elements: Mapping[str, tuple[int, int]] = MappingProxyType({})
+
+
+NO_TERMS = TermArrays()
+
+
 def read_checkpoint(
-    folder: str | os.PathLike[str], order: FileOrder, edge_order: FileOrder | None = None
+    folder: str | os.PathLike[str],
+    order: FileOrder,
+    edge_order: FileOrder | None = None,
+    terms: TermArrays = NO_TERMS,
 ) -> Checkpoint:
     """The newest undamaged checkpoint of a run, which any number of ranks may have written.
 
@@ -127,33 +157,38 @@ def read_checkpoint(
         The run's folder.
     order : FileOrder
         File order of the vertices that each rank owns now; collective over its ranks.
+    edge_order : FileOrder or None
+        File order of the edges with an unknown; None without such edges.
+    terms : TermArrays
+        Arrays of the scene's terms; elements of other terms are not read.
 
     Raises
     ------
     InputError
-        On every rank, if there is no checkpoint, all are damaged, or the mesh is a different one.
+        On every rank, if there is no checkpoint, none holds what a run writes, or the mesh is another one.
     """
     newest: InputError | None = None
     for file in on_root(order.comm, lambda: checkpoint_files(folder)):
         try:
-            scalars, sums, counts = on_root(order.comm, lambda f=file: _read_metadata(f, order))  # type: ignore[misc]
-            arrays, edges = (
-                {
-                    name.split("/", 1)[1]: _read_rows(file, name, sums[name], by)
-                    for name in sorted(sums)
-                    if name.startswith(kind) and by is not None
-                }
-                for kind, by in (("vertices/", order), ("edges/", edge_order))
+            scalars, stored = on_root(
+                order.comm,
+                lambda f=file: _read_metadata(f, order, edge_order, terms),  # type: ignore[misc]
             )
-            elements = {
-                name.split("/", 1)[1]: _read_rows(file, name, sums[name], _equal_slabs(order.comm, count))
-                for name, count in sorted(counts.items())
-            }
+            arrays: dict[str, dict[str, NDArray[Any]]] = {"vertices": {}, "edges": {}, "elements": {}}
+            for path, (_, shape, total) in stored.items():
+                kind, name = path.split("/", 1)
+                by = {"vertices": order, "edges": edge_order}.get(kind) or _equal_slabs(order.comm, shape[0])
+                slab = read_slab(file, path, by)
+                n_numbers = terms.elements[name][0] if kind == "elements" else 0
+                problem = _problem_of(slab, total, order, n_numbers)
+                if problem:
+                    raise InputError(f"checkpoint is damaged: {path} {problem}", file=file)
+                arrays[kind][name] = by.from_slab(slab)
         except InputError as error:
             newest = newest or error
             continue
         note = f"{newest}; going on from the one before" if newest else None
-        return Checkpoint(arrays, scalars, file, note, edges, elements)
+        return Checkpoint(arrays["vertices"], scalars, file, note, arrays["edges"], arrays["elements"])
     if newest is None:
         raise InputError("holds no checkpoint to resume from; run without --resume", file=folder)
     raise InputError(
@@ -162,33 +197,84 @@ def read_checkpoint(
     )
 
 
-def _read_metadata(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int], dict[str, int]]:
+def _read_metadata(
+    file: Path, order: FileOrder, edge_order: FileOrder | None, terms: TermArrays
+) -> tuple[Scalars, dict[str, Stored]]:
+    """The checked entries, and the arrays that the scene needs by their paths (rank 0)."""
     with open_stored(file) as content:
         version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
-        if version not in (FIRST_FORMAT, FORMAT):
-            raise InputError(
-                f"checkpoint has format {version}, this version reads {FIRST_FORMAT} and {FORMAT}", file=file
-            )
-        text = text_attribute(content, "scalars")
-        scalars = json.loads(text)
-        found = {
-            f"{kind}/{name}": (data.dtype.str, data.shape[1:], int(text_attribute(data, "sum")))
+        if version != FORMAT:
+            raise InputError(f"checkpoint has format {version}, this version reads {FORMAT}", file=file)
+        text, digest = text_attribute(content, "scalars"), text_attribute(content, "digest")
+        stored = {
+            f"{kind}/{name}": Stored(data.dtype.str, data.shape, int(text_attribute(data, "sum")))
             for kind in ("vertices", "edges", "elements")
             for name, data in content.get(kind, {}).items()
         }
-        counts = {f"elements/{name}": len(data) for name, data in content.get("elements", {}).items()}
-        stored_digest = text_attribute(content, "digest") if version != FIRST_FORMAT else None
-    if stored_digest is not None and stored_digest != _digest(version, n_vertices, text, found):
+    if digest != _digest(n_vertices, text, stored):
         raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
-    if not _is_plausible(scalars) or any(np.dtype(kind).itemsize != 8 for kind, _, _ in found.values()):
-        raise InputError("checkpoint is damaged: it holds what no run writes", file=file)
     if n_vertices != order.n_global:
         raise InputError(
             f"checkpoint has {n_vertices} vertices, the scene's mesh {order.n_global}: "
             "resume with the scene it was written by",
             file=file,
         )
-    return scalars, {name: total for name, (_, _, total) in found.items()}, counts
+    try:
+        scalars, names = check_entries(text)
+        n_edges = 0 if edge_order is None else edge_order.n_global
+        needed = _needed_arrays(stored, names, n_vertices, n_edges, terms)
+        if 8 * max(math.prod(array.shape) for array in needed.values()) > file.stat().st_size:
+            raise ValueError("an array is longer than the file")
+    except ValueError as error:
+        raise InputError(f"checkpoint is damaged: it holds what no run writes ({error})", file=file) from None
+    return scalars, needed
+
+
+def _needed_arrays(
+    stored: Mapping[str, Stored], names: Set[str], n_vertices: int, n_edges: int, terms: TermArrays
+) -> dict[str, Stored]:
+    """The arrays that the scene needs; ``names`` are those that belong to the entries.
+
+    Raises
+    ------
+    ValueError
+        In one line, if an array is missing or has another type or shape than it must, or is unknown.
+    """
+    of_vertices = {path.split("/", 1)[1] for path in stored if path.startswith("vertices/")}
+    own = {name for name in of_vertices if "." not in name}  # arrays of terms have a dot
+    if own - OPTIONAL_ARRAYS != names:
+        raise ValueError(
+            f"{', '.join(sorted((own - OPTIONAL_ARRAYS) ^ names))}: without its array or its entry"
+        )
+    known = {name.split(".")[0] for name in of_vertices}
+    of_vertices |= {name for name in terms.vertices if name.split(".")[0] in known}
+    shapes: dict[str, tuple[int, ...]] = {f"vertices/{name}": (n_vertices, 3) for name in of_vertices}
+    if n_edges:
+        shapes |= {f"edges/{name}": (n_edges,) for name in own | terms.edges}
+    for name, (_, columns) in terms.elements.items():
+        if f"elements/{name}" in stored:
+            shapes[f"elements/{name}"] = (*stored[f"elements/{name}"].shape[:1], columns)
+    for path, shape in shapes.items():
+        if path not in stored:
+            raise ValueError(f"{path} is missing")
+        if stored[path][:2] != ("<f8", shape):
+            raise ValueError(
+                f"{path} is {stored[path].dtype} of shape {stored[path].shape}, not <f8 of {shape}"
+            )
+    return {path: stored[path] for path in sorted(shapes)}
+
+
+def _problem_of(slab: NDArray[Any], total: int, order: FileOrder, n_numbers: int) -> str:
+    """What is wrong with an array of which this rank has a slab; empty if nothing is; collective.
+
+    The first ``n_numbers`` columns are numbers of vertices.
+    """
+    if int(check_sums([slab], order.comm)[0]) != total:
+        return "differs from its check sum"
+    numbers = slab[:, :n_numbers] if n_numbers else slab[:0]
+    plausible = (np.abs(slab) <= LARGEST).all()  # not so for NaN
+    plausible &= ((numbers >= 0) & (numbers < order.n_global) & (numbers == np.floor(numbers))).all()
+    return "" if order.comm.allreduce(bool(plausible), MPI.LAND) else "holds numbers that no run writes"
 
 
 def _equal_slabs(comm: MPI.Comm, count: int) -> FileOrder:
@@ -197,29 +283,12 @@ def _equal_slabs(comm: MPI.Comm, count: int) -> FileOrder:
     return FileOrder(comm, np.arange(starts[comm.rank], starts[comm.rank + 1]), count)
 
 
-def _is_plausible(scalars: Any) -> bool:
-    """Whether a run can have written these scalars; in the first format they have no check sum."""
-    if not isinstance(scalars, dict):
-        return False
-    step, time = scalars.get("step"), scalars.get("time")
-    return isinstance(step, int) and step >= 0 and isinstance(time, float | int) and 0.0 <= time < math.inf
+def _digest(n_vertices: int, entries: str, arrays: Mapping[str, Stored]) -> str:
+    """SHA-256 of a checkpoint's content: the entries, and type, shape and check sum of each array.
 
-
-def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tuple[Any, ...]]) -> str:
-    """SHA-256 of a checkpoint's content: the scalars' text, and type, shape and check sum of each array."""
-    content = [
-        version,
-        n_vertices,
-        scalars,
-        sorted((name, *map(str, facts)) for name, facts in arrays.items()),
-    ]
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
-
-
-def _read_rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
-    slab = read_slab(file, name, order)
-    if int(check_sums([slab], order.comm)[0]) != expected:
-        raise InputError(
-            f"checkpoint is damaged: the check sum of {name.split('/', 1)[1]} does not fit", file=file
-        )
-    return order.from_slab(slab)
+    A rank does not know the number of all elements.
+    """
+    facts = sorted(
+        (name, dtype, str(shape[1:]), str(total)) for name, (dtype, shape, total) in arrays.items()
+    )
+    return hashlib.sha256(json.dumps([FORMAT, n_vertices, entries, facts]).encode()).hexdigest()

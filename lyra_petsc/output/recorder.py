@@ -14,9 +14,9 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
+from lyra_petsc.output.checkpoint import Checkpoint, TermArrays, checkpoint_file, read_checkpoint
 from lyra_petsc.output.fields import Field, chosen_fields
-from lyra_petsc.output.file_operations import reason, replace_text
+from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.hdf5 import Background, NewFile, read_slab, write_collective
 from lyra_petsc.output.history import (
     HISTORY_COLUMNS,
@@ -118,16 +118,9 @@ class Recorder:
         simulation = self._simulation
         problem, scene = simulation.problem, simulation.scene
         check_same_mesh(folder, problem.mesh, _used_groups(scene), self._comm)
-        checkpoint = read_checkpoint(folder, self._vertices, self._edges)
+        checkpoint = read_checkpoint(folder, self._vertices, self._edges, self._term_arrays())
         on_root(self._comm, lambda: self._check_continuable(folder, checkpoint))
-        try:
-            self._restore(checkpoint)
-        except (LookupError, TypeError, ValueError) as error:
-            raise InputError(
-                f"checkpoint is damaged, or was written by another version ({reason(error)}): "
-                "run without --resume",
-                file=checkpoint.file,
-            ) from error
+        self._restore(checkpoint)
         on_root(self._comm, lambda: self._refuse_crossings(checkpoint))
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
@@ -139,7 +132,7 @@ class Recorder:
         if (kept := history.kept_until) != last:
             simulation.notes.append(f"{history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
-        self._last_state = int(checkpoint.scalars["last_state"])
+        self._last_state = checkpoint.scalars["last_state"]
 
     def _first_positions(self, folder: Path, *, otherwise: Array) -> Array:
         """Positions [m] of this rank's vertices in state 0, or ``otherwise`` if state 0 cannot be read."""
@@ -170,10 +163,16 @@ class Recorder:
         elements = {
             name: self._changing_elements(terms[name].registration.element_vertices, rows)
             for name, rows in checkpoint.elements.items()
-            if name in terms
         }
         simulation.resume(arrays, scalars, checkpoint.edges, elements)
-        int(scalars["last_state"])  # a bad entry must raise here, where `resume` catches it
+
+    def _term_arrays(self) -> TermArrays:
+        """The arrays of the scene's terms in checkpoints."""
+        system, terms = self._simulation.problem.system, self._simulation.problem.terms
+        widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(system).items()}
+        elements = {name: (terms[name].registration.element_vertices, n) for name, n in widths.items()}
+        vertices, edges = term_states.vertex_arrays(system), term_states.edge_arrays(system)
+        return TermArrays(vertices.keys(), edges.keys(), elements)
 
     def _changing_elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
         """Changing elements from a checkpoint's rows (E, n + m).
@@ -187,16 +186,13 @@ class Recorder:
         """
         layout = self._simulation.problem.points
         numbers = rows[:, :n].astype(np.int64)
-        known = bool(((numbers >= 0) & (numbers < layout.n_vertices_global)).all())
-        if not self._comm.allreduce(known, MPI.LAND):
-            raise ValueError("elements are of vertices that there are not")
         own = layout.start + np.arange(layout.n_vertices)
         return self._vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
 
     def _check_continuable(self, folder: Path, checkpoint: Checkpoint) -> None:
         """Check that the scene can continue from the checkpoint (rank 0)."""
         now = self._simulation.scene.time.scheme
-        before = checkpoint.scalars.get("scheme", now)
+        before = checkpoint.scalars["scheme"]
         if "static" in (now, before) and now != before:
             raise InputError(
                 "a motion does not go on as a static analysis, nor the other way round: run without --resume",

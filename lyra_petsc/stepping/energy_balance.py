@@ -213,11 +213,9 @@ class EnergyBalance:
 
     def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
         """Restore works from a checkpoint; energies are measured at the present state."""
-        for name, value in budget.items():
-            if name != "more":
-                setattr(self.budget, name, float(value))
-        if self._pull is not None:  # older checkpoints have no entry
-            self._pull, self._targets = arrays.get("pull", self._pull), self._moving_targets()
+        self.budget = Budget(**{**budget, "more": {}})
+        if self._pull is not None:
+            self._pull, self._targets = arrays["pull"], self._moving_targets()
         self.measure()
 
     @property

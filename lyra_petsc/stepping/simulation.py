@@ -693,7 +693,7 @@ class SteppedScene:
         system = self.problem.system
         system.state.update_ghosts()
         term_states.restore_fixed(system, edges, elements)
-        self.time, self.step_number = float(scalars["time"]), int(scalars["step"])
+        self.time, self.step_number = scalars["time"], scalars["step"]
         # loads and handles that only the changed scene starts earlier start now; the others have started
         system.set_references(self.time)
         system.hold_targets(self.time)
@@ -701,22 +701,21 @@ class SteppedScene:
         self.energy_balance.restore(arrays, scalars["budget"])
         self.control.restore(scalars)
         if self._equilibrium is not None:
-            self._equilibrium.restore(arrays, scalars.get("equilibrium", {}), self.time)
-        self.estimated_error = float(scalars["estimated_error"])
+            self._equilibrium.restore(arrays, scalars["equilibrium"], self.time)
+        self.estimated_error = scalars["estimated_error"]
         system.integrator.restore(arrays, scalars["integrator"])
-        if self.guard is not None and scalars.get("energy"):  # older checkpoints have none
-            same = scalars.get("scheme") == self.scene.time.scheme
-            self.guard.restore(scalars["energy"], same=same)
+        if self.guard is not None:
+            self.guard.restore(scalars["energy"], same=scalars["scheme"] == self.scene.time.scheme)
         if self.local_error is not None:
             self.local_error.restore(arrays, scalars["integrator"])
-        term_states.restore_changing(system, arrays, elements, scalars.get("obstacles", {}))
+        term_states.restore_changing(system, arrays, elements, scalars["obstacles"])
         self.stepper.restore(arrays, scalars, self.time, self.step_number)
-        self.totals |= {name: int(number) for name, number in scalars.get("totals", {}).items()}
-        self.stability = self.stability and scalars.get("stability", self.stability)
-        self._repeats = {str(why): int(count) for why, count in scalars.get("repeated", {}).items()}
-        self._smallest_dt = math.inf if scalars.get("least") is None else float(scalars["least"])
-        self._reported |= set(scalars.get("told", ()))
-        earlier = [str(note) for note in scalars.get("notes", ())]
+        self.totals |= scalars["totals"]
+        self.stability = self.stability and scalars["stability"]
+        self._repeats = dict(scalars["repeated"])
+        self._smallest_dt = math.inf if scalars["least"] is None else scalars["least"]
+        self._reported |= set(scalars["told"])
+        earlier = scalars["notes"]
         self.earlier_notes = len(earlier)
         self.notes[:] = [*earlier, *(note for note in self.notes if note not in earlier)]
 

@@ -144,9 +144,9 @@ class StepControl:
 
     def restore(self, saved: Mapping[str, float]) -> None:
         """Restore a `saved_state`, unless its nominal step is another."""
-        if float(saved.get("nominal", self.step)) == self.step:
-            self.factor, self.successes = float(saved["factor"]), int(saved["good"])
-            self.patience = int(saved.get("patience", GROW_AFTER))
+        if saved["nominal"] == self.step:
+            self.factor = max(saved["factor"], self.smallest / self.step)
+            self.successes, self.patience = int(saved["good"]), int(saved["patience"])
 
 
 class ToleranceControl(StepControl):
@@ -208,9 +208,8 @@ class ToleranceControl(StepControl):
     def restore(self, saved: Mapping[str, float]) -> None:
         """Restore a `saved_state`; if its largest step is another, only the length of the next step."""
         super().restore(saved)
-        nominal = float(saved.get("nominal", self.step))
-        if nominal != self.step:
-            planned = float(saved["factor"]) * nominal
+        if saved["nominal"] != self.step:
+            planned = saved["factor"] * saved["nominal"]
             self.factor = min(max(planned, self.smallest) / self.step, 1.0)
 
 

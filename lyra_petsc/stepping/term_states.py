@@ -79,13 +79,12 @@ def restore_changing(
 ) -> None:
     """Restore the state of vertices, and of elements with changing stencils (pairs that are near).
 
-    ``places`` are the `obstacle_places` of the checkpoint; those of older versions have none.
+    ``places`` are the `obstacle_places` of the checkpoint.
     """
     layout = system.points
     for term in system.active.elastic:
-        if term.registration.state:
-            known = {name: arrays.get(f"{term.name}.{name}") for name in term.registration.state}
-            term.restore({name: array for name, array in known.items() if array is not None})
+        if all(f"{term.name}.{name}" in arrays for name in term.registration.state):
+            term.restore({name: arrays[f"{term.name}.{name}"] for name in term.registration.state})
         if term.name in elements and term.registration.neighbours:
             own = range(layout.start, layout.start + layout.n_owned)
             term.restore_elements(*_send_to_owners(system, *elements[term.name]), own, places)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from written_run import REST, TRIANGLES, position, written
+from written_run import ENTRIES, REST, TRIANGLES, position, written
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.checkpoint import CHECKPOINT, PREVIOUS, checkpoint_file, read_checkpoint
@@ -21,7 +21,6 @@ pytestmark = pytest.mark.quick
 ORDER = FileOrder(MPI.COMM_SELF, np.arange(len(REST)), len(REST))
 FILES = ["mesh.h5", "states", "states.xdmf", "history.csv", "summary.json", "scene.yaml"]
 SUMMARY = {"outcome": "done", "ranks": 2, "terms": ["membrane"], "wall_seconds": {"solve": 1.5}, "notes": []}
-SCALARS = {"step": 7, "time": 0.5, "works": {"wind": -1.5}}
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def whole(tmp_path_factory):
     (folder / "summary.json").write_text(json.dumps(SUMMARY), encoding="utf-8")
     for step in (6, 7):
         arrays = {"position": position(step), "velocity": -position(step)}
-        write_collective([checkpoint_file(folder, ORDER, arrays, SCALARS | {"step": step})], MPI.COMM_SELF)
+        write_collective([checkpoint_file(folder, ORDER, arrays, ENTRIES | {"step": step})], MPI.COMM_SELF)
     return folder
 
 
@@ -119,7 +118,7 @@ def test_a_checkpoint_with_a_flipped_bit_is_replaced_by_the_previous_one(run):
         found = read_checkpoint(run, ORDER)
         step = found.scalars["step"]
         assert (step == 7) == (found.note is None)
-        assert found.scalars == SCALARS | {"step": step}
+        assert found.scalars == ENTRIES | {"step": step}
         np.testing.assert_array_equal(found.arrays["position"], position(step))
         np.testing.assert_array_equal(found.arrays["velocity"], -position(step))
 
@@ -138,18 +137,6 @@ def test_changed_scalars_of_a_checkpoint_are_detected(run, scalars):
     assert found.scalars["step"] == 6
     assert found.file.name == PREVIOUS
     assert "damaged" in found.note
-
-
-def test_a_checkpoint_of_an_older_version(run):
-    """Without a check sum of its scalars; impossible values are refused nevertheless."""
-    for name in (CHECKPOINT, PREVIOUS):
-        with import_h5py().File(run / name, "a") as file:
-            del file.attrs["digest"]
-            file.attrs["format"] = 1
-    assert read_checkpoint(run, ORDER).scalars == SCALARS
-    with import_h5py().File(run / CHECKPOINT, "a") as file:
-        file.attrs["scalars"] = json.dumps(SCALARS | {"time": -1.0})
-    assert read_checkpoint(run, ORDER).scalars["step"] == 6
 
 
 def change_mesh(name, values):

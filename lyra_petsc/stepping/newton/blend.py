@@ -82,12 +82,11 @@ class Blend:
         return {"blend": self.value, "too_little": self._too_little, "enough": self._enough}
 
     def restore(self, saved: Mapping[str, float]) -> None:
-        """Restore a `saved_state`; older ones have the weight only."""
-        if not self._adaptive:
-            return
-        self.value = float(saved.get("blend", self.value))
-        self._too_little = float(saved.get("too_little", self._too_little))
-        self._enough = float(saved.get("enough", self._enough))
+        """Restore a `saved_state`."""
+        if self._adaptive:
+            self.value, self._too_little, self._enough = (
+                saved[name] for name in ("blend", "too_little", "enough")
+            )
 
     @staticmethod
     def _bisect(low: float, high: float) -> float:

@@ -73,7 +73,7 @@ class Extrapolation:
         }
 
     def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float], t0: float, v: Array) -> None:
-        """Restore a `saved_state`, empty in old checkpoints, and velocities v (n, 3) [m/s] at t0 [s]."""
+        """Restore a `saved_state` and velocities v (n, 3) [m/s] at t0 [s]; another integrator saves none."""
         names = sorted(name for name in numbers if name.startswith("past_") and name in arrays)
         if not names:
             return

@@ -61,7 +61,7 @@ class DiagonalShift:
 
     def restore(self, saved: Mapping[str, float]) -> None:
         """Restore a `saved_state`."""
-        self._value = float(saved.get("shift", self._value))
+        self._value = saved["shift"]
 
     def decrease(self) -> None:
         """Try a slightly smaller shift in a new step."""

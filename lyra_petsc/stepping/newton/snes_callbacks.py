@@ -423,10 +423,9 @@ class Newton:
         }
 
     def restore(self, saved: Mapping[str, float]) -> None:
-        """Restore a `saved_state`; entries that older checkpoints lack keep their defaults."""
-        self._convex_at_start = bool(saved.get("convex", self._convex_at_start))
-        self.forcing.tolerance = float(saved.get("tolerance", self.forcing.tolerance))
-        self.convergence.mean_iterations = float(saved.get("usual", self.convergence.mean_iterations))
+        """Restore a `saved_state`."""
+        self._convex_at_start = bool(saved["convex"])
+        self.forcing.tolerance, self.convergence.mean_iterations = saved["tolerance"], saved["usual"]
         self._blend.restore(saved)
         self._linear.shift.restore(saved)
 

@@ -458,15 +458,14 @@ class Equilibrium:
         return arrays, numbers | {"extrapolation": past}
 
     def restore(self, arrays: Mapping[str, Array], saved: Mapping[str, Any], factor: float) -> None:
-        """Restore a `saved_state`; that of older checkpoints is empty."""
-        self._scale = float(saved.get("scale", self._scale))
-        self._in_vain = int(saved.get("in_vain", self._in_vain))
+        """Restore a `saved_state`."""
+        self._scale, self._in_vain = saved["scale"], saved["in_vain"]
         self._friction.restore(saved)
-        self._pseudo_time.sufficed = float(saved.get("sufficed", self._pseudo_time.sufficed))
+        self._pseudo_time.sufficed = saved["sufficed"]
         self._last_factor = factor
         self._tangent = np.array(arrays["rate"]) if "rate" in arrays else None
         x = self._system.x[: self._system.points.n_owned].copy()
-        self._extrapolation.restore(arrays, saved.get("extrapolation", {}), factor, x)
+        self._extrapolation.restore(arrays, saved["extrapolation"], factor, x)
 
     @property
     def in_vain(self) -> bool:

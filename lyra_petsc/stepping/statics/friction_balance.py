@@ -95,9 +95,8 @@ class FrictionBalance:
         return {"slid": self._sliding_steps, "slid_in": self._sliding_increment}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Restore a `saved_state`; that of older checkpoints is empty."""
-        self._sliding_steps = int(saved.get("slid", self._sliding_steps))
-        self._sliding_increment = float(saved.get("slid_in", self._sliding_increment))
+        """Restore a `saved_state`."""
+        self._sliding_steps, self._sliding_increment = saved["slid"], saved["slid_in"]
 
     def _sums(self) -> tuple[float, str]:
         """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""

@@ -555,11 +555,10 @@ class CoulombFriction(Elastic):
         return self._obstacle_loads[:count]
 
     def state(self) -> dict[str, Array]:
-        # in older checkpoints the column of what is owed had another meaning
         return {"friction_work": self._vertex_data * IS_WORK, "friction_owed": self._vertex_data * ~IS_WORK}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self._vertex_data = state["friction_work"] * IS_WORK + state.get("friction_owed", 0.0)
+        self._vertex_data = state["friction_work"] * IS_WORK + state["friction_owed"]
 
     def history(self, x: Array, frozen: ObstacleMotion) -> Mapping[str, float]:
         return {"friction_work": float(self._vertex_data[:, WORK].sum())}
