@@ -86,15 +86,28 @@ class Outcome(Generic[C]):
         return bool(self.left_out) or (bool(self.verdicts) and not self.failures)
 
     @property
+    def status(self) -> str:
+        """``passed`` or ``FAILED``."""
+        return "passed" if self.passed else "FAILED"
+
+    @property
+    def failed(self) -> bool:
+        """Whether the case makes the verb end with exit code 1."""
+        return self.status == "FAILED"
+
+    @property
     def failures(self) -> dict[str, Verdict]:
         """The verdicts that did not pass."""
         return {name: verdict for name, verdict in self.verdicts.items() if not verdict.passed}
 
 
 def count_passed(outcomes: Sequence[Outcome[C]]) -> str:
-    """``3 of 4 cases passed``; cases that were left out do not count."""
-    run = [outcome for outcome in outcomes if not outcome.left_out]
-    return f"{sum(outcome.passed for outcome in run)} of {len(run)} cases passed"
+    """``3 of 4 cases passed``; cases that were left out, or compare with nothing, do not count."""
+    status = [outcome.status for outcome in outcomes if not outcome.left_out]
+    passed, others = status.count("passed"), len(status) - status.count("passed") - status.count("FAILED")
+    compared = len(status) - others
+    texts = [f"{passed} of {compared} cases passed"] if compared or not others else []
+    return ", ".join([*texts, f"{others} measured without a comparison"] if others else texts)
 
 
 T = TypeVar("T")

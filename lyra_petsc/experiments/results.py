@@ -84,7 +84,7 @@ class View(ABC, Generic[O]):
 
     def summary_table(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
         """Table of the terminal at the end, headings first."""
-        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
+        table = [(o.case.name, "left out" if o.left_out else o.status, f"{o.seconds:.1f}") for o in outcomes]
         return [(self.entry, "verdict", "run time [s]"), *table]
 
     def case_ended(self, outcomes: Sequence[O]) -> None:
@@ -110,7 +110,7 @@ class View(ABC, Generic[O]):
         """The content of the JSON file."""
         run = _without_left_out(outcomes)
         return self.summary_content(outcomes) | {
-            "passed": all(outcome.passed for outcome in run),
+            "passed": _all_passed(run),
             "ranks": ranks,
             "versions": library_versions(),
             "cases": [
@@ -131,6 +131,13 @@ class View(ABC, Generic[O]):
     def close_page(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         """Add command and versions and write the page, on one rank; returns a note on missing packages."""
         return write_report(report, folder, library_versions(), command, pictures=self.pictures)
+
+
+def _all_passed(outcomes: Sequence[O]) -> bool | None:
+    """Whether no case failed; None if none was compared with anything."""
+    if any(outcome.failed for outcome in outcomes):
+        return False
+    return True if not outcomes or any(outcome.passed for outcome in outcomes) else None
 
 
 def _without_left_out(outcomes: Sequence[O]) -> list[O]:

@@ -91,10 +91,16 @@ class FabricOutcome(Outcome[FabricCase]):
 
     record: Record = field(default_factory=Record)
 
+    @property
+    def status(self) -> str:
+        """``measured`` if nothing was compared, else ``passed`` or ``FAILED``."""
+        return super().status if self.verdicts else "measured"
+
 
 def outcome_of(case: FabricCase, record: Record) -> FabricOutcome:
     """The outcome of a case with this record."""
-    verdicts = {"measured": Verdict(not record.stopped, record.stopped or "to its end"), **record.verdicts}
+    stopped = {"measured to its end": Verdict(False, record.stopped)} if record.stopped else {}
+    verdicts = stopped | record.verdicts
     return FabricOutcome(case, verdicts, record.seconds, record=record)
 
 
@@ -115,7 +121,7 @@ class FabricView(View[FabricOutcome]):
     verb = "fabric"
     entry = "test"
     pictures = "plots"
-    columns = ("test", "quantity", "value", "scatter", "unit", "passed", "problem")
+    columns = ("test", "quantity", "value", "scatter", "unit", "status", "problem")
 
     def __init__(self, material: str) -> None:
         self.title = f"Textile tests: {material}"
@@ -123,14 +129,15 @@ class FabricView(View[FabricOutcome]):
 
     def terminal_lines(self, outcome: FabricOutcome) -> Iterable[Line]:
         yield f"{outcome.case.name}: {outcome.case.title}", "bold"
+        if outcome.left_out:
+            yield f"  left out: {outcome.left_out}", "dim"
         for number in outcome.record.numbers:
             yield f"  {number.quantity} = {_value(number)} {number.unit}", ""
         for name, verdict in outcome.verdicts.items():
-            if name != "measured" or not verdict.passed:
-                yield verdict_line(verdict, f"{name}: ")
+            yield verdict_line(verdict, f"{name}: ")
 
     def csv_rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
-        common = {"test": outcome.case.name, "passed": outcome.passed, "problem": outcome.record.stopped}
+        common = {"test": outcome.case.name, "status": outcome.status, "problem": outcome.record.stopped}
         for number in outcome.record.numbers:
             yield common | vars(number)
         if not outcome.record.numbers:
@@ -139,7 +146,7 @@ class FabricView(View[FabricOutcome]):
     def case_content(self, outcome: FabricOutcome) -> dict[str, Any]:
         return {
             "numbers": [vars(number) for number in outcome.record.numbers],
-            "passed": outcome.passed,
+            "status": outcome.status,
             "wall_seconds": outcome.seconds,
         }
 
@@ -157,7 +164,9 @@ class FabricView(View[FabricOutcome]):
         report.table(["test", "quantity", "value", "unit"], rows)
         for outcome in outcomes:
             report.heading(outcome.case.name)
-            report.paragraph(f"{outcome.case.title}. Run time {seconds(outcome.seconds)}.")
+            ended = f"Left out: {outcome.left_out}." if outcome.left_out else ""
+            ended = ended or f"{outcome.status.capitalize()}. Run time {seconds(outcome.seconds)}."
+            report.paragraph(f"{outcome.case.title}. {ended}")
             for name, verdict in outcome.verdicts.items():
                 report.paragraph(f"{name}: {verdict.line}.")
             if plots:

@@ -48,6 +48,11 @@ class Fabric:
         d11, d12, d22, _ = self.shell(degrees).plate
         return d11 - d12**2 / d22 if d22 > 0.0 else 0.0
 
+    @property
+    def bends(self) -> bool:
+        """Whether the material resists bending."""
+        return self.rigidity(0.0) > 0.0
+
     def needs_bending(self, test: str) -> None:
         """Refuse a test of bending if the material has no bending stiffness.
 
@@ -55,7 +60,7 @@ class Fabric:
         ------
         InputError
         """
-        if not self.rigidity(0.0) > 0.0:
+        if not self.bends:
             raise InputError(
                 f"the test {test} is of bending, which this material does not resist", key=self.name
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,30 @@ def test_heart_loops_with_and_without_weight() -> None:
         record = textile_tests.loop(bench, FABRIC, 0.0)
     assert len(record.verdicts) == 3
     assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
+
+
+def test_a_loop_that_friction_holds_is_measured() -> None:
+    """The shortest is no longer than one without weight, where Peirce's formula gives no number."""
+    assert np.isnan(textile_tests.loop_length(0.13, 1.0))
+    assert np.isnan(textile_tests.loop_length(0.6, 1.0))
+    kes = {"B": 0.145, "2HB": 0.105, "G": 1.35}
+    block = {"density": 0.245, "membrane": {"c11": 3900, "c22": 2100, "c12": 250}, "kes": kes}
+    rubbing = Fabric("rubbing", block | {"bending_model": "midedge"})
+    case = next(case for case in cases_of("loop") if case.name == "loop-warp")
+    outcome = textile_tests.run_case(MPI.COMM_SELF, case, rubbing, lambda: None)
+    assert outcome.status == "measured"
+    assert not outcome.passed
+    assert not outcome.failed
+
+
+def test_a_failed_formula_fails_its_test_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*given: Any) -> Record:
+        raise ArithmeticError("the heart loop's elastica was not found")
+
+    monkeypatch.setitem(TESTS, "loop", replace(TESTS["loop"], measure=fails))
+    outcome = textile_tests.run_case(MPI.COMM_SELF, cases_of("loop")[0], FABRIC, lambda: None)
+    assert outcome.failed
+    assert "elastica was not found" in outcome.record.stopped
 
 
 @pytest.mark.parametrize("count", [3, 6])
