@@ -419,6 +419,9 @@ def _check_and_transform(sheet: Sheet, source: MeshSource, key: str, file: objec
 def _weld(sheet: Sheet, source: MeshSource, distance: float, where: dict[str, Any]) -> None:
     """Join coincident vertices of the scaled sheet, with a note."""
     dropped = weld(sheet, _transformed(sheet.points, source.transform)[0], distance)
+    if not dropped:
+        sheet.notes.append(f"no vertices coincide within weld = {distance:g} m")
+        return
     triangles = sheet.triangles
     if (bad := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))).size:
         raise InputError(

@@ -21,7 +21,7 @@ import numpy as np
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.geo_script import check_script
-from lyra_petsc.mesh.library_formats import LIBRARIES
+from lyra_petsc.mesh.library_formats import LIBRARIES, usual_spelling
 from lyra_petsc.mesh.mesh import Sheet
 from lyra_petsc.mesh.msh_file import ElementBlock, MshError, NoTrianglesError, assemble_sheet, element_type
 from lyra_petsc.mesh.readers import printable
@@ -126,8 +126,9 @@ def read_library_file(path: Path) -> Sheet:
         # a copy, as libraries also read files beside it; its ending in the spelling that they know
         inside = Path(folder) / "file"
         inside.mkdir()
-        copy = inside / f"mesh{path.suffix.lower()}"
-        copy.write_bytes(data)
+        suffix = path.suffix.lower()
+        copy = inside / f"mesh{suffix}"
+        copy.write_bytes(usual_spelling(suffix, data))
         _run_library(path, copy, inside, {"size": None, "algorithm": None}, Path(folder), meshed, None)
         sheet = _read_mesh(path, meshed, note_loose=True)
     sheet.tags = None

@@ -28,9 +28,17 @@ LIBRARIES = {
 }
 """The library that reads each format: meshio does not read surfaces of .vtk, nor gmsh their version 5."""
 
+_POINT_SET = "points of a set"
+
 # gmsh's numbers of elements with straight and with curved sides, and the number of corners
 _KINDS = {
-    **{"vertex": (15, 15, 1), "line": (1, 8, 2), "triangle": (2, 9, 3), "quad": (3, 16, 4)},
+    **{
+        _POINT_SET: (15, 15, 1),
+        "vertex": (15, 15, 1),
+        "line": (1, 8, 2),
+        "triangle": (2, 9, 3),
+        "quad": (3, 16, 4),
+    },
     **{"tetra": (4, 4, 4), "hexahedron": (5, 5, 8), "wedge": (6, 6, 6), "pyramid": (7, 7, 5)},
 }
 _VTK_TYPES = {
@@ -138,7 +146,11 @@ def _converted(
 ) -> FileMesh:
     """The mesh that a library read, if it is whole."""
     surfaces_only = path.suffix == ".bdf"  # whose other cards are too many to know them
-    counted = [len(each.points) for each in cells if not surfaces_only or each.name[:4] in ("tria", "quad")]
+    counted = [
+        len(each.points)
+        for each in cells
+        if each.name != _POINT_SET and (not surfaces_only or each.name[:4] in ("tria", "quad"))
+    ]
     refuse_losses(LIBRARIES[path.suffix], announced, len(points), sum(counted))
     if points.ndim != 2 or points.shape[1] != 3:
         raise Refused(f"its points have {points.shape[-1]} coordinates, not three; {_REMEDY}")
@@ -187,18 +199,38 @@ def _fan(points: Array, polygon: Ints) -> Ints:
     return polygon[fan]
 
 
+# -- spelling ----------------------------------------------------------------------------------------
+
+
+def usual_spelling(suffix: str, data: bytes) -> bytes:
+    """The content of a file in the spelling that meshio knows, of several that are in use."""
+    if suffix == ".stl" and b"\0" not in data:
+        return data.lower()
+    if suffix == ".ply":
+        return re.sub(rb"\bvertex_index\b", b"vertex_indices", data, count=1)
+    if suffix == ".off":
+        data = re.sub(rb"#[^\n]*", b"", data)
+        return re.sub(rb"^\s*OFF\s+(\d+)\s+(\d+)\s+(\d+)", rb"OFF\n\1 \2 \3\n", data)
+    if suffix == ".bdf":
+        data = data.upper()
+        return data if re.search(rb"^\s*BEGIN BULK", data, re.MULTILINE) else b"BEGIN BULK\n" + data
+    if suffix == ".inp":
+        data = re.sub(rb"^\*\*[^\n]*\n", b"", data, flags=re.MULTILINE)
+        return _ABAQUS_TYPE.sub(lambda found: found[1] + _ABAQUS_FLAT.sub(rb"S\1", found[2].upper()), data)
+    return data
+
+
+_ABAQUS_TYPE = re.compile(rb"^(\*ELEMENT\b[^\n]*?\bTYPE\s*=\s*)(\w+)", re.MULTILINE | re.IGNORECASE)
+_ABAQUS_FLAT = re.compile(rb"^(?:S|DS|M3D|SFM3D|R3D|CPS|CPE)([34])(?:R|RS|R5|RSW)?$")
+"""Shells, membranes and plane elements of three or four nodes, of which meshio knows few."""
+
+
 # -- libraries ---------------------------------------------------------------------------------------
 
 
 def _read_meshio(meshio: ModuleType, path: Path) -> tuple[Array, list[_Cells], _Names]:
     reader = getattr(meshio, {".inp": "abaqus", ".bdf": "nastran"}.get(path.suffix, path.suffix[1:]))
-    data = path.read_bytes()
-    source: str | io.StringIO | io.BytesIO = str(path)
-    if path.suffix == ".ply":
-        source = io.BytesIO(re.sub(rb"\bvertex_index\b", b"vertex_indices", data, count=1))  # both are in use
-    if path.suffix == ".bdf" and not re.search(rb"^\s*BEGIN BULK", data, re.MULTILINE):
-        source = io.StringIO("BEGIN BULK\n" + data.decode("latin-1"))  # many programs leave it out
-    mesh = reader.read(source)
+    mesh = reader.read(str(path))
     if (np.asarray(mesh.point_data.get("nastran:ref", 0)) != 0).any():
         raise Refused(f"has points in coordinate systems of their own; {_REMEDY} in one system")
     if len(set(ids := getattr(mesh, "points_id", np.arange(0)).tolist())) < len(ids):
@@ -209,7 +241,7 @@ def _read_meshio(meshio: ModuleType, path: Path) -> tuple[Array, list[_Cells], _
     }
     if path.suffix == ".inp":
         # meshio takes the number of a set for that of the elements which define it
-        owners = _inp_content(data).sets
+        owners = _inp_content(path.read_bytes()).sets
         for name in {owner for owner in owners if owner}:
             sets[name] = [
                 np.arange(len(nodes)) if owner == name else None
@@ -230,6 +262,11 @@ def _read_meshio(meshio: ModuleType, path: Path) -> tuple[Array, list[_Cells], _
         _Cells(kind, nodes, np.concatenate([np.empty((0, 2), np.int64), *rows]))
         for (kind, nodes), rows in zip(blocks, groups, strict=True)
     ]
+    for number, (name, inside) in enumerate(mesh.point_sets.items(), len(sets) + 1):
+        if name not in sets and len(inside):  # programs write the nodes of each set of elements, too
+            rows = np.column_stack([np.arange(len(inside)), np.full(len(inside), number)])
+            cells.append(_Cells(_POINT_SET, np.asarray(inside)[:, None], rows))
+            names.append((0, number, name))
     return np.asarray(mesh.points), cells, names
 
 
@@ -290,12 +327,11 @@ def _count_stl(data: bytes) -> tuple[None, int]:
     n_binary = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + 50 * n_binary:
         return None, n_binary
-    text = data.lower().split()
     if data.lstrip()[:5].lower() != b"solid":
         raise Refused(f"is no STL: neither text, nor as long as its {n_binary} triangles")
-    if b"endsolid" not in text:
+    if not re.search(rb"^\s*endsolid\b", data, re.MULTILINE | re.IGNORECASE):
         raise Refused("is cut short: 'endsolid' is missing")
-    return None, text.count(b"facet")
+    return None, len(re.findall(rb"^\s*facet\b", data, re.MULTILINE | re.IGNORECASE))
 
 
 def _count_ply(data: bytes) -> tuple[int, int]:

@@ -150,10 +150,21 @@ def test_two_squares(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_ply_with_the_other_name_of_corners(tmp_path: Path) -> None:
-    file = tmp_path / "mesh.ply"
-    file.write_text(PLY.replace("vertex_indices", "vertex_index"))
-    assert mesh_of(file).n_triangles == 4
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("other.ply", PLY.replace("vertex_indices", "vertex_index")),
+        ("upper.stl", STL.upper()),
+        ("line.off", OFF.replace("OFF\n# two squares\n6 4 0", "OFF  6 4  0 # two squares")),
+        ("lower.bdf", BDF.lower()),
+        ("membrane.inp", INP.replace("TYPE=S3", "type=m3d3").replace("S4R", "CPE4")),
+        ("comment.inp", INP.replace("30, 2., 0., 0.", "** a comment\n30, 2., 0., 0.")),
+    ],
+)
+def test_other_spellings(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    assert text not in [content.decode("latin-1") for content in FILES.values()]
+    assert rest_areas(mesh_of(tmp_path / name)).sum() == pytest.approx(2.0)
 
 
 def test_sets_of_abaqus_and_properties_of_nastran_are_groups(tmp_path: Path) -> None:
@@ -162,6 +173,7 @@ def test_sets_of_abaqus_and_properties_of_nastran_are_groups(tmp_path: Path) -> 
     groups = mesh_of(tmp_path / "sets.inp").groups
     assert groups["east"].triangles.tolist() == [2, 3]
     assert groups["low"].triangles.tolist() == [0, 2, 3]
+    assert groups["far"].vertices.tolist() == [2, 5]
     groups = mesh_of(tmp_path / "free.bdf").groups
     assert groups["5"].triangles.tolist() == [0, 1]
     assert groups["6"].triangles.tolist() == [2, 3]
