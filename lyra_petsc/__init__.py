@@ -9,14 +9,16 @@ See ``docs/python.md``. Modules are imported, and MPI and PETSc started, when a 
 used; `load` and `Run` need neither MPI nor PETSc.
 """
 
-from __future__ import annotations
-
+# `python -m` has put the working directory on the import path: before `__main__` removes it, only what Python
+# has loaded already is imported
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+TYPE_CHECKING = False  # as that of typing
 if TYPE_CHECKING:
+    from typing import Any
+
     from lyra_petsc.api.scenes import load
     from lyra_petsc.api.simulations import Simulation, Step
     from lyra_petsc.errors import InputError, LyraError, OutputError, SolverError
@@ -56,10 +58,17 @@ _MODULES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+_WITH_PETSC = ("Simulation", "Step", "fit", "gradient")
+
+
+def __getattr__(name: str) -> "Any":
     module = _MODULES.get(name)
     if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _WITH_PETSC:
+        from lyra_petsc.startup import start_petsc
+
+        start_petsc()
     value = getattr(import_module(f"{__name__}.{module}"), name)
     globals()[name] = value
     return value

@@ -1,14 +1,26 @@
-"""``python -m lyra_petsc`` and the command ``lyra-petsc``."""
-
-from __future__ import annotations
+"""``python -m lyra_petsc``, ``python FOLDER/lyra_petsc`` and the command ``lyra-petsc``."""
 
 import gc
 import os
 import sys
 
+if not __package__:  # started by the name of the folder, which Python has put on the import path
+    sys.path[0] = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+
+
+def leave_working_directory() -> None:
+    """Remove the working directory from the import path: a stranger's folder may hold modules of any name."""
+    try:
+        here = os.getcwd()
+    except OSError:  # it was removed
+        here = ""
+    sys.path[:] = [folder for folder in sys.path if folder not in ("", here)]
+    os.environ["PYTHONSAFEPATH"] = "1"  # for processes that libraries start
+
 
 def main() -> None:
     """Run the command line and leave with its exit code."""
+    leave_working_directory()
     from lyra_petsc.cli.signals import exit_on_signals
 
     exit_on_signals()  # before the imports that follow, which take a second

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from lyra_petsc.errors import InputError, LyraError
 
@@ -19,6 +19,26 @@ Result = TypeVar("Result")
 
 GRACE = 5.0
 """Time [s] for which a rank that failed waits for the other ranks to fail as well."""
+
+
+class SingleProcess:
+    """Stands for a communicator in a process without MPI."""
+
+    rank, size = 0, 1
+
+    def bcast(self, value: Result, root: int = 0) -> Result:
+        """The value."""
+        return value
+
+    def allgather(self, value: Result) -> list[Result]:
+        """The value of the only rank."""
+        return [value]
+
+    gather = allgather
+
+
+ALONE: Any = SingleProcess()
+"""The only rank of a process without MPI."""
 
 
 def restore_signal_handlers() -> None:

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 LEVELS = [
     {"arrays", "errors"},
     {"extras", "parallel", "phases"},
+    {"startup"},
     {"kernels"},
     {"scene"},
     {"mesh"},

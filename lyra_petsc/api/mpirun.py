@@ -7,17 +7,16 @@ import os
 import shlex
 import shutil
 import signal
-import site
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import lyra_petsc
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.file_operations import reason
+from lyra_petsc.startup import is_launched
 
 POLL = 0.05
 """Seconds between checks whether a process has ended."""
@@ -28,9 +27,6 @@ GRACE = 10.0
 PR_SET_PDEATHSIG = 1
 """Number of the Linux prctl that sets the signal a process gets when its parent ends."""
 
-LAUNCHER_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK", "PMIX_RANK", "MPI_LOCALNRANKS")
-"""Environment variables of processes that a launcher has started."""
-
 JOB_PREFIXES = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_", "ORTE_SCHIZO_")
 
 SINGLETON_VARIABLES = frozenset(
@@ -39,16 +35,6 @@ SINGLETON_VARIABLES = frozenset(
 )
 """Variables that Open MPI 4 sets in a process without a launcher, with which an mpirun started there
 fails."""
-
-
-def is_launched(environment: Mapping[str, str]) -> bool:
-    """Whether this process was started by mpirun, mpiexec or srun."""
-    if environment.get("OMPI_MCA_ess") == "singleton":  # child of a process without a launcher
-        return False
-    if any(name in environment for name in LAUNCHER_VARIABLES):
-        return True
-    # only within srun: a batch script may have the first of these variables as well
-    return "SLURM_STEP_NUM_TASKS" in environment and "SLURM_PROCID" in environment
 
 
 def find_launcher(ranks: int) -> list[str]:
@@ -87,9 +73,6 @@ def environment() -> dict[str, str]:
     if os.geteuid() == 0:
         for name in ("OMPI_ALLOW_RUN_AS_ROOT", "PRTE_ALLOW_RUN_AS_ROOT"):
             variables[name] = variables[f"{name}_CONFIRM"] = "1"
-    root = str(Path(lyra_petsc.__file__).resolve().parents[1])
-    if root not in site.getsitepackages():
-        variables["PYTHONPATH"] = os.pathsep.join(filter(None, [root, variables.get("PYTHONPATH")]))
     return variables
 
 

@@ -1,5 +1,4 @@
-"""Entry point of the command line: starts PETSc, runs a verb, and turns errors into messages and exit
-codes."""
+"""Entry point of the command line: runs a verb, and turns errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -12,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
-from lyra_petsc.cli.arguments import move_help, split, start_error, start_petsc
+from lyra_petsc.cli.arguments import move_help, split
+from lyra_petsc.cli.options import Session
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError, shorten_words
-from lyra_petsc.parallel import restore_signal_handlers
+from lyra_petsc.parallel import ALONE
 
 PROGRAM = "lyra-petsc"
 
@@ -34,61 +35,50 @@ RESERVE = 4 * 2**20
 
 
 def run_command_line(argv: Sequence[str]) -> int:
-    """Start PETSc with its part of the arguments and run the verb; returns the exit code."""
-    if COMPLETION in os.environ:  # completion does not need PETSc
+    """Run the verb; returns the exit code."""
+    if COMPLETION in os.environ:
         verbs.main([], prog_name=PROGRAM)
     ours, petsc = move_help(*split(argv[1:]))
-    # without a launcher Open MPI would start a daemon, which is only needed to spawn processes
-    os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
     try:
-        failure = start_error(petsc)
-        if not failure:
-            failure = start_petsc([argv[0], *petsc])
-            restore_signal_handlers()
-        import numpy as np
-        from mpi4py import MPI
-    except ImportError as error:
-        print(
-            f"lyra-petsc: {error}: this Python ({sys.executable}) has no working petsc4py and mpi4py; "
-            "use 'bash scripts/run.sh', or see the README for conda, clusters and PyPI",
-            file=sys.stderr,
-        )
-        return InputError.exit_code
-
-    comm = MPI.COMM_WORLD
-    if failure:
-        _print_error(comm, failure)
-        MPI.Finalize()  # PETSc does not, as it has not started
-        return InputError.exit_code
-    from petsc4py import PETSc
-
-    from lyra_petsc.linear.petsc_options import quoted, refused
-
+        session = Session(petsc)
+    except InputError as error:  # no MPI
+        _print_error(ALONE, str(error))
+        return error.exit_code
     reserve = [bytes(RESERVE)]
     # if colorama is installed, numba would print colour codes to the standard output
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     # overflow makes a step fail, with a message of its own
     np.seterr(over="ignore", invalid="ignore")
     try:
-        code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=comm)
+        code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=session)
     except LyraError as error:
-        return _leave_together(comm, error.exit_code, str(error), error.details)
+        return _leave_together(session.comm, error.exit_code, str(error), error.details)
     except click.exceptions.Exit as leave:
         return leave.exit_code
     except click.ClickException as error:
-        return _leave_together(comm, InputError.exit_code, _in_one_line(error))
+        return _leave_together(session.comm, InputError.exit_code, _in_one_line(error))
     except (Exception, KeyboardInterrupt) as error:
         reserve.clear()  # without memory Open MPI would end with another exit code
-        if isinstance(error, PETSc.Error) and quoted(error):
-            line = str(refused(error))
+        if line := _refused_option(error):
             _clear_frames(error)
-            return _leave_together(comm, InputError.exit_code, line)
-        code = _report_unexpected(comm, error)
+            return _leave_together(session.comm, InputError.exit_code, line)
+        code = _report_unexpected(session.comm, error)
         _clear_frames(error)
-        if comm.size > 1:
-            comm.Abort(code)
+        if session.comm.size > 1:
+            session.comm.Abort(code)
         return code
     return code if isinstance(code, int) else 0
+
+
+def _refused_option(error: BaseException) -> str:
+    """Message on an option that PETSc refuses; empty for any other error."""
+    if "petsc4py.PETSc" not in sys.modules:
+        return ""
+    from petsc4py import PETSc
+
+    from lyra_petsc.linear.petsc_options import quoted, refused
+
+    return str(refused(error)) if isinstance(error, PETSc.Error) and quoted(error) else ""
 
 
 def _clear_frames(error: BaseException) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
@@ -20,6 +19,9 @@ from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root
 from lyra_petsc.show.obstacle_surfaces import run_obstacles
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 
 class StateCrossings(NamedTuple):

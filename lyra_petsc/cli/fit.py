@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import click
@@ -23,6 +22,7 @@ from lyra_petsc.output.run_folder import RunDirectory, choose_folder
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.startup import module_command
 
 
 class FitProgress(ProgressBar, FitObserver):
@@ -113,5 +113,5 @@ def fit(
 
 def _launched(comm: MPI.Comm, ranks: int, arguments: list[str]) -> int:
     """Run the same command on ``ranks`` ranks, with this process's streams; returns the exit code."""
-    program = [*on_root(comm, lambda: find_launcher(ranks)), sys.executable, "-m", "lyra_petsc", "fit"]
+    program = [*on_root(comm, lambda: find_launcher(ranks)), *module_command("lyra_petsc"), "fit"]
     return subprocess.call([*program, *arguments, *petsc_arguments()], env=environment())

@@ -10,11 +10,11 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.options import trust_mesh, verb
+from lyra_petsc.cli.options import Session, trust_mesh, verb
 from lyra_petsc.errors import InputError
 
 
-@verb("lyra-petsc new pennant --mesh pennant.geo")
+@verb("lyra-petsc new pennant --mesh pennant.geo", start=Session.without_petsc)
 @click.argument("name")
 @click.option(
     "--mesh",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import results, verb
+from lyra_petsc.cli.options import Session, results, verb
 from lyra_petsc.cli.signals import stop_signals
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 @verb(
     "lyra-petsc render runs/flag --film flag.mp4 --field speed",
     "lyra-petsc render runs/flag --at 0.5,1 --handles --wind",
+    start=Session.without_petsc,
 )
 @results
 @click.option("--at", metavar="T,T,…", help="Pictures of the states nearest to these times [s].")
@@ -88,7 +89,7 @@ def _file_line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
     return f"{'film':<8} {path}  ({count / timing.fps:.3g} s, {count} frames, {timing.fps:g} a second)"
 
 
-@verb("lyra-petsc export runs/flag --to gltf")
+@verb("lyra-petsc export runs/flag --to gltf", start=Session.without_petsc)
 @results
 @click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")
 @click.option(
@@ -121,7 +122,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise Interrupted("; nothing was written", number)
 
 
-@verb("lyra-petsc report runs/flag")
+@verb("lyra-petsc report runs/flag", start=Session.without_petsc)
 @results
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="The page (RUN/report.html).")
 def report(comm: Any, run: Path, out: Path | None) -> None:

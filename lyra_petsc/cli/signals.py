@@ -46,6 +46,4 @@ class StopRequest:
 
     def signal_number(self) -> int:
         """The signal that any rank has received, else 0; collective."""
-        from mpi4py import MPI
-
-        return int(self._comm.allreduce(self._received, MPI.MAX))
+        return max(self._comm.allgather(self._received))

@@ -13,7 +13,18 @@ import click
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, add_help, example, out, prints, scene, settings, trust_mesh, verb
+from lyra_petsc.cli.options import (
+    SETTINGS,
+    Session,
+    add_help,
+    example,
+    out,
+    prints,
+    scene,
+    settings,
+    trust_mesh,
+    verb,
+)
 from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, server_options, view
 from lyra_petsc.errors import InputError, suggest
@@ -52,7 +63,7 @@ def verbs(ctx: click.Context) -> None:
 
     mpirun -n P lyra-petsc VERB [SCENE] [--our options] [-petsc options]
     """
-    if ctx.invoked_subcommand is None and ctx.obj.rank == 0:
+    if ctx.invoked_subcommand is None and ctx.obj.comm.rank == 0:
         click.echo(ctx.get_help())
 
 
@@ -77,7 +88,11 @@ def run(
     run_scene(comm, served=Served.of_live(live, host, port, no_browser), **options)
 
 
-@verb("lyra-petsc check configs/flag.yaml --set mesh.size=0.02", "lyra-petsc check runs/flag")
+@verb(
+    "lyra-petsc check configs/flag.yaml --set mesh.size=0.02",
+    "lyra-petsc check runs/flag",
+    start=lambda session: session,
+)
 @click.argument("path", required=False, type=click.Path(path_type=Path), metavar="[SCENE|RUN]")
 @settings
 @trust_mesh
@@ -86,25 +101,31 @@ def run(
     "--crossings", is_flag=True, help="Exit code 1 if triangles cross in RUN, also without contact."
 )
 def check(
-    comm: Any, path: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool, crossings: bool
+    session: Session,
+    path: Path | None,
+    settings: tuple[str, ...],
+    trust_mesh: bool,
+    schema: bool,
+    crossings: bool,
 ) -> int:
     """Check SCENE and print what a run would do; or count crossing triangles in the states of RUN."""
     from lyra_petsc.parallel import on_root
 
     if crossings and path is None:
         raise InputError("needs the folder of a run, as in: check runs/flag --crossings", key="--crossings")
-    if path is not None and (crossings or on_root(comm, lambda: os.path.isdir(path))):
+    if path is not None and (crossings or on_root(session.comm, lambda: os.path.isdir(path))):
         if settings or trust_mesh or schema:
             raise InputError("for the folder of a run there is no option but --crossings", file=path)
         from lyra_petsc.cli.check_run import check_run
 
-        return check_run(comm, path, crossings=crossings)
+        return check_run(session.without_petsc(), path, crossings=crossings)
     if schema:
         from lyra_petsc.scene.json_schema import schema_text
 
-        if comm.rank == 0:
+        if session.without_petsc().rank == 0:
             click.echo(schema_text(), nl=False)
         return 0
+    comm = session.start_petsc()  # else PETSc would start without its options by the import
     from lyra_petsc.cli.check import check as check_scene
 
     check_scene(comm, path, settings, trust_mesh=trust_mesh)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import click
 
-from lyra_petsc.cli.options import results, verb
+from lyra_petsc.cli.options import Session, results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import raise_on_all_ranks
@@ -86,7 +86,7 @@ class Served:
             open_browser(url)
 
 
-@verb("lyra-petsc view runs/flag")
+@verb("lyra-petsc view runs/flag", start=Session.without_petsc)
 @results
 @click.option("--field", metavar="NAME", help="Colour by speed, strain, displacement or a written field.")
 @click.option("--range", metavar="LOW,HIGH", help="Range of the colours: values, or percentiles as 2%,98%.")
@@ -102,9 +102,10 @@ def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser
             _serve(run, Served.of(host, port, no_browser), look)
         except LyraError as error:
             problem = error
-    request = comm.Ibarrier()
-    while not request.Test():  # unlike MPI's barrier this keeps no processor busy
-        time.sleep(0.2)
+    if comm.size > 1:
+        request = comm.Ibarrier()
+        while not request.Test():  # unlike MPI's barrier this keeps no processor busy
+            time.sleep(0.2)
     raise_on_all_ranks(comm, problem)
 
 

@@ -8,7 +8,6 @@ the same PETSc options.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -23,6 +22,7 @@ from pydantic import PlainValidator, TypeAdapter
 from lyra_petsc.api.mpirun import error_message, run_launched
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.output.file_operations import replace_text
+from lyra_petsc.startup import module_command
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -211,7 +211,7 @@ class Launcher:
         self, arguments: Sequence[str], watch: Watch, keep_open: Sequence[int] = ()
     ) -> tuple[int, str]:
         """Run the verb; returns the exit code and the last message on stderr, see `run_launched`."""
-        program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
+        program = [*self.command, *module_command("lyra_petsc"), self.verb]
         code, stderr = run_launched([*program, *arguments, *self.petsc_options], watch, keep_open)
         return code, error_message(stderr, code)
 

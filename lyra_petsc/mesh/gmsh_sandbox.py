@@ -22,6 +22,8 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
+from lyra_petsc.startup import python_command
+
 PR_SET_NO_NEW_PRIVS = 38
 CLONE_THREAD = 0x10000
 TIOCSTI, TIOCLINUX = 0x5412, 0x541C
@@ -117,11 +119,9 @@ def describe_sandbox(layers: Sequence[str], *, trusted: bool = False) -> str:
 def supported_layers() -> list[str]:
     """Layers of the sandbox that this system supports, determined in a child process."""
     code = "import json, lyra_petsc.mesh.gmsh_sandbox as s; print(json.dumps(s.enter_sandbox(None)))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=environment,
+            python_command(code),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=60,

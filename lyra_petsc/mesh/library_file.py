@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from lyra_petsc.mesh.msh_file import ElementBlock, MshError, NoTrianglesError, a
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
+from lyra_petsc.startup import module_command
 
 # beyond this ratio of the mean edge to the requested size a note says that the script sets its own sizes
 _SIZE_RATIO = 1.6
@@ -167,12 +167,11 @@ def _run_library(
     job_file = folder / "job.json"
     job_file.write_text(json.dumps(job))
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_MPI_VARIABLES)}
-    environment["PYTHONPATH"] = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     environment["GMSH_HOME"] = str(folder)  # no .gmshrc of the user's
     with tempfile.TemporaryFile() as outcome_file:
         descriptors = outcome_file.fileno(), meshed.fileno()
         process = subprocess.Popen(
-            [sys.executable, "-m", "lyra_petsc.mesh.library_process", str(job_file), *map(str, descriptors)],
+            [*module_command("lyra_petsc.mesh.library_process"), str(job_file), *map(str, descriptors)],
             cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,

@@ -141,13 +141,9 @@ def raise_on_all_ranks(comm: MPI.Comm, problem: LyraError | None) -> None:
     LyraError
         The same error on every rank, if any rank has one.
     """
-    from mpi4py import MPI
-
-    first = comm.allreduce(comm.size if problem is None else comm.rank, MPI.MIN)
-    if first == comm.size:
-        return
-    shared = comm.bcast(problem, root=first)
-    raise shared
+    for shared in comm.allgather(problem):
+        if shared is not None:
+            raise shared
 
 
 def on_every_rank(comm: MPI.Comm, work: Callable[[], Result]) -> Result:

@@ -15,7 +15,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar
 
@@ -33,7 +33,7 @@ from lyra_petsc.output.file_operations import (
     writing,
 )
 from lyra_petsc.output.ordering import row_type
-from lyra_petsc.output.stored import import_h5py, open_stored
+from lyra_petsc.output.stored import hdf5_properties, import_h5py, open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
@@ -296,23 +296,6 @@ def preallocate(
             file.close()
         os.posix_fallocate(raw.fileno(), 0, os.fstat(raw.fileno()).st_size)
     return offsets
-
-
-@cache
-def hdf5_properties() -> tuple[Any, Any, Any, Any]:
-    """HDF5 property lists for creating datasets, their groups and files, and the dataspace of attributes."""
-    h5py = import_h5py()
-    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    early.set_layout(h5py.h5d.CONTIGUOUS)
-    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
-    links.set_create_intermediate_group(True)
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-    # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
-    access.set_libver_bounds(h5py.h5f.LIBVER_V18, h5py.h5f.LIBVER_V18)
-    return early, links, access, h5py.h5s.create(h5py.h5s.SCALAR)
 
 
 def write_slabs(path: Path, part: Path, pieces: Sequence[Piece], comm: MPI.Comm) -> None:

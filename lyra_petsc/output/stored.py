@@ -14,7 +14,7 @@ import re
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,23 @@ def import_h5py() -> Any:
     import h5py
 
     return h5py
+
+
+@cache
+def hdf5_properties() -> tuple[Any, Any, Any, Any]:
+    """HDF5 property lists for creating datasets, their groups and files, and the dataspace of attributes."""
+    h5py = import_h5py()
+    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    early.set_layout(h5py.h5d.CONTIGUOUS)
+    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
+    links.set_create_intermediate_group(True)
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
+    access.set_libver_bounds(h5py.h5f.LIBVER_V18, h5py.h5f.LIBVER_V18)
+    return early, links, access, h5py.h5s.create(h5py.h5s.SCALAR)
 
 
 def import_h5py_in_background() -> None:

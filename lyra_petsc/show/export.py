@@ -32,10 +32,9 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError, suggest
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import HDF5_ERRORS, reason
-from lyra_petsc.output.hdf5 import hdf5_properties
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
-from lyra_petsc.output.stored import import_h5py
+from lyra_petsc.output.stored import hdf5_properties, import_h5py
 from lyra_petsc.output.tensors import in_vtk_order, is_tensor
 from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, create_metadata
 from lyra_petsc.show.render.render_plan import parse_numbers, pick_state

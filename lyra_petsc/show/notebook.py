@@ -16,6 +16,8 @@ from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import open_output
 from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.parallel import ALONE
+from lyra_petsc.startup import start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -156,8 +158,6 @@ class Run(StoredRun):
             from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 
             require_packages("render", PACKAGES, "view")
-            from mpi4py import MPI
-
             from lyra_petsc.show.render.draw import draw
 
             with tempfile.TemporaryDirectory() as folder:
@@ -170,7 +170,7 @@ class Run(StoredRun):
                 if isinstance(chosen.get("range"), tuple | list):
                     chosen["range"] = ",".join(map(str, chosen["range"]))
                 plan = make_plan(RenderOptions(self.folder, **chosen))
-                (path,) = draw(MPI.COMM_SELF, plan, lambda done, count: None)
+                (path,) = draw(ALONE, plan, lambda done, count: None)
                 return Media(path.read_bytes(), TYPES[path.suffix.lower()])
 
     def view(self) -> ViewedPage:
@@ -252,8 +252,9 @@ def run(
     SolverError, OutputError
         The run failed; the states written before are kept.
     """
-    from lyra_petsc.api.runs import run as simulate
-
     with python_argument_names():
+        start_petsc()
+        from lyra_petsc.api.runs import run as simulate
+
         options: dict[str, Any] = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
         return Run(simulate(scene, out, **options, on_step=on_step, comm=comm, progress=progress))

@@ -228,9 +228,10 @@ def petsc_page() -> str:
         MADE,
         "Every option of PETSc's TS, SNES, KSP, PC, Mat and Vec has its usual name, without a prefix: "
         "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones override earlier ones in: the program's "
-        "defaults, the scene's `petsc:` block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc "
-        "run SCENE -help` lists all options of PETSc. A note before the first step, and in `check`, names "
-        "options that PETSc does not have, with the nearest name; a warning at the end names unused options.",
+        "defaults, the scene's `petsc:` block, `~/.petscrc`, the file of `--petscrc`, `PETSC_OPTIONS`, the "
+        "command line. `lyra-petsc run SCENE -help` lists all options of PETSc. A note before the first "
+        "step, and in `check`, names options that PETSc does not have, with the nearest name; a warning at "
+        "the end names unused options.",
         "The program itself reads, sets or refuses these:",
         "\n".join(rows),
         "## Named linear solvers",

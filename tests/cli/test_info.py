@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from lyra_petsc import startup
 from lyra_petsc.cli import info as module
 from lyra_petsc.cli.info import Installation, incompatibilities, info, launched_ranks
+from lyra_petsc.errors import InputError
 
 
 def test_info_lists_the_versions_in_use(comm):
@@ -105,3 +107,22 @@ def test_its_import_starts_neither_petsc_nor_mpi():
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_the_folder_of_the_distributions_petsc4py_is_named(tmp_path, monkeypatch):
+    """Debian's petsc4py lies beside its PETSc, where the Python of an environment does not look."""
+    folder = tmp_path / "petsc3.18" / "x86-real" / "lib" / "python3" / "dist-packages"
+    (folder / "petsc4py").mkdir(parents=True)
+    monkeypatch.setattr(
+        startup, "DISTRIBUTION", str(tmp_path / "*/*-real/lib/python3/dist-packages/petsc4py")
+    )
+    for name in [name for name in sys.modules if name.startswith("petsc4py")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "petsc4py", None)
+    with pytest.raises(
+        InputError, match=f"the distribution's is in {folder}: add this folder to PYTHONPATH$"
+    ):
+        startup.start_petsc()
+    monkeypatch.syspath_prepend(folder)  # and broken all the same
+    with pytest.raises(InputError, match=r"conda, clusters and PyPI$"):
+        startup.start_petsc()

@@ -195,5 +195,5 @@ def test_the_command_line_overrides_the_environment_which_overrides_the_scene(tm
 
 
 def test_options_in_files_are_refused_like_those_of_the_command_line(tmp_path: Path) -> None:
-    (tmp_path / ".petscrc").write_text("-ksp_rtol 1e-6  # and then\n-fp_trap\n")
-    refused(["info"], tmp_path, ".petscrc: -fp_trap: ends Python")
+    (tmp_path / "mine").write_text("-ksp_rtol 1e-6  # and then\n-fp_trap\n")
+    refused(["info", "--petscrc=mine"], tmp_path, "--petscrc: mine: -fp_trap: ends Python")

@@ -188,12 +188,10 @@ def test_the_exit_code_fits_the_message(tmp_path: Path, words: list[str]) -> Non
     assert message in left.err
 
 
-@pytest.mark.parametrize(
-    "line", ["-fp_trap", "-python", "-history /nonexistent/log", "-options_file .petscrc"]
-)
+@pytest.mark.parametrize("line", ["-fp_trap", "-python", "-history /nonexistent/log", "-options_file mine"])
 def test_options_files_are_checked_before_petsc_reads_them(tmp_path: Path, line: str) -> None:
-    (tmp_path / ".petscrc").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
-    left = lyra(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
+    (tmp_path / "mine").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
+    left = lyra(["run", write_scene(tmp_path), "--out", "out", "--petscrc", "mine"], tmp_path)
     assert left.code == 2, left.err
     (message,) = left.err.splitlines()
-    assert message.startswith(f"lyra-petsc: .petscrc: {line.split()[0]}: ")
+    assert message.startswith(f"lyra-petsc: --petscrc: mine: {line.split()[0]}: ")

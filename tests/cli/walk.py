@@ -45,13 +45,14 @@ def simulate(scene: Path, words: list[str]) -> int:
     from mpi4py import MPI
     from petsc4py import PETSc
 
-    from lyra_petsc.cli.arguments import split, start_error
+    from lyra_petsc.cli.arguments import split
     from lyra_petsc.errors import LyraError
     from lyra_petsc.scene.load import load_scene
+    from lyra_petsc.startup import options_error
     from lyra_petsc.stepping.simulation import SteppedScene
 
     ours, petsc = split(words)
-    why = start_error(petsc)
+    why = options_error(petsc)
     if why:
         print(f"lyra-petsc: {why}", file=sys.stderr)
         return 2

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
@@ -29,6 +28,8 @@ from lyra_petsc.show.render.scene_drawing import (
 )
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Image = NDArray[np.uint8]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import os
+import platform
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +21,7 @@ REMEDY = (
 
 def share_cores(comm: MPI.Comm) -> None:
     """Divide the cores of a machine among its ranks for drawing; collective, before anything is drawn."""
-    from mpi4py import MPI
-
-    here = comm.Split_type(MPI.COMM_TYPE_SHARED)
-    ranks_here = here.size
-    here.Free()
+    ranks_here = comm.allgather(platform.node()).count(platform.node())
     if ranks_here > 1:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, cores // ranks_here)))

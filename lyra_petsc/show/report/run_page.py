@@ -23,6 +23,7 @@ from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import is_locked
+from lyra_petsc.parallel import ALONE
 from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing, surface
@@ -608,8 +609,6 @@ def _rendered(run: StoredRun) -> list[Drawing]:
     """Pictures of a few states as ``render`` draws them; empty without its packages or OpenGL."""
     if missing_packages(PACKAGES):
         return []
-    from mpi4py import MPI
-
     from lyra_petsc.show.render.draw import draw
 
     states = chosen_states(run)
@@ -618,7 +617,7 @@ def _rendered(run: StoredRun) -> list[Drawing]:
         options = RenderOptions(run.folder, at=times, out=Path(folder), size=PICTURE_SIZE, label=False)
         try:
             plan = make_plan(options)
-            draw(MPI.COMM_SELF, plan, lambda done, count: None)
+            draw(ALONE, plan, lambda done, count: None)
             drawn = {state: path.read_bytes() for path, state in plan.pictures}
         except LyraError:  # no OpenGL: the page has plain pictures
             return []

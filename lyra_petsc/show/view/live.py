@@ -18,6 +18,7 @@ from pathlib import Path
 
 from lyra_petsc.api.mpirun import environment
 from lyra_petsc.errors import LyraError
+from lyra_petsc.startup import module_command
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
 """Packages of the extra ``view`` that the page needs."""
@@ -52,7 +53,7 @@ class LivePage:
         self._ready, self._failed, self._announced = ready, failed, False
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "lyra_petsc.show.view.live", host, str(port)],
+                [*module_command("lyra_petsc.show.view.live"), host, str(port)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
