@@ -14,11 +14,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import imageio_ffmpeg
+from PIL import Image
+
 ROOT = Path(__file__).resolve().parent.parent
 GALLERY = ROOT / "docs" / "gallery"
 LIMIT = 5_000_000
 """Bytes of all pictures and films."""
-SIZE = "640x360"
+COMPRESSED = ["-c:v", "libx264", "-crf", "31", "-preset", "veryslow", "-movflags", "+faststart"]
+"""Options of ffmpeg for small films."""
 GIF = "flag"
 """The scene that moves in the README."""
 
@@ -58,9 +62,9 @@ ENTRIES = {
     "ball": Entry(1.0, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
     "flag-contact": Entry(1.5, ("--handles", "--wind")),
     "tablecloth": Entry(1.5, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
-    "stack": Entry(0.3, ("--field", "displacement"), speed=0.5),
+    "stack": Entry(0.3, speed=0.5),
     "twist": Entry(1.6, ("--handles", "--colors", "#2f6f9f,#f3e7d3")),
-    "reef-knot": Entry(1.0, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
+    "reef-knot": Entry(1.0, speed=0.5),
     "shell": Entry(1.0, ("--handles", "--field", "curvature")),
 }
 
@@ -79,10 +83,13 @@ def make(name: str, entry: Entry, runs: Path, ranks: int) -> None:
     if not (run / "summary.json").exists():
         settings = [word for setting in entry.settings for word in ("--set", setting)]
         lyra("run", f"configs/{name}.yaml", "--out", str(run), "--force", *settings, ranks=ranks)
-    look = ("--size", SIZE, "--out", str(run), *entry.options)
-    lyra("render", str(run), "--at", f"{entry.at:g}", *look)
-    (run / f"picture-{entry.at:g}.png").replace(GALLERY / f"{name}.png")
-    lyra("render", str(run), "--film", str(GALLERY / f"{name}.mp4"), "--speed", f"{entry.speed:g}", *look)
+    lyra("render", str(run), "--at", f"{entry.at:g}", *entry.options)
+    with Image.open(run / f"picture-{entry.at:g}.png") as picture:
+        picture.save(GALLERY / f"{name}.png", optimize=True)
+    film = run / "film.mp4"
+    lyra("render", str(run), "--film", str(film), "--speed", f"{entry.speed:g}", *entry.options)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-i", str(film), *COMPRESSED]
+    subprocess.run([*command, str(GALLERY / f"{name}.mp4")], check=True)
 
 
 def main() -> None:

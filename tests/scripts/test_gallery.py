@@ -31,7 +31,7 @@ def test_every_scene_is_shown_and_all_is_small(gallery):
     assert sum(path.stat().st_size for path in gallery.GALLERY.iterdir()) < gallery.LIMIT
     for name in names:
         with Image.open(gallery.GALLERY / f"{name}.png") as picture:
-            assert picture.size == (640, 360)
+            assert picture.size == (1280, 720)
 
 
 @pytest.mark.slow

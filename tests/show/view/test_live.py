@@ -163,9 +163,9 @@ def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_
         assert group.read_text().endswith(f"nice {NICENESS}\n")
 
     page.end()
-    time.sleep(6.0)
+    time.sleep(5.0)
     connection = opened(messages[0])
-    time.sleep(6.0)
+    time.sleep(5.0)
     assert pages(tmp_path), "the page left those who look"
     connection.close()
     connection.sock = None
