@@ -158,9 +158,9 @@ def test_the_usual_folder_of_a_scene_is_no_link(stranger: Path, own: Path) -> No
 OPENS = {
     "output/file_operations.py": "opens",
     "scene/json_schema.py": "the user's cache",
-    "mesh/geo_file.py": "a temporary folder",
+    "mesh/library_file.py": "a temporary folder",
     "mesh/geo_script.py": "a temporary folder",
-    "mesh/gmsh_process.py": "an open file",
+    "mesh/library_process.py": "an open file",
     "experiments/bench.py": "a temporary folder",
     "show/export.py": "a folder that it has just made",
     "show/view/live.py": "/proc",
