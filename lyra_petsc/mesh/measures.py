@@ -112,18 +112,18 @@ def unit_normals(points: Array, triangles: Ints) -> Array:
     return _unit(np.cross(*triangle_sides(points[triangles])))
 
 
-def largest_folds(normals: Array, triangles: Ints, chosen: Ints) -> Array:
-    """Largest angle (n,) [°] between the ``chosen`` (n,) of triangles (F, 3) with unit normals (F, 3), and
-    those with which they have a vertex in common; at most 90, as neighbours may be oriented differently.
+def largest_changes(values: Array, triangles: Ints, chosen: Ints) -> Array:
+    """Largest difference (n,) between the values (F,) of ``chosen`` (n,) of triangles (F, 3) and those of
+    others with which they have a vertex in common.
     """
     corners = np.sort(triangles.ravel())
     owner = np.argsort(triangles.ravel(), kind="stable") // 3
     first, last = (np.searchsorted(corners, triangles[chosen], side) for side in ("left", "right"))
-    smallest = np.ones(len(chosen))
+    largest = np.zeros(len(chosen))
     for n, triangle in enumerate(chosen):
         around = np.concatenate([owner[begin:end] for begin, end in zip(first[n], last[n], strict=True)])
-        smallest[n] = np.abs(normals[around] @ normals[triangle]).min()
-    return np.degrees(np.arccos(np.minimum(smallest, 1.0)))
+        largest[n] = np.abs(values[around] - values[triangle]).max()
+    return largest
 
 
 def _projected(direction: Array, normal: Array) -> Array:

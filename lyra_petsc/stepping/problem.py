@@ -21,7 +21,7 @@ from lyra_petsc.linear.petsc_options import petsc_number
 from lyra_petsc.mesh.build import SAME_PLACE, build_scene_mesh
 from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.measures import largest_folds, mean_edge_length, unit_normals
+from lyra_petsc.mesh.measures import largest_changes, mean_edge_length, unit_normals
 from lyra_petsc.mesh.mesh import Mesh, Source
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.mesh.select import FLAT, select_vertices
@@ -283,7 +283,7 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
     """Refuse symmetry handles off a plane, and those at which hinges end, or a sheet is not normal to the
     plane.
 
-    A facet of a curved sheet that is normal to the plane is off by half the angle to the next facet.
+    A facet of a curved sheet that is normal to the plane is off it by half the angle to the next facet.
     """
     scene, mesh = rest.scene, rest.mesh
     tolerance = FLAT * float(np.ptp(mesh.positions, axis=0).max())
@@ -310,16 +310,15 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
                 "sheet must be normal; take another axis, or hold axes instead"
             )
         elif at_plane.any():
-            facets, normals = np.flatnonzero(at_plane), unit_normals(mesh.positions, mesh.triangles)
-            tilt = np.degrees(np.arcsin(np.minimum(np.abs(normals[facets, AXES.index(axis)]), 1.0)))
-            excess = tilt - LARGEST_TILT
-            steep = np.flatnonzero(excess > 0.0)
-            excess[steep] -= 0.5 * largest_folds(normals, mesh.triangles, facets[steep])
-            if (excess > 0.0).any():
-                worst = int(np.where(excess > 0.0, tilt, 0.0).argmax())
+            sine = unit_normals(mesh.positions, mesh.triangles)[:, AXES.index(axis)]
+            tilt = np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
+            steep = np.flatnonzero(at_plane & (np.abs(tilt) > LARGEST_TILT))
+            allowed = LARGEST_TILT + 0.5 * largest_changes(tilt, mesh.triangles, steep)
+            if len(off := steep[np.abs(tilt[steep]) > allowed]):
+                worst = off[np.abs(tilt[off]).argmax()]
                 problem = (
                     f"the sheet is off the normal of the plane {axis} = {np.median(coordinate):.6g} m by up "
-                    f"to {tilt[worst]:.3g}° (triangle {facets[worst]}), so that its image would make a fold; "
+                    f"to {abs(tilt[worst]):.3g}° (triangle {worst}), so that its image would make a fold; "
                     "choose the plane to which it is normal, or hold axes instead"
                 )
         if problem:

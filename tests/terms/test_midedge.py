@@ -865,18 +865,24 @@ def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> Non
         (1e-9, 3, 11, 11),
         (1e-9, 3, 40, 40),
         (0.7, 8, 20, 22.5),
+        (0, 3, 5, 0),
+        (0, 3, 30, 22.2),
     ],
 )
 def test_symmetry_needs_a_sheet_normal_to_its_plane(
     tmp_path: Path, arc: float, cells: int, incline: float, off: float
 ) -> None:
-    """Arcs [rad] that are inclined by some degrees where they meet the plane x = 0."""
+    """Arcs [rad] that are inclined by some degrees where they meet the plane x = 0; an arc of 0 is a sheet
+    that is folded along x.
+    """
     flat, faces = rectangle(cells, 2, 1.0, 0.5)
     angle, turn = arc * flat[:, 0], np.radians(incline)
-    x, z = np.sin(angle) / arc, (np.cos(angle) - 1.0) / arc
-    vertices = np.column_stack(
-        [x * np.cos(turn) + z * np.sin(turn), flat[:, 1], z * np.cos(turn) - x * np.sin(turn)]
-    )
+    if arc:
+        x, z = np.sin(angle) / arc, (np.cos(angle) - 1.0) / arc
+        x, z = x * np.cos(turn) + z * np.sin(turn), z * np.cos(turn) - x * np.sin(turn)
+    else:
+        x, z = flat[:, 0], np.abs(flat[:, 1] - 0.25) - flat[:, 0] * np.tan(turn)
+    vertices = np.column_stack([x, flat[:, 1], z])
     content = vault(obj_file(tmp_path / "sheet.obj", vertices, faces), symmetry_planes("x"))
     content["handles"] = content["handles"][1:]
     if not off:
