@@ -382,7 +382,7 @@ def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None]
     from lyra_petsc.mesh.library_file import mesh_geo, read_library_file
 
     if suffix != ".geo":
-        return read_library_file(source.file)
+        return read_library_file(source.file, report)
     return mesh_geo(
         source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, report=report
     )

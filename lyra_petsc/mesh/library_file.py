@@ -34,6 +34,9 @@ _SIZE_RATIO = 1.6
 SCRIPT_SECONDS = 60
 """Limit on the CPU time until gmsh begins to mesh, for scripts that loop for ever."""
 
+READ_RATE = 100_000
+"""Bytes of other formats for each of which the time to read them may be a second longer."""
+
 MESH_SECONDS = 3600
 """Limit on the CPU time of meshing."""
 
@@ -110,11 +113,12 @@ def mesh_geo(
     return sheet
 
 
-def read_library_file(path: Path) -> Sheet:
+def read_library_file(path: Path, report: Callable[[str], None] | None = None) -> Sheet:
     """Read a file by the library that knows its format (`library_formats.LIBRARIES`).
 
     Vertices and triangles are in the order in which the library returns them. What `msh_file.read_msh` drops
-    or splits with a note this does, too. Groups are those of the file, if the library reads them.
+    or splits with a note this does, too. Groups are those of the file, if the library reads them. ``report``
+    as for `mesh_geo`.
 
     Raises
     ------
@@ -129,7 +133,12 @@ def read_library_file(path: Path) -> Sheet:
         suffix = path.suffix.lower()
         copy = inside / f"mesh{suffix}"
         copy.write_bytes(usual_spelling(suffix, data))
-        _run_library(path, copy, inside, {"size": None, "algorithm": None}, Path(folder), meshed, None)
+        settings = {
+            "size": None,
+            "algorithm": None,
+            "script_seconds": SCRIPT_SECONDS + len(data) // READ_RATE,
+        }
+        _run_library(path, copy, inside, settings, Path(folder), meshed, report)
         sheet = _read_mesh(path, meshed, note_loose=True)
     sheet.tags = None
     return sheet
@@ -158,8 +167,8 @@ def _run_library(
     job = {
         "script": str(script),
         "folder": None if readable is None else str(readable),
-        **settings,
         "script_seconds": SCRIPT_SECONDS,
+        **settings,
         "mesh_seconds": MESH_SECONDS,
         "memory": memory,
         "max_triangles": 2 * memory // BYTES_PER_VERTEX,
@@ -181,7 +190,7 @@ def _run_library(
             start_new_session=True,  # Ctrl-C goes to this process only, which ends gmsh
         )
         try:
-            errors = _wait(process, outcome_file, lambda line: report and report(f"{path.name}: {line}"))
+            errors = _wait(path, process, outcome_file, report)
         finally:
             if process.poll() is None:
                 process.kill()
@@ -190,13 +199,15 @@ def _run_library(
     if "refused" in outcome:
         raise InputError(one_line(outcome["refused"]), file=path)
     if outcome.get("stage") != "done" or process.returncode != 0:
-        message = _failure(path, outcome.get("stage", ""), process.returncode, errors, memory)
+        message = _failure(path, outcome.get("stage", ""), process.returncode, errors, job)
         raise InputError(message, file=path)
 
 
-def _wait(process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[str], object]) -> bytes:
-    """Wait for gmsh's process, reporting progress; returns what the process wrote to stderr."""
-    began = time.monotonic()
+def _wait(
+    path: Path, process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[str], None] | None
+) -> bytes:
+    """Wait for the library's process, reporting progress; returns what the process wrote to stderr."""
+    began, library = time.monotonic(), LIBRARIES.get(path.suffix.lower())
     interval = FIRST_REPORT
     while time.monotonic() - began < _WALL_TIME_RATIO * (SCRIPT_SECONDS + MESH_SECONDS):
         try:
@@ -206,10 +217,11 @@ def _wait(process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[st
         outcome = _read_outcome(file)
         if outcome.get("stage") != "mesh" and time.monotonic() - began < 2.0 * FIRST_REPORT:
             continue  # most scripts that take this long to read never end, and the time limit ends them
-        doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading the script"
+        doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading it"
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
-        report(f"gmsh {doing}, {time.monotonic() - began:.0f} s so far")
+        if report is not None:
+            report(f"{path.name}: {library or 'gmsh'} {doing}, {time.monotonic() - began:.0f} s so far")
     return b""
 
 
@@ -248,7 +260,7 @@ def _read_mesh(path: Path, file: BinaryIO, *, note_loose: bool) -> Sheet:
     return sheet
 
 
-def _failure(path: Path, stage: str, code: int, errors: bytes, memory: int) -> str:
+def _failure(path: Path, stage: str, code: int, errors: bytes, job: dict[str, Any]) -> str:
     """Message on why the library did not finish."""
     library = LIBRARIES.get(path.suffix.lower())
     doing = "meshing" if stage == "mesh" else "reading the file" if library else "reading the script"
@@ -259,9 +271,9 @@ def _failure(path: Path, stage: str, code: int, errors: bytes, memory: int) -> s
         slow = "are its mesh sizes too small?"
     library = library or "gmsh"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
-        return f"{library} needs more than the {memory / 2**30:.3g} GiB there are, {doing}: {large}"
+        return f"{library} needs more than the {job['memory'] / 2**30:.3g} GiB there are, {doing}: {large}"
     if code in (-signal.SIGXCPU, -signal.SIGKILL):
-        seconds = MESH_SECONDS if stage == "mesh" else SCRIPT_SECONDS
+        seconds = job["mesh_seconds" if stage == "mesh" else "script_seconds"]
         return f"{library} did not finish {doing} in {seconds} s of CPU time; {slow}"
     if code < 0:
         hint = "; is it damaged?" if doing == "reading the file" else ""
