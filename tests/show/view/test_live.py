@@ -26,8 +26,11 @@ def pages(folder):
     found = []
     for entry in Path("/proc").iterdir():
         try:
-            words = entry.joinpath("cmdline").read_bytes().split(b"\0")
-            if b"lyra_petsc.show.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
+            line = entry.joinpath("cmdline").read_bytes()
+            if (
+                b"'lyra_petsc.show.view.live'" in line
+                and entry.joinpath("cwd").readlink() == folder.resolve()
+            ):
                 found.append(int(entry.name))
         except (OSError, ValueError):  # no process, or gone meanwhile
             continue
