@@ -38,7 +38,7 @@ from lyra_petsc.mesh.library_formats import (
 )
 
 _EQUILATERAL = math.sqrt(3) / 4
-_UNOPENED = re.compile("Unable to open file '(.*)'")
+_UNOPENED = re.compile(r"(?:line \d+: )?Unable to open file '(.*)'")
 _MIN_FILL = 0.25
 """Fraction of its bounding box that a surface fills at least, for estimates of the number of triangles."""
 
@@ -307,8 +307,9 @@ def _raise_refused(gmsh: ModuleType, script: str) -> Iterator[None]:
 
 
 def _saves(script: str, name: str) -> bool:
-    """Whether the script saves the mesh to a file of this name; the mesh goes to `library_file` anyway."""
-    return re.search(rb'\bSave\s+"' + re.escape(name.encode()) + b'"', Path(script).read_bytes()) is not None
+    """Whether the script writes a file of this name, of which none is needed here."""
+    writes = rb'(?:\b(?:Save|Print)\s+|>\s*)"' + re.escape(name.encode()) + b'"'
+    return re.search(writes, Path(script).read_bytes()) is not None
 
 
 if __name__ == "__main__":
