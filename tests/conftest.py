@@ -21,6 +21,7 @@ import faulthandler
 import gc
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -32,9 +33,10 @@ import numpy as np
 import pytest
 from compile_once import compile_once
 from mpi4py import MPI
+from patience import Patience
 
 WAIT_FOR_OTHERS = 20.0  # s that a failed rank gives the others to finish the test
-LONGEST_TEST = 300.0  # s after which every rank prints its stack and the job ends
+LONGEST_TEST = 300.0  # s of CPU time after which a rank prints its stack and the job ends; who waits computes
 
 WORLD = MPI.COMM_WORLD
 FAILURE = pytest.StashKey[str]()
@@ -96,6 +98,8 @@ def pytest_configure(config: pytest.Config) -> None:
     else:
         terminal = os.dup(2)
     config.stash[TERMINAL] = os.fdopen(terminal, "w")
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process, after the stack is printed
+    faulthandler.register(signal.SIGPROF, file=config.stash[TERMINAL], all_threads=True, chain=True)
     if WORLD.rank > 0:  # rank 0 speaks for all
         config.get_terminal_writer()._file = open(os.devnull, "w")  # noqa: SIM115
 
@@ -129,10 +133,10 @@ def together(item: pytest.Item) -> bool:
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     if together(item):
-        faulthandler.dump_traceback_later(LONGEST_TEST, exit=True, file=item.config.stash[TERMINAL])
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_TEST)
     yield
     if together(item):
-        faulthandler.cancel_dump_traceback_later()
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -149,10 +153,10 @@ def agree(item: pytest.Item) -> None:
     mine = item.stash.get(FAILURE, None)
     failed, any_failed = np.array([mine is not None], "i"), np.zeros(1, "i")
     request = WORLD.Iallreduce(failed, any_failed, MPI.MAX)
-    start = time.monotonic()
+    patience = Patience(WAIT_FOR_OTHERS)
     while not request.Test():
         time.sleep(1e-3)
-        if mine is not None and time.monotonic() - start > WAIT_FOR_OTHERS:
+        if mine is not None and patience.over:
             terminal = item.config.stash[TERMINAL]
             terminal.write(f"\nfailed on rank {WORLD.rank}, others still wait: {item.nodeid}\n{mine}\n")
             terminal.flush()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import pytest
+from patience import run_program
 
 from lyra_petsc.api.mpirun import environment, find_launcher
 
@@ -25,7 +25,7 @@ def test_a_launcher_can_be_started_after_mpi_init(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setenv(name, value)
     code = "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"
     command = [*find_launcher(2), sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60)
+    done = run_program(command, env=environment(), seconds=60)
     assert (done.returncode, sorted(done.stdout.replace("\n", ""))) == (0, ["2", "2"]), done.stderr
 
 

@@ -24,12 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import SECONDS, Patience, communicate
 
 ROOT = Path(__file__).parents[2]
 RANK = Path(__file__).with_name("rank.py")
-PATIENCE = 60.0
-"""Seconds after which a program counts as hanging."""
-
 SESSIONS = tempfile.mkdtemp(prefix="lyra-")
 """Folder of Open MPI's sessions: jobs of other processes that end at the same time remove a common one."""
 atexit.register(shutil.rmtree, SESSIONS, ignore_errors=True)
@@ -166,10 +164,10 @@ def start(
     )
 
 
-def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
+def finish(process: subprocess.Popen[str], patience: float = SECONDS) -> Left:
     """Wait for a process; one that hangs is killed with all its ranks and fails the test."""
     try:
-        out, err = process.communicate(timeout=patience)
+        out, err = communicate(process, patience)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         out, err = process.communicate()
@@ -178,13 +176,13 @@ def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
 
 
 def wait_until(
-    condition: Callable[[], object], process: subprocess.Popen[str] | None = None, patience: float = PATIENCE
+    condition: Callable[[], object], process: subprocess.Popen[str] | None = None, patience: float = SECONDS
 ) -> None:
     """Wait for an effect of a started process; fails if the process ends before, or takes too long."""
-    deadline = time.monotonic() + patience
+    waiting = Patience(patience)
     while not condition():
         assert process is None or process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline, "the program does not get on"
+        assert not waiting.over, "the program does not get on"
         time.sleep(0.01)
 
 
@@ -244,10 +242,9 @@ class Forks:
 def read_pipes(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
     """Text from pipes until they are closed, and whether this happened in time."""
     pieces = {file: bytearray() for file in files}
-    deadline = time.monotonic() + patience
-    still = set(files)
-    while still and (left := deadline - time.monotonic()) > 0.0:
-        for file in select.select(still, [], [], left)[0]:
+    waiting, still = Patience(patience), set(files)
+    while still and not waiting.over:
+        for file in select.select(still, [], [], 1.0)[0]:
             piece = os.read(file, 2**16)
             pieces[file] += piece
             if not piece:
@@ -272,7 +269,7 @@ def lyra(
     folder: Path,
     ranks: int = 1,
     extra: Mapping[str, str] | None = None,
-    patience: float = PATIENCE,
+    patience: float = SECONDS,
     **keywords: Any,
 ) -> Left:
     """Run the program in ``folder`` to its end."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 from launch import environment
+from patience import run_program
 
 PROGRAM = """
 import atexit
@@ -32,8 +32,6 @@ main()
 def test_no_garbage_collection_at_the_end(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    ended = subprocess.run(
-        [sys.executable, program], env=environment(), capture_output=True, text=True, timeout=60
-    )
+    ended = run_program([sys.executable, program], env=environment(), seconds=60)
     assert (ended.returncode, ended.stderr) == (3, "")
     assert ended.stdout.split("\n") == ["last line", "handlers run", ""]

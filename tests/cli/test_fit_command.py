@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from pathlib import Path
 
 from launch import done, finish, lyra, read_csv, start, wait_until, write_scene
@@ -39,7 +38,6 @@ def test_a_fit_writes_its_results_and_resumes(tmp_path: Path) -> None:
 def test_a_signal_in_the_first_evaluation_leaves_no_results(tmp_path: Path) -> None:
     process = start(["fit", write_scene(tmp_path, LONG), "--out", "out"], tmp_path)
     wait_until((tmp_path / "out" / "fit.lock").exists, process)
-    time.sleep(1.0)
     process.send_signal(signal.SIGTERM)
     left = finish(process)
     assert left.code == 143, left.err

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from launch import SCENE, done, environment, read_csv, write_scene
+from patience import run_program
 
 STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|balance|output): +\S+ +[\d.]+%", re.M)
 
@@ -74,9 +74,7 @@ print(after[0] - before[0], after[1] > before[1])
 """
     path = tmp_path / "program.py"
     path.write_text(program)
-    process = subprocess.run(
-        [sys.executable, path], env=environment(), capture_output=True, text=True, timeout=100
-    )
+    process = run_program([sys.executable, path], env=environment(), seconds=100)
     # the kernel that is called is compiled within the other one
     assert process.stdout.split() == ["1", "True"], process.stderr
 
@@ -106,9 +104,7 @@ event = PETSc.Log.Event("Marker")
 print([event.getPerfInfo(stage)["count"] for stage in (0, *(stage.id for stage in STAGES.values()))])
 print(list(STAGES))
 """
-    process = subprocess.run(
-        [sys.executable, "-c", program], env=environment(), capture_output=True, text=True, timeout=60
-    )
+    process = run_program([sys.executable, "-c", program], env=environment(), seconds=60)
     # once outside of all stages, once in each innermost stage
     assert process.stdout.splitlines() == [
         "[1, 1, 0, 0, 0, 0, 1, 1]",

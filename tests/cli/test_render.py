@@ -9,6 +9,7 @@ from unittest.mock import MagicMock
 
 import pytest
 from launch import SCENE, done, lyra, start, write_scene
+from patience import communicate
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
@@ -95,7 +96,7 @@ def test_a_signal_ends_a_film_without_files(tmp_path):
     while process.poll() is None and not part.exists():
         pass
     process.terminate()
-    _, err = process.communicate(timeout=60)
+    _, err = communicate(process)
     assert process.returncode == 143, err
     assert "stopped by SIGTERM after" in err
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -15,10 +15,10 @@ import time
 import traceback
 from pathlib import Path
 
-os.environ |= {"OMPI_MCA_ess_singleton_isolated": "1"}  # no daemon of Open MPI
-PATIENCE = 60.0
-"""Seconds after which a run counts as hanging."""
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from patience import Patience
 
+os.environ |= {"OMPI_MCA_ess_singleton_isolated": "1"}  # no daemon of Open MPI
 AT_A_TIME = 2
 
 
@@ -77,15 +77,15 @@ def files(folder: Path, name: str) -> tuple[Path, Path]:
 def run_all(folder: Path, runs: list[list[str]]) -> list[tuple[int, str, str]]:
     """Exit code (−1 if it hangs), stdout and stderr of each run; several run at the same time."""
     waiting = list(enumerate(runs))
-    going: dict[int, tuple[int, float]] = {}
+    going: dict[int, tuple[int, Patience]] = {}
     codes: dict[int, int] = {}
     while waiting or going:
         while waiting and len(going) < AT_A_TIME:
             number, words = waiting.pop(0)
-            going[number] = start(folder, words, f"run{number}"), time.monotonic() + PATIENCE
-        for number, (pid, deadline) in list(going.items()):
+            going[number] = start(folder, words, f"run{number}"), Patience()
+        for number, (pid, patience) in list(going.items()):
             ended, status = os.waitpid(pid, os.WNOHANG)
-            late = time.monotonic() > deadline
+            late = patience.over
             if late and not ended:
                 os.kill(pid, signal.SIGKILL)
                 os.waitpid(pid, 0)

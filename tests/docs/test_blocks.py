@@ -13,6 +13,7 @@ import click
 import pytest
 from blocks import PAGES, ROOT, Block, blocks_of, commands_of
 from launch import FORKS, RANK, environment
+from patience import run_program
 
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.verbs import verbs
@@ -114,9 +115,7 @@ def test_commands_run(page: Path, checkout: tuple[Path, dict[str, str]]) -> None
         if block.language == "python":
             (folder / "block.py").write_text(block.text, encoding="utf-8")
             command = ["python", "block.py"]
-        process = subprocess.run(
-            command, cwd=folder, env=variables, capture_output=True, text=True, timeout=PATIENCE
-        )
+        process = run_program(command, cwd=folder, env=variables, seconds=PATIENCE)
         said = f"{block.place}\n{block.text}\n{process.stdout[-2000:]}\n{process.stderr[-3000:]}"
         assert process.returncode == block.exit_code, said
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from module_of import module_of
+from patience import run_program
 from petsc4py import PETSc
 
 from lyra_petsc.cli.verbs import verbs
@@ -62,12 +62,10 @@ def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("material")
     pytest.importorskip("latex2mathml")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", "scripts/docs/mkdocs.yml"]
-    built = subprocess.run(
+    built = run_program(
         [*command, "--site-dir", str(tmp_path / "site")],
         cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        seconds=300,
     )
     assert built.returncode == 0, built.stdout + built.stderr
     assert (tmp_path / "site" / "tutorial.html").is_file()

@@ -21,6 +21,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from patience import Patience
+
 CPU_SECONDS = 60
 """Limit on the CPU time of a case; the first cases in a new checkout compile kernels."""
 
@@ -158,13 +160,13 @@ def judge(case: Case, folder: Path) -> Outcome:
 
 
 def _wait(pid: int) -> int:
-    deadline = time.monotonic() + WALL_SECONDS
+    patience = Patience(WALL_SECONDS)
     pause = 1e-3
     while True:
         found, status = os.waitpid(pid, os.WNOHANG)
         if found:
             return status
-        if time.monotonic() > deadline:
+        if patience.over:
             os.kill(pid, signal.SIGKILL)
             return os.waitpid(pid, 0)[1]
         time.sleep(pause)

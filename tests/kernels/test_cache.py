@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from numba import config
 from numba.core.caching import CacheImpl
+from patience import communicate, run_program
 
 from lyra_petsc.kernels import cache as kernel_cache
 from lyra_petsc.kernels.cache import KernelCache, cached, digest
@@ -122,7 +123,9 @@ def test_processes_that_start_together_with_an_empty_cache(place: Path) -> None:
         begun = [
             subprocess.Popen([sys.executable, "-c", code.format(bits)], env=environment) for bits in each
         ]
-        assert not any([process.wait(timeout=120) for process in begun])
+        for process in begun:
+            communicate(process)
+        assert not any(process.returncode for process in begun)
     assert not files(place, "tmp.*")
 
 
@@ -138,13 +141,10 @@ scene = {"mesh": {"grid": grid}, "material": stuff, "time": {"end": 0.01, "step"
 SteppedScene(MPI.COMM_SELF, Scene.model_validate(scene)).step()
 print(sorted(name.split(".")[-1] for name in sys.modules if name.startswith("lyra_petsc.terms.")))
 """
-    done = subprocess.run(
+    done = run_program(
         [sys.executable, "-c", code],
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
+        seconds=120,
     )
     loaded = set(done.stdout.split("[")[1].replace("'", "").strip("]\n").split(", "))
     assert "membrane" in loaded

@@ -1,10 +1,11 @@
 """Reporting and timing of compilation, only if numba really compiles."""
 
 import os
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
+
+from patience import run_program
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,9 +37,7 @@ def compiled(folder: Path, place: Path) -> list[str]:
     program = folder / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
     variables = {**os.environ, "NUMBA_CACHE_DIR": str(place), "PYTHONPATH": str(ROOT), "HOME": "/dev/null"}
-    done = subprocess.run(
-        [sys.executable, program], env=variables, capture_output=True, text=True, timeout=100
-    )
+    done = run_program([sys.executable, program], env=variables, seconds=100)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from patience import run_program
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.matrix import AssembledMatrix
@@ -117,12 +117,9 @@ def imported(**more: Any) -> set[str]:
         "initial": {"velocity": [0, 0, 1]},
     } | more
     script = SCRIPT.replace("HEAVY", repr(HEAVY))
-    done = subprocess.run(
+    done = run_program(
         [sys.executable, "-c", script, json.dumps(scene)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
+        seconds=120,
     )
     assert done.returncode == 0, done.stderr
     return set(json.loads(done.stdout.splitlines()[-1]))

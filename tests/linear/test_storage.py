@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import weakref
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from patience import run_program
 from petsc4py import PETSc
 from physics import CLOTH, Simulation, grid
 
@@ -181,7 +181,5 @@ def test_a_program_may_end_before_its_solvers_are_freed(kind: str) -> None:
     """PETSc frees them after Python has ended, and must not call matrices of type python then."""
     scene = {"mesh": grid(1, 1, 8, 8), "material": CLOTH, "time": {"end": 1, "step": 0.01}}
     script = SCRIPT.format(kind=kind, scene=scene)
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120
-    )
+    done = run_program([sys.executable, "-c", script], seconds=120)
     assert done.returncode == 0, done.stderr

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from mesh_sources import MeshSource, mesh_of
+from patience import run_program
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import library_file as geo
@@ -285,13 +285,11 @@ written.write("still open")
 @pytest.mark.skipif("seccomp" not in supported_layers(), reason="the kernel has no seccomp for us")
 def test_the_sandbox_refuses_what_gmsh_does_not_need(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(
+    done = run_program(
         [sys.executable, "-c", ATTEMPTS],
         cwd=tmp_path,
         env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
+        seconds=60,
     )
     *attempts, system, outside = done.stdout.splitlines()
     assert attempts.pop(0) == "thread", done.stderr

@@ -71,6 +71,6 @@ def test_no_triangles_no_edges() -> None:
 
 def test_fast_on_a_large_mesh() -> None:
     triangles = grid_mesh(nx=300, ny=300).triangles
-    begin = time.perf_counter()
+    begin = time.process_time()
     hinges(triangles)
-    assert time.perf_counter() - begin < 2.0
+    assert time.process_time() - begin < 2.0

@@ -8,6 +8,8 @@ import sys
 import venv
 from pathlib import Path
 
+from patience import run_program
+
 ROOT = Path(__file__).parents[2]
 NEEDED = {
     "numpy": "1.26.0",
@@ -63,13 +65,11 @@ def surroundings(folder: Path) -> dict[str, str]:
 
 def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run a script of the repository."""
-    return subprocess.run(
+    return run_program(
         ["bash", str(ROOT / "scripts" / script), *arguments],
         cwd=cwd,
         env=surroundings(cwd) | variables,
-        capture_output=True,
-        text=True,
-        timeout=60,
+        seconds=60,
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from environments import NEEDED, ROOT, activated, call, make, put, site_packages, surroundings
+from patience import Patience
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")
 
@@ -159,13 +160,13 @@ def test_an_interrupt_ends_pytest(made: Path, tmp_path: Path, number: int) -> No
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     pid = tmp_path / "pid"
-    deadline = time.monotonic() + 30.0
+    patience = Patience()
     while not (pid.exists() and pid.read_text()):
-        assert time.monotonic() < deadline
+        assert not patience.over
         time.sleep(0.02)
     os.killpg(process.pid, number)  # as a terminal does
-    assert process.wait(timeout=20.0) != 0
+    assert process.wait(timeout=600.0) != 0
     while at_work(int(pid.read_text())):
-        assert time.monotonic() < deadline + 20.0
+        assert not patience.over
         time.sleep(0.02)
     assert list(logs.iterdir()) == []

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,6 +114,15 @@ def test_a_case_ends_at_its_time_limit(comm: MPI.Comm, monkeypatch: pytest.Monke
     monkeypatch.setitem(stress_runner.TIME_LIMIT, Scope.QUICK, 0.0)
     outcome = run_case(comm, StressCase("a", "b", base_scene), SMALL)
     assert "has had its time" in outcome.failures["converged"].message
+
+
+@pytest.mark.parallel(2)
+def test_time_without_a_processor_is_not_the_case_s(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(stress_runner.TIME_LIMIT, Scope.QUICK, 1e3)
+    hours = itertools.count()
+    clock = SimpleNamespace(perf_counter=lambda: 3600.0 * next(hours), process_time=time.process_time)
+    monkeypatch.setattr(stress_runner, "time", clock)
+    assert run_case(comm, StressCase("a", "b", base_scene), SMALL).failures == {}
 
 
 def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> None:

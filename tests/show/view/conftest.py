@@ -17,6 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from patience import communicate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
 
@@ -38,7 +39,7 @@ class Served:
 
     def get(self, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
         """Send a request without a browser; ``_`` in names of headers stands for ``-``."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=600)
         connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
         answer = connection.getresponse()
         return answer.status, dict(answer.getheaders()), answer.read()
@@ -64,7 +65,7 @@ def serving(place: Path) -> Iterator[Serve]:
         started.append(process)
         line = process.stdout.readline()
         found = re.fullmatch(r"view: (http://\S+)\n", line)
-        assert found, line + process.communicate(timeout=30)[1]
+        assert found, line + communicate(process)[1]
         return Served(process, found[1])
 
     try:

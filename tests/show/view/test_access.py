@@ -5,7 +5,8 @@ import signal
 import socket
 
 import pytest
-from launch import PATIENCE, finish
+from launch import finish
+from patience import SECONDS
 from written_run import written
 
 from lyra_petsc.show.view.server import Access, is_loopback
@@ -76,7 +77,7 @@ def test_malformed_requests_are_answered_without_a_traceback(quiet_page):
         b"GET /\xe9 HTTP/1.1",
         b"GET / HTTP/1.1\r\nHost",
     ):
-        with socket.create_connection(("127.0.0.1", page.port), PATIENCE) as connection:
+        with socket.create_connection(("127.0.0.1", page.port), 10 * SECONDS) as connection:
             connection.sendall(request + b"\r\n\r\n")
             assert connection.recv(12).endswith(b" 400"), request
 
@@ -92,7 +93,7 @@ def test_unknown_messages_end_their_web_socket_only(serve, tmp_path):
             for message in (b"\xff\x00", b"\x81\xa6wslink\xa31.0", b""):
                 async with session.ws_connect(address) as socket:
                     await socket.send_bytes(message)
-                    assert (await socket.receive(timeout=PATIENCE)).type is not aiohttp.WSMsgType.TEXT
+                    assert (await socket.receive(timeout=10 * SECONDS)).type is not aiohttp.WSMsgType.TEXT
 
     asyncio.run(send())
     assert page.get(f"/index.html?token={page.token}")[0] == 200
@@ -157,5 +158,5 @@ def test_a_given_port_is_used_and_refused_if_taken(serve, tmp_path):
     assert len(left.ours) == 1
     assert f"--port: 127.0.0.1:{page.port} cannot be used: Address already in use" in left.ours[0]
     page.process.terminate()
-    page.process.wait(PATIENCE)
+    page.process.wait(10 * SECONDS)
     assert serve(tmp_path / "run", "--port", str(page.port)).port == page.port

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from launch import SCENE, UNHURRIED, done, finish, lyra, start, write_scene
+from patience import Patience
 from written_run import Writer
 
 from lyra_petsc.output.read_run import StoredRun
@@ -17,8 +18,6 @@ from lyra_petsc.show.view.live import NICENESS, LivePage
 
 SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
 """The same scene with a much later end."""
-
-PATIENCE = 60.0
 
 
 def pages(folder):
@@ -38,9 +37,9 @@ def pages(folder):
 
 
 def until(condition, what):
-    deadline = time.monotonic() + PATIENCE
+    patience = Patience()
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert not patience.over, what
         time.sleep(0.05)
 
 
