@@ -21,8 +21,6 @@ Result = TypeVar("Result")
 # the exceptions by which h5py reports a failure of HDF5, depending on the call and the version
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
 
-NOT_PLAIN = "it is a link, has a second name (a hard link) or is no plain file; remove it"
-
 
 def reason(error: BaseException) -> str:
     """The cause of a failed file operation as a short text on one line."""
@@ -82,12 +80,17 @@ def open_regular_file(path: str | os.PathLike[str], flags: int) -> int:
     except OSError as error:
         if error.errno not in (errno.ELOOP, errno.ENXIO):
             raise
-        raise OSError(NOT_PLAIN) from None
+        raise _not_plain(path) from None
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         os.close(descriptor)
-        raise OSError(NOT_PLAIN)
+        raise _not_plain(path)
     return descriptor
+
+
+def _not_plain(path: str | os.PathLike[str]) -> OSError:
+    name = os.path.basename(path)
+    return OSError(f"{name} is a link, has a second name (a hard link), or is no plain file; remove it")
 
 
 def make_folder(path: Path) -> None:

@@ -71,7 +71,7 @@ def places(folder: Path) -> Iterator[Path]:
             yield path.with_name(f".{path.stem}.part{path.suffix}")
 
 
-def attack(words: list[str], folder: Path, own: Path) -> None:
+def attack(words: list[str], folder: Path, own: Path) -> str:
     """Run a command in a stranger's folder, and check that it leaves the user's file alone."""
     before = own.read_bytes()
     left = lyra(words, folder, extra=None if words[0] in WITH_PICTURES else PLAIN)
@@ -80,6 +80,7 @@ def attack(words: list[str], folder: Path, own: Path) -> None:
     assert left.code in (0, 2, 3), left.err
     assert len(left.ours) == (left.code != 0), left.err
     assert "Traceback" not in left.err
+    return left.err
 
 
 @pytest.fixture
@@ -108,7 +109,7 @@ def test_a_command_changes_nothing_outside_its_folder(stranger: Path, own: Path,
 def test_a_lock_file_is_no_link(stranger: Path, own: Path, lock: str, kind: str) -> None:
     (stranger / "new").mkdir()
     KINDS[kind](stranger / "new" / f"{lock}.lock", own)
-    attack(VERBS[lock], stranger, own)
+    assert f"new: --out: cannot be used: {lock}.lock is a link, " in attack(VERBS[lock], stranger, own)
 
 
 @pytest.mark.parametrize("kind", ["link", "hard link"])

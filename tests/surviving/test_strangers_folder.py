@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -109,6 +110,20 @@ def test_settings_of_numba_are_refused(tmp_path: Path) -> None:
     left = lyra(["check", write_scene(tmp_path)], tmp_path, program=words)
     assert left.code == 2
     assert left.ours == [line for line in left.ours if "numba would take settings from it" in line] != []
+
+
+def test_settings_of_matplotlib_start_no_latex(tmp_path: Path) -> None:
+    from written_run import written
+
+    written(tmp_path / "run")
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
+    (tmp_path / "latex").write_text(f"#!/bin/sh\ntouch '{tmp_path}/mark'\n")
+    (tmp_path / "latex").chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    words = ["-c", "from lyra_petsc.__main__ import main; main()"]
+    left = lyra(["report", "run"], tmp_path, program=words, extra={"PATH": path})
+    assert left.code == 0, left.err
+    assert not (tmp_path / "mark").exists()
 
 
 def monitored(left: Left) -> bool:

@@ -238,15 +238,21 @@ def _finish_axes(axes: Any) -> None:
 def make_drawing(figure: Any, name: str, caption: str) -> Drawing:
     """A matplotlib figure as SVG, and as PNG when that is first used."""
     from matplotlib import rc_context
+    from matplotlib.text import Text
+
+    # without LaTeX, whatever a matplotlibrc says, of which one may lie in the working directory
+    for text in figure.findobj(Text):
+        text.set_usetex(False)
 
     def png() -> bytes:
         content = io.BytesIO()
-        figure.savefig(content, format="png", dpi=150, metadata={"Software": None})
+        with rc_context({"text.usetex": False}):
+            figure.savefig(content, format="png", dpi=150, metadata={"Software": None})
         return content.getvalue()
 
     svg = io.BytesIO()
     # without date and with a fixed salt, the same data give the same file
-    with rc_context({"svg.hashsalt": name}):
+    with rc_context({"text.usetex": False, "svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     return Drawing(name, caption, png, svg.getvalue())
 
