@@ -1,6 +1,7 @@
 """``python -m lyra_petsc``, ``python FOLDER/lyra_petsc`` and the command ``lyra-petsc``."""
 
 import gc
+import io
 import os
 import sys
 
@@ -24,6 +25,10 @@ def main() -> None:
     from lyra_petsc.cli.signals import exit_on_signals
 
     exit_on_signals()  # before the imports that follow, which take a second
+    for stream in (sys.stdout, sys.stderr):
+        # a name that the terminal cannot show does not end a run
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
     from lyra_petsc.cli.app import run_command_line
 
     code = run_command_line(sys.argv)

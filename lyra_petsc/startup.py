@@ -158,6 +158,8 @@ def _all_options(words: Sequence[str]) -> list[str]:
 def options_error(options: Sequence[str], files: Sequence[str] = ()) -> str:
     """Message if PETSc would fail or crash when it reads these options; ``files`` include them."""
     for option, value in itertools.pairwise([*options, ""]):
+        if option != option.encode("utf-8", "replace").decode():
+            return f"{option}: must be text in UTF-8"
         if not option.startswith("-"):
             continue
         name = option.lstrip("-").lower()

@@ -23,7 +23,10 @@ done
 crowded=0
 ((ranks <= $(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc))) || crowded=1
 export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-$crowded}
+trap 'exit 143' USR1
 set_up "${extras[@]}"
 start=("${python[@]}" -m lyra_petsc)
+# a signal before Python's first line would end it with another exit code; the program unblocks it
+! env --block-signal=USR1 true 2>/dev/null || start=(env --block-signal=USR1 "${start[@]}")
 ((ranks == 1)) || start=("${launcher[@]}" -n "$ranks" "${start[@]}")
 exec "${start[@]}" "$@"

@@ -21,9 +21,13 @@ def stop_signals() -> tuple[signal.Signals, ...]:
 
 
 def exit_on_signals() -> None:
-    """Let the stop signals end the process at once without a message, until a run handles them."""
+    """Let the stop signals end the process at once without a message, until a run handles them.
+
+    A launcher may have blocked them, since they would end Python with another exit code before this.
+    """
     for number in stop_signals():
         signal.signal(number, _exit)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, stop_signals())
 
 
 def _exit(number: int, frame: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TypeVar, cast
 
-from lyra_petsc.errors import LyraError, OutputError
+from lyra_petsc.errors import InputError, LyraError, OutputError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -27,6 +27,22 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def possible_path(path: str | os.PathLike[str], key: str | None = None) -> Path:
+    """The path, which need not exist.
+
+    Raises
+    ------
+    InputError
+        If no file can have it: it holds a null character, or half of a surrogate pair.
+    """
+    try:
+        with suppress(OSError):
+            os.lstat(path)
+    except ValueError:
+        raise InputError(f"no file can have the name {os.fspath(path)!r}", key=key) from None
+    return Path(path)
 
 
 def cannot_write(path: Path, error: BaseException) -> OutputError:
@@ -175,7 +191,7 @@ def replace_text(path: str | os.PathLike[str], text: str) -> None:
     OutputError
         If the file cannot be written; then the old file is kept.
     """
-    replace_bytes(path, text.encode("utf-8"))
+    replace_bytes(path, text.encode("utf-8", "backslashreplace"))  # names of folders may be no text
 
 
 def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.extras import require_packages
-from lyra_petsc.output.file_operations import reason
+from lyra_petsc.output.file_operations import possible_path, reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.stored import StoredMesh, check_file, check_file_name, check_folder, read_stored
 from lyra_petsc.output.summary import read_summary
@@ -70,7 +70,7 @@ class StoredRun:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+        self.folder = possible_path(folder)
         self._load()
 
     def _load(self) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.file_operations import HDF5_ERRORS, open_regular_file, reason
+from lyra_petsc.output.file_operations import HDF5_ERRORS, open_regular_file, possible_path, reason
 from lyra_petsc.output.stored import check_folder, open_contained
 from lyra_petsc.parallel import on_root
 
@@ -203,7 +203,7 @@ def _choose_folder(
             raise InputError(f"must be the path of a folder, not {out!r}", key=key)
         if not os.fspath(out).strip():
             raise InputError("is empty; give the folder to write to", key=key)
-        choice = FolderChoice(Path(out), resume=resume, given=True, force=force, kind=kind)
+        choice = FolderChoice(possible_path(out, key), resume=resume, given=True, force=force, kind=kind)
     try:
         _check_choice(choice, key)
     except OSError as error:

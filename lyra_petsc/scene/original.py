@@ -32,6 +32,7 @@ from lyra_petsc.scene.values import (
     Vector,
     integer,
     number,
+    one_line,
     problem,
     shown,
 )
@@ -319,7 +320,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     vertices = cache(lambda cloth: read_vertices(files[cloth]))  # few scenes need them
     several = len(scene.cloths) > 1
     ours: dict[str, Any] = {
-        "title": path.stem,
+        "title": one_line(path.stem),
         "mesh": [],
         "material": [],
         "time": {"step": scene.frame_time / scene.frame_steps, "integrator": "semi-implicit"},

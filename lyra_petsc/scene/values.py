@@ -35,8 +35,8 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 
 def problem(message: str, *at: str | int) -> PydanticCustomError:
     """Error of a scene value; ``at`` is the path of the key relative to the block that is being checked."""
-    # not in the template, as text of the user may contain braces
-    return PydanticCustomError("scene", "{message}", {"message": message, "at": list(at)})
+    # not in the template, as text of the user may contain braces; pydantic takes only characters of UTF-8
+    return PydanticCustomError("scene", "{message}", {"message": one_line(message), "at": list(at)})
 
 
 def shown(value: object) -> str:
@@ -62,10 +62,21 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
+def characters(text: str) -> str:
+    """``text`` with pairs of surrogates, as JSON writes some characters, as these characters.
+
+    A single surrogate, or a byte that is not UTF-8 in a file name, cannot be written to files.
+    """
+    try:
+        return text.encode("utf-16", "surrogatepass").decode("utf-16")
+    except UnicodeDecodeError:
+        raise problem(f"must be text in UTF-8, not {shown(text)}") from None
+
+
 def path_beside(value: Any, info: ValidationInfo) -> Path:
     """An absolute path; a relative ``value`` is relative to the scene file."""
     directory = (info.context or {}).get("directory", Path.cwd())
-    path = Path(value)
+    path = Path(characters(str(value)))
     # symbolic links are not resolved: messages shall show the user's name
     return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
 
@@ -192,7 +203,7 @@ def _text(value: Any) -> str:
         raise problem(f"must be text, not {shown(value)} (put it in quotes)")
     if "\0" in value:
         raise problem("must be text without null characters")
-    return value
+    return characters(value)
 
 
 def _name(value: Any) -> str:

@@ -226,3 +226,11 @@ else:
     raise AssertionError
 """
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_names_that_no_file_can_have_are_refused() -> None:
+    for name in ("\ud800", "a\0b"):
+        with pytest.raises(lyra_petsc.InputError, match="no file can have the name"):
+            lyra_petsc.Run(name)
+        with pytest.raises(lyra_petsc.InputError, match="out: no file can have the name"):
+            lyra_petsc.run(lyra_petsc.load(SCENE), name)

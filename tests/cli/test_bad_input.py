@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from launch import SCENE, Left, done, lyra, refusal, without, write_scene
@@ -49,6 +50,14 @@ CASES: dict[str, tuple[tuple[str, str] | None, list[str], str]] = {
     "nothing to resume": (None, ["--resume"], "--resume"),
     "folder in use": (None, ["--out", "used"], "used"),
     "folder is a file": (None, ["--out", "empty.obj"], "empty.obj"),
+    "title that is no text": (("gravity:", 'title: "\\uD800"\ngravity:'), [], "title: must be text in UTF-8"),
+    "probe that is no text": (
+        ("gravity:", 'probes: {"\\uD800": {nodes: [0]}}\ngravity:'),
+        [],
+        "must be text in UTF-8",
+    ),
+    "option that is no text": (None, ["-ksp_type", "a\udcff"], "a\\udcff: must be text in UTF-8"),
+    "override that is no text": (None, ["--set", "title=a\udcff"], "--set title=a\\udcff"),
     "second scene": (None, ["other.yaml"], "other.yaml"),
 }
 
@@ -124,6 +133,7 @@ import re
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 import os, sys
 from mpi4py import MPI
 from lyra_petsc.cli.app import run_command_line
@@ -249,3 +259,16 @@ def test_ranks_agree_on_a_mistake(together: dict[str, tuple[Path, Listing, list[
     assert first.lines == first.ours
     assert all(other == Left(2, "", "") for other in others)
     assert listing(folder) == before
+
+
+def test_names_of_files_need_not_be_text(tmp_path: Path) -> None:
+    """Bytes that are not UTF-8 in the names of the scene and of folders, on a terminal for UTF-8 only."""
+    strict: dict[str, Any] = {"extra": {"PYTHONIOENCODING": "utf-8:strict"}, "program": ("-m", "lyra_petsc")}
+    folder = tmp_path / "in\udcff"
+    folder.mkdir()
+    scene = Path(write_scene(folder, SCENE)).rename(folder / "sc\udcfe.yaml")
+    done(["check", scene], tmp_path, **strict)
+    left = done(["run", scene, "--out", "out\udcff"], tmp_path, **strict)
+    assert "results      out\\udcff" in left.out
+    done(["check", "out\udcff"], tmp_path, **strict)
+    done(["run", "--out", "out\udcff", "--resume", "--set", "time.end=0.06"], tmp_path, **strict)

@@ -275,6 +275,55 @@ def test_the_number_of_further_mistakes_is_reported(tmp_path: Path) -> None:
         load_scene(path)
 
 
+SURROGATES: list[tuple[str, str]] = [
+    ("title", 'title: "\\uD800"'),
+    ("mesh[1].name", 'mesh: [{grid: {width: 1, height: 1, nx: 1, ny: 1}}, {file: a.obj, name: "\\uDFFFx"}]'),
+    ("mesh.file", 'mesh: {file: "\\uDCFF.obj"}'),
+    ("material.cloth", 'material: {cloth: "gray\\uD800"}'),
+    ("material.group", 'material: {cloth: gray-interlock, group: "\\uD800"}'),
+    (
+        "material.law",
+        'material: {cloth: gray-interlock, law: {warp: "\\uD800.csv", weft: b.csv, shear: c.csv}}',
+    ),
+    ("handles[0].group", 'handles: [{group: "\\uD800"}]'),
+    ("handles[0].motion", 'handles: [{nodes: [0], motion: "\\uD800"}]'),
+    ("motions", 'motions: {"\\uD800": [{time: 0}]}'),
+    ("probes", 'probes: {"\\uD800": {nodes: [0]}}'),
+    ("obstacles", 'obstacles: {"a\\uDC00b": {sphere: {center: [0, 0, 0], radius: 1}}}\ncontact: {}'),
+    ("obstacles.b.mesh.file", 'obstacles: {b: {mesh: {file: "\\uD800.obj"}}}\ncontact: {}'),
+    ("loads[0].group", 'loads: [{pressure: 1, group: "\\uD800"}]'),
+    ("petsc.ksp_type", 'petsc: {ksp_type: "\\uD800"}'),
+    ("petsc", 'petsc: {"\\uD800": 1}'),
+    ("output.fields", 'output: {fields: ["\\uD800"]}'),
+    ("time.integrator", 'time: {end: 1, step: 1, integrator: "\\uD800"}'),
+    ("", '"\\uD800": 1'),
+]
+
+
+@pytest.mark.parametrize(("key", "line"), SURROGATES, ids=[case[0] for case in SURROGATES])
+def test_half_of_a_surrogate_pair_is_refused_wherever_text_stands(
+    tmp_path: Path, key: str, line: str
+) -> None:
+    path = tmp_path / "scene.yaml"
+    first = line.partition(":")[0]
+    base = {
+        "mesh": "mesh: {grid: {width: 1, height: 1, nx: 1, ny: 1}}",
+        "material": "material: {cloth: gray-interlock}",
+        "time": "time: {end: 1, step: 1}",
+    }
+    path.write_text("\n".join([*(text for name, text in base.items() if name != first), line]) + "\n")
+    with pytest.raises(InputError) as caught:
+        load_scene(path, meshes_needed=False)
+    str(caught.value).encode()  # what is said can be written
+    assert (caught.value.key or "").startswith(key)
+
+
+def test_a_character_that_json_writes_as_two_surrogates_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(scene_text('title: "\\uD83D\\uDE00 flag"'))
+    assert load_scene(path).title == "\N{GRINNING FACE} flag"
+
+
 UNREADABLE = [
     (b"", "is empty"),
     (b" \n\t\n", "is empty"),

@@ -65,6 +65,19 @@ def test_signals_during_the_start(tmp_path: Path, seconds: float, number: signal
         assert steps(tmp_path / "out") == list(range(len(steps(tmp_path / "out"))))
 
 
+def test_a_signal_that_the_launcher_has_blocked_ends_the_program_at_its_first_line(tmp_path: Path) -> None:
+    """As scripts/lyra.sh does, since Python would end with another code before it."""
+    program = command(["run", write_scene(tmp_path, ENDLESS)])
+    process = subprocess.Popen(
+        ["bash", "-c", 'kill -USR1 $$; exec "$@"', "bash", *program],
+        cwd=tmp_path,
+        env=environment(),
+        preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1]),
+    )
+    assert process.wait(60) == 143
+    assert not (tmp_path / "runs").exists()
+
+
 def maps(pid: int) -> list[str]:
     """Check that the program's handlers are installed: the process catches SIGUSR1."""
     with open(f"/proc/{pid}/status", encoding="utf-8") as file:
