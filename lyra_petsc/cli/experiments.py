@@ -271,10 +271,11 @@ def fabric(
         if textile_tests.TESTS[case.test].bends and not tested.bends:
             return fabric_report.FabricOutcome(case, left_out="the material does not resist bending")
         if launcher is not None:
-            return textile_tests.launched(launcher, case, asked, watch)
-        return textile_tests.run_case(comm, case, tested, watch)
+            return textile_tests.launched(launcher, case, [*asked, "--out", str(folder), "--force"], watch)
+        return textile_tests.run_case(comm, case, tested, watch, folder)
 
     if job is not None:
+        folder = out
         outcome = run(next(case for case in cases if case.name == only))
         on_root(comm, lambda: save_record(job / OUTCOME_FILE, outcome.record))
         return FAILED if outcome.failed else 0

@@ -27,6 +27,18 @@ TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 
 
 @contextmanager
+def own_petsc_options() -> Iterator[None]:
+    """At the end of the block the PETSc options that were set in it are removed."""
+    database = PETSc.Options()
+    before = set(database.getAll())
+    try:
+        yield
+    finally:
+        for name in set(database.getAll()) - before:
+            database.delValue(name)
+
+
+@contextmanager
 def open_simulation(
     comm: MPI.Comm, scene: Scene, phases: Phases | None = None, **arguments: Any
 ) -> Iterator[SteppedScene]:
@@ -34,22 +46,19 @@ def open_simulation(
 
     ``arguments`` are passed to `SteppedScene`.
     """
-    before = set(PETSc.Options().getAll())
     simulation, alone = None, False
-    try:
-        simulation = SteppedScene(comm, scene, phases, **arguments)
-        yield simulation
-    except BaseException as error:
-        # an error on this rank only: destroying the simulation, which is collective, would deadlock
-        collective = isinstance(error, LyraError) and getattr(error, "collective", True)
-        alone = comm.size > 1 and not collective
-        raise
-    finally:
-        if simulation is not None and not alone:
-            simulation.destroy()
-        database = PETSc.Options()
-        for name in set(database.getAll()) - before:
-            database.delValue(name)
+    with own_petsc_options():
+        try:
+            simulation = SteppedScene(comm, scene, phases, **arguments)
+            yield simulation
+        except BaseException as error:
+            # an error on this rank only: destroying the simulation, which is collective, would deadlock
+            collective = isinstance(error, LyraError) and getattr(error, "collective", True)
+            alone = comm.size > 1 and not collective
+            raise
+        finally:
+            if simulation is not None and not alone:
+                simulation.destroy()
 
 
 def failure_message(comm: MPI.Comm, error: LyraError) -> str:
@@ -246,6 +255,30 @@ class Bench:
         path = Path(self._folder.name) / f"{self._files}{suffix}"
         path.write_text(text, encoding="utf-8")
         return str(path)
+
+    def run(self, content: Mapping[str, Any], folder: Path) -> Array:
+        """Run a scene with its results in a folder, as the verb ``run``; collective.
+
+        Returns positions (V, 3) [m] at the end, in mesh order.
+        """
+        from lyra_petsc.api.run_loop import ProgressCallbacks, simulate  # what keeps no run needs no files
+        from lyra_petsc.output.run_folder import choose_folder
+
+        class LastPositions(ProgressCallbacks):
+            x: Array
+
+            def done(self, simulation: SteppedScene, folder: Path) -> None:
+                self.x = simulation.problem.points.gather(simulation.problem.system.x)
+
+        def stop() -> int:
+            self.watch()
+            return 0
+
+        scene, last = validated(Scene, dict(content), file="scene of the case"), LastPositions()
+        choice = choose_folder(self.comm, folder.name, folder, force=True)
+        with own_petsc_options():
+            simulate(self.comm, scene, choice, last, stop)
+        return last.x
 
     @contextmanager
     def simulation(self, content: Mapping[str, Any], *, stops: Sequence[float] = ()) -> Iterator[Trial]:

@@ -42,18 +42,16 @@ def disc_mesh(angle: Array) -> tuple[Array, Ints]:
     return np.vstack([rim, np.zeros((1, 3))]), fan
 
 
-def drape_cloth(
+def drape_scene(
     bench: Bench,
     start: Array,
     faces: Ints,
     rest: Array,
     material: dict[str, Any],
     seed: int,
-    *,
     gap: float = DRAPE_GAP,
-    speed: float = SPEED,
-) -> Array:
-    """Simulate a cloth that comes to rest on the disc; returns its positions (V, 3) [m]; collective.
+) -> dict[str, Any]:
+    """The scene of a cloth that falls over the disc; collective.
 
     Parameters
     ----------
@@ -68,11 +66,9 @@ def drape_cloth(
         Seed of the noise that is added to the start.
     gap : float
         Contact gap [m]; must be below the shortest edge.
-    speed : float
-        Speed [m/s] of the fastest vertex below which the cloth counts as at rest.
     """
     disc = {"mesh": bench.mesh(*disc_mesh(np.radians(np.linspace(0.0, 360.0, 49))))}
-    content = {
+    return {
         "mesh": bench.mesh(start + [0.0, 0.0, 0.95 * gap], faces, rest=rest),
         "material": material,
         "time": {"end": STEP * STEPS, "step": STEP},
@@ -83,7 +79,14 @@ def drape_cloth(
         # many iterations, as stiff sheets fold slowly; shorter steps would cost more
         "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
     }
-    with bench.simulation(content) as trial:
+
+
+def drape_cloth(bench: Bench, scene: dict[str, Any], speed: float = SPEED) -> Array:
+    """Simulate a `drape_scene` until the cloth is at rest; returns positions (V, 3) [m]; collective.
+
+    It is if its fastest vertex is slower than ``speed`` [m/s].
+    """
+    with bench.simulation(scene) as trial:
         while not trial.simulation.finished:
             trial.step()
             # a bound on time, not on steps: steps of stiff sheets may be cut into many

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,11 @@ from lyra_petsc.experiments.drape import (
     CLOTH,
     MARGIN,
     STARTS,
+    STEP,
     count_folds,
     drape_cloth,
     drape_coefficient,
+    drape_scene,
     shadow,
 )
 from lyra_petsc.experiments.fabric.fabric_report import (
@@ -493,8 +496,8 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     return record
 
 
-ACROSS = 12
-"""Cells along the diameter of the cloth"""
+ACROSS = 24
+"""Least number of cells along the diameter of the cloth"""
 
 PIXELS = 240
 
@@ -505,13 +508,32 @@ def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
     return square_to_disc(flat - [1.0, 1.0, 0.0]), faces
 
 
-def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
-    """Drape test: 30 cm on a disc of 18 cm; drape coefficient and folds, mean and scatter of five starts."""
+def cells_across(fabric: Fabric) -> int:
+    """Cells along the diameter of the cloth: `ACROSS`, or as many as make them shorter than the bending
+    length (B / w)^⅓ of warp and weft.
+    """
+    weight = G * fabric.shell().density
+    shortest = min((fabric.rigidity(degrees) / weight) ** (1.0 / 3.0) for degrees in DIRECTIONS.values())
+    return max(ACROSS, math.ceil(2.0 * CLOTH / shortest))
+
+
+def cusick(bench: Bench, fabric: Fabric, degrees: float, folder: Path | None = None) -> Record:
+    """Drape test: 30 cm on a disc of 18 cm; drape coefficient and folds, mean and scatter of five starts.
+
+    The run of the first start is kept in a folder.
+    """
     record, coefficients, counts = Record(), [], []
     dark = np.zeros((1, 1), dtype=np.bool_)
     for start in range(STARTS):
-        flat, faces = _disc(ACROSS, start)
-        x = drape_cloth(bench, CLOTH * flat, faces, CLOTH * flat[:, :2], fabric.turned(degrees), start)
+        flat, faces = _disc(cells_across(fabric), start)
+        scene = drape_scene(bench, CLOTH * flat, faces, CLOTH * flat[:, :2], fabric.turned(degrees), start)
+        if record.drape is None and folder is not None:
+            title = {"title": f"Drape of {fabric.name}", "output": {"every": 2.0 * STEP}}
+            x = bench.run(scene | title, folder)
+        else:
+            x = drape_cloth(bench, scene)
+        if record.drape is None:
+            record.drape, record.triangles = x, faces
         dark = shadow(x, faces, PIXELS)
         coefficients.append(100.0 * drape_coefficient(dark))
         counts.append(float(count_folds(dark)))
@@ -525,9 +547,9 @@ def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     return record
 
 
-Measure = Callable[[Bench, Fabric, float], Record]
-
 DIRECTIONS = {"warp": 0.0, "weft": 90.0}
+
+Measure = Callable[..., Record]
 
 
 @dataclass(frozen=True)
@@ -538,12 +560,14 @@ class TextileTest:
     ----------
     title : str
     measure : callable (bench, fabric, degrees) → Record
+        With ``keeps_run``, also the folder of a run that is kept, or None.
     both : bool
         Run for warp and weft.
     direct : bool
         Use a direct linear solver.
     bends : bool
         Needs a bending stiffness.
+    keeps_run : bool
     """
 
     title: str
@@ -551,6 +575,7 @@ class TextileTest:
     both: bool = True
     direct: bool = True
     bends: bool = True
+    keeps_run: bool = False
 
 
 TESTS = {
@@ -559,7 +584,9 @@ TESTS = {
     "bending": TextileTest("KES-F 2, 1 cm bent to ±2.5 cm⁻¹", bending),
     "cantilever": TextileTest("ASTM D1388, overhang at 41.5°", cantilever),
     "loop": TextileTest("Peirce's heart loop", loop),
-    "cusick": TextileTest("BS 5058, 30 cm on a disc of 18 cm", cusick, both=False, direct=False),
+    "cusick": TextileTest(
+        "BS 5058, 30 cm on a disc of 18 cm", cusick, both=False, direct=False, keeps_run=True
+    ),
 }
 ALL = "all"
 
@@ -587,13 +614,16 @@ def cases_of(test: str) -> list[FabricCase]:
     return found
 
 
-def run_case(comm: MPI.Comm, case: FabricCase, fabric: Fabric, watch: Watch) -> FabricOutcome:
-    """Run a test; collective, the same outcome on all ranks."""
+def run_case(
+    comm: MPI.Comm, case: FabricCase, fabric: Fabric, watch: Watch, folder: Path | None = None
+) -> FabricOutcome:
+    """Run a test; collective, the same outcome on all ranks. A run that it keeps is in ``folder / NAME``."""
     began, test = time.perf_counter(), TESTS[case.test]
     with Bench(comm, watch, direct=test.direct) as bench:
         bench.watch()
         try:
-            record = test.measure(bench, fabric, case.degrees)
+            kept = [folder and folder / case.name] if test.keeps_run else []
+            record = test.measure(bench, fabric, case.degrees, *kept)
         except SolverError as error:
             record = Record(stopped=failure_message(comm, error))
         except ArithmeticError as error:  # in formulas for numbers that all ranks have

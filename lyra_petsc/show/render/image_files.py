@@ -48,11 +48,16 @@ def write_png(path: Path, image: Image) -> None:
     OutputError
         If it cannot be written.
     """
+    replace_bytes(path, png_bytes(image))
+
+
+def png_bytes(image: Image) -> bytes:
+    """The content of a PNG file of a picture."""
     from PIL import Image as Pictures
 
     buffer = io.BytesIO()
     Pictures.fromarray(image).save(buffer, format="PNG")
-    replace_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def half_size(image: Image) -> Image:

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+import lyra_petsc
 from lyra_petsc.errors import InputError
+from lyra_petsc.experiments import drape
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.case import OUTCOME_FILE, load_record, save_record
 from lyra_petsc.experiments.drape import DISC, count_folds, disc_mesh, drape_coefficient, shadow
 from lyra_petsc.experiments.fabric import textile_tests
-from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, outcome_of
+from lyra_petsc.experiments.fabric.fabric_report import FabricCase, Record, outcome_of, pictures
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
 from lyra_petsc.scene.materials.measured_curves import force_at
@@ -143,6 +145,31 @@ def test_a_failed_formula_fails_its_test_only(monkeypatch: pytest.MonkeyPatch) -
     outcome = textile_tests.run_case(MPI.COMM_SELF, cases_of("loop")[0], FABRIC, lambda: None)
     assert outcome.failed
     assert "elastica was not found" in outcome.record.stopped
+
+
+@pytest.mark.parametrize(("stiffness", "cells"), [(1e-4, 24), (2e-6, 30), (2.5e-7, 60)])
+def test_cells_of_the_drape_are_shorter_than_the_bending_length(stiffness: float, cells: int) -> None:
+    """c = 37, 10.07 and 5.03 mm; cells along the diameter of 30 cm."""
+    fabric = Fabric("fabric", FABRIC.block | {"bending": stiffness, "density": 0.2})
+    assert textile_tests.cells_across(fabric) == cells
+
+
+def test_the_drape_is_kept_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run of the first of two starts, which end long before they are at rest."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(textile_tests, "STARTS", 2)
+    monkeypatch.setattr(textile_tests, "cells_across", lambda fabric: 6)
+    monkeypatch.setattr(drape, "STEPS", 2)
+    (case,) = cases_of("cusick")
+    outcome = textile_tests.run_case(MPI.COMM_SELF, case, FABRIC, lambda: None, tmp_path)
+    assert outcome.status == "measured"
+    run = lyra_petsc.Run(tmp_path / "cusick")
+    np.testing.assert_allclose(run.positions[-1], outcome.record.drape, atol=1e-7)
+    assert "disc" in run.scene.obstacles
+    assert run.summary["outcome"] == "done"
+    names = {drawing.name: drawing.png for drawing in pictures(outcome)}
+    assert names.keys() == {"plots/cusick-drape", "plots/cusick-shadow"}
+    assert all(png.startswith(b"\x89PNG") for png in names.values())
 
 
 @pytest.mark.parametrize("count", [3, 6])

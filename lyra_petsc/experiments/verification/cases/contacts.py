@@ -13,7 +13,15 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.drape import CLOTH, DISC, STARTS, drape_cloth, drape_coefficient, shadow
+from lyra_petsc.experiments.drape import (
+    CLOTH,
+    DISC,
+    STARTS,
+    drape_cloth,
+    drape_coefficient,
+    drape_scene,
+    shadow,
+)
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, ring_disc, square_to_disc
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.verification_case import (
@@ -660,7 +668,7 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
     random = np.random.default_rng([MESHES.index(kind), start])
     flat, faces = _disc(kind, n, random)
     lifted, rest = _wavy(flat, random), CLOTH * flat[:, :2]
-    x = drape_cloth(bench, lifted, faces, rest, material, start, gap=SHORT, speed=AT_REST)
+    x = drape_cloth(bench, drape_scene(bench, lifted, faces, rest, material, start, SHORT), AT_REST)
     return drape_coefficient(shadow(x, faces, PIXELS))
 
 
