@@ -36,6 +36,10 @@ class SingleProcess:
 
     gather = allgather
 
+    def allreduce(self, value: Result, op: object = None) -> Result:
+        """The value."""
+        return value
+
 
 ALONE: Any = SingleProcess()
 """The only rank of a process without MPI."""

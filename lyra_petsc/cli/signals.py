@@ -50,4 +50,4 @@ class StopRequest:
 
     def signal_number(self) -> int:
         """The signal that any rank has received, else 0; collective."""
-        return max(self._comm.allgather(self._received))
+        return int(self._comm.allreduce(self._received, max))

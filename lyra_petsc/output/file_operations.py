@@ -160,9 +160,10 @@ def raise_on_all_ranks(comm: MPI.Comm, problem: LyraError | None) -> None:
     LyraError
         The same error on every rank, if any rank has one.
     """
-    for shared in comm.allgather(problem):
-        if shared is not None:
-            raise shared
+    first = comm.allreduce(comm.size if problem is None else comm.rank, min)
+    if first < comm.size:
+        shared = comm.bcast(problem, root=first)
+        raise shared
 
 
 def on_every_rank(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
