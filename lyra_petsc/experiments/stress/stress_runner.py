@@ -184,7 +184,7 @@ def _own_seconds() -> float:
 
 
 def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: float) -> None:
-    """Fill the record, step by step to the end or until `_own_seconds` of rank 0 are beyond the deadline [s]."""
+    """Fill the record, step by step to the end or until `_own_seconds` of rank 0 reach a deadline."""
     simulation = trial.simulation
     comm = simulation.comm
     mesh = simulation.problem.mesh
