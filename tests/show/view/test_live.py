@@ -150,6 +150,7 @@ def test_a_page_that_cannot_be_served_is_reported(tmp_path):
     assert "nowhere: no such folder" in messages[0]
 
 
+@pytest.mark.slow
 def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_path):
     """Also if the run ends before the browser has started."""
     writer = Writer(tmp_path / "run")
