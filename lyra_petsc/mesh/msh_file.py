@@ -46,7 +46,7 @@ ELEMENT_TYPES: dict[int, tuple[int, int, int]] = {
 
 
 _WITHOUT_TRIANGLES = {
-    1: ", only curves: make a surface; beside other physical groups it must be in one to be saved by gmsh",
+    1: ", only curves: make a surface, and beside other physical groups a Physical Surface of it",
     3: ", only solid elements: save the surface mesh",
 }
 
