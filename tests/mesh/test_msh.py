@@ -168,7 +168,9 @@ def test_a_file_with_curves_alone_says_what_gmsh_saves(tmp_path: Path, gmsh: Mod
         'Point(1) = {0, 0, 0}; Point(2) = {1, 0, 0}; Line(1) = {1, 2}; Physical Curve("a") = {1};\n'
     )
     for path in (file, script):
-        with pytest.raises(InputError, match=r"no triangles, only curves: make a surface, .* Physical Surface"):
+        with pytest.raises(
+            InputError, match=r"no triangles, only curves: make a surface, .* Physical Surface"
+        ):
             mesh_of(path)
 
 
