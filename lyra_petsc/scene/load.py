@@ -46,7 +46,7 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
     """
     path = Path(path)
     text = read_text(path)
-    data = _read_plain(path, text)
+    data, notes = _read_plain(path, text)
     if not isinstance(data, dict):
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
     with _refuse_recursion(path):
@@ -55,7 +55,9 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
             for block in _blocks_without_model(data):
                 block["bending_model"] = "hinge"
         overridden = apply_overrides(data, overrides)
-    return _load_checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
+    scene = _load_checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
+    scene._notes = notes
+    return scene
 
 
 def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> Scene:
@@ -114,6 +116,7 @@ def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
         other = _load_changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
     else:
         other = _load_changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+    other._notes = scene._notes
     return other.trusting_meshes() if scene.trusts_meshes else other
 
 
@@ -151,8 +154,10 @@ def _load_checked(
     return scene
 
 
-def _read_plain(path: Path, text: str) -> Any:
-    """The scene as plain values with the keys of this program, also for a file of the original program."""
+def _read_plain(path: Path, text: str) -> tuple[Any, list[str]]:
+    """The scene as plain values with the keys of this program, also for a file of the original program; and
+    notes on what of that has no effect.
+    """
     start = text.lstrip()
     if path.suffix.lower() == ".json" or start.startswith(("//", "/*")):
         data = parse_json(text, file=path)
@@ -162,7 +167,7 @@ def _read_plain(path: Path, text: str) -> Any:
     else:
         data, original = parse_yaml(text, file=path), False
     if not original:
-        return data
+        return data, []
     from lyra_petsc.scene.original import import_original
 
     return import_original(data, path)

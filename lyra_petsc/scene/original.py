@@ -1,14 +1,20 @@
-"""Conversion of scenes of the original Lyra program (conf.json, material tables, vertex labels) to our keys.
+"""Conversion of scenes of the original Lyra program and of ARCSim (conf.json, material tables, labels).
 
-As in the original, Δt = frame_time/frame_steps with one linear solve a step (``semi-implicit``), handles are
+As in the originals, Δt = frame_time/frame_steps with one linear solve a step (``semi-implicit``), handles are
 springs of 1000 N/m, a negative c12 of a measured cloth is set to 0, and there is no gravity by default. Other
-than in the original, ``end_time`` has an effect; ``texture`` has none, as it is for the original's window.
+than in Lyra, ``end_time`` has an effect; ``texture`` has none, as it is for the original's window.
+
+Lyra has part of ARCSim's keys. A scene with any of the others (`ARCSIM_KEYS`) is ARCSim's: then there is
+contact, with the friction of ARCSim, still air of 1 kg/m³ unless the scene has wind, and ``thicken`` makes
+bending proportional to the thickness. What has no counterpart (`IGNORED`) is named in a note. (Format: ARCSim
+0.3.1, Narain, Samii, Pfaff & O'Brien.)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -42,6 +48,51 @@ STRETCHING_SHAPE = (6, 4)
 BENDING_SHAPE = (3, 5)
 DEFAULT_FRAME_TIME = 0.04  # s
 DEFAULT_FRAME_STEPS = 8
+FRICTION, OBSTACLE_FRICTION = 0.6, 0.3
+"""ARCSim's coefficients of friction of cloths, and of cloths on obstacles, by default."""
+
+ARCSIM_KEYS = {
+    "scene": {"obstacles", "disable", "magic", "friction", "obs_friction", "timestep", "duration", "morphs"},
+    "cloth": {"remeshing", "reference", "velocity"},
+    "material": {"strain_limits", "yield_curv", "weakening", "elastic_modulus"},
+}
+"""Keys that Lyra does not have."""
+
+_NOT_SIMULATED = "no effect here"
+IGNORED = {
+    "scene": {"morphs": _NOT_SIMULATED, "passive_time": _NOT_SIMULATED, "remeshing_frames": _NOT_SIMULATED},
+    "cloth": {
+        "remeshing": "no effect here: the triangles stay those of the mesh file, which must be fine enough",
+        "reference": "no effect here: the rest shape is that of the mesh file",
+    },
+    "material": {
+        "strain_limits": "no effect here: the sheet stretches by its stiffness",
+        **dict.fromkeys(
+            ("yield_curv", "weakening", "yield_stretch", "plastic_flow", "plastic_limit"),
+            "no effect here: plasticity is not simulated",
+        ),
+        **dict.fromkeys(
+            (
+                *("toughness", "fracture_bending_mult", "bending_factor"),
+                *("bend_width", "initiation_factor"),
+            ),
+            "no effect here: fracture is not simulated",
+        ),
+    },
+    "obstacle": {
+        **dict.fromkeys(("start_time", "end_time"), "no effect here: obstacles are always there"),
+        "proxy": "no effect here: the obstacle is its mesh",
+    },
+    "magic": dict.fromkeys(
+        (
+            *("fixed_high_res_mesh", "collision_stiffness", "projection_thickness", "edge_flip_threshold"),
+            *("rib_stiffening", "combine_tensors", "add_jitter", "preserve_creases", "separation_step_size"),
+            *("relax_method", "max_cracks", "enable_localopt"),
+        ),
+        "no effect here: for ARCSim's own algorithms",
+    ),
+}
+"""ARCSim's keys of each kind of block that have no effect here, and why."""
 
 
 def _rotation(value: Any) -> Any:
@@ -94,14 +145,31 @@ class Placement(Block):
 
 
 class OriginalMaterial(Block):
-    unsupported = dict.fromkeys(("yield_curv", "weakening"), "plasticity is not simulated; leave the key out")
-
-    data: Text
+    data: Text = ""
+    thickness: Positive | None = None
+    density: Positive | None = None
+    elastic_modulus: Positive | None = None
+    poisson_ratio: Number = 0.0
     density_mult: Positive = 1.0
     stretching_mult: Positive = 1.0
     bending_mult: NonNegative = 1.0
     thicken: Positive = 1.0
     damping: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check_numbers(self) -> Self:
+        for name in () if self.data else ("thickness", "density", "elastic_modulus"):
+            if getattr(self, name) is None:
+                raise problem(
+                    "missing (a material has data, or thickness, density and elastic_modulus)", name
+                )
+        return self
+
+
+class OriginalVelocity(Block):
+    linear: Vector = (0.0, 0.0, 0.0)
+    angular: Vector = (0.0, 0.0, 0.0)
+    origin: Vector = (0.0, 0.0, 0.0)
 
 
 class OriginalCloth(Block):
@@ -109,6 +177,7 @@ class OriginalCloth(Block):
     transform: Placement = Field(default_factory=Placement)
     materials: list[OriginalMaterial]
     texture: Text = ""
+    velocity: OriginalVelocity = Field(default_factory=OriginalVelocity)
 
     @model_validator(mode="after")
     def _check_materials(self) -> Self:
@@ -151,8 +220,19 @@ class OriginalKeyframe(Block):
         return self
 
 
+class OriginalObstacle(Block):
+    mesh: Text
+    transform: Placement = Field(default_factory=Placement)
+    motion: Annotated[Index | None, BeforeValidator(_motion_number)] = None
+
+
+class OriginalMagic(Block):
+    handle_stiffness: Positive = HANDLE_STIFFNESS
+    repulsion_thickness: Positive | None = None
+
+
 class OriginalWind(Block):
-    density: NonNegative = 0.0
+    density: NonNegative | None = None
     velocity: Vector = (0.0, 0.0, 0.0)
     drag: NonNegative = 0.0
 
@@ -162,13 +242,22 @@ class OriginalScene(Block):
 
     frame_time: Positive = DEFAULT_FRAME_TIME
     frame_steps: Count
+    timestep: Positive | None = None
+    save_frames: Count = 1
+    save_every: Count = 1
     end_time: Positive | None = None
     end_frame: Count | None = None
+    duration: Positive | None = None
     cloths: list[OriginalCloth]
     handles: list[OriginalHandle] = Field(default_factory=list)
     motions: list[Annotated[list[OriginalKeyframe], BeforeValidator(_motion_keyframes)]] = Field(
         default_factory=list
     )
+    obstacles: list[OriginalObstacle] = Field(default_factory=list)
+    disable: list[Text] = Field(default_factory=list)
+    magic: OriginalMagic = Field(default_factory=OriginalMagic)
+    friction: NonNegative = FRICTION
+    obs_friction: NonNegative = OBSTACLE_FRICTION
     gravity: Vector | None = None
     wind: OriginalWind = Field(default_factory=OriginalWind)
 
@@ -181,11 +270,12 @@ class OriginalScene(Block):
     def _check_references(self) -> Self:
         if not self.cloths:
             raise problem("must hold at least one cloth", "cloths")
+        users = [("handles", i, handle.motion) for i, handle in enumerate(self.handles)]
+        users += [("obstacles", i, obstacle.motion) for i, obstacle in enumerate(self.obstacles)]
+        for key, i, motion in users:
+            if motion is not None and motion >= len(self.motions):
+                raise problem(f"there is no motion {motion}, only {len(self.motions)}", key, i, "motion")
         for i, handle in enumerate(self.handles):
-            if handle.motion is not None and handle.motion >= len(self.motions):
-                raise problem(
-                    f"there is no motion {handle.motion}, only {len(self.motions)}", "handles", i, "motion"
-                )
             if handle.cloth >= len(self.cloths):
                 raise problem(
                     f"there is no cloth {handle.cloth}, only {len(self.cloths)}", "handles", i, "cloth"
@@ -300,8 +390,36 @@ def read_vertices(file: Path) -> ObjVertices:
     return found
 
 
-def import_original(data: Any, path: Path) -> dict[str, Any]:
-    """Convert a parsed conf.json to plain values in our keys.
+def _blocks(data: Any) -> Iterator[tuple[str, str, Any]]:
+    """Kind, key and content of the blocks of a conf.json that may have keys of ARCSim."""
+
+    def entries(block: Any, name: str) -> list[tuple[str, Any]]:
+        found = block.get(name) if isinstance(block, dict) else None
+        return [(f"{name}[{i}]", entry) for i, entry in enumerate(found if isinstance(found, list) else [])]
+
+    yield "scene", "", data
+    yield "magic", "magic", data.get("magic") if isinstance(data, dict) else None
+    yield from (("obstacle", key, block) for key, block in entries(data, "obstacles"))
+    for key, cloth in entries(data, "cloths"):
+        yield "cloth", key, cloth
+        yield from (("material", f"{key}.{name}", block) for name, block in entries(cloth, "materials"))
+
+
+def _without_ignored(data: Any) -> tuple[Any, bool, list[str]]:
+    """A copy of ``data`` without `IGNORED` keys, whether it has keys of ARCSim only, and notes."""
+    data = deepcopy(data)
+    arcsim, places = False, dict[str, list[str]]()
+    for kind, key, block in _blocks(data):
+        if isinstance(block, dict):
+            arcsim |= not ARCSIM_KEYS.get(kind, set()).isdisjoint(block)
+            for name in [name for name in block if name in IGNORED[kind]]:
+                del block[name]
+                places.setdefault(IGNORED[kind][name], []).append(f"{key}.{name}" if key else name)
+    return data, arcsim, [f"{', '.join(keys)}: {why}" for why, keys in places.items()]
+
+
+def import_original(data: Any, path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Convert a parsed conf.json to plain values in our keys; and notes on what has no effect here.
 
     Parameters
     ----------
@@ -315,62 +433,129 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     InputError
         Unknown keys, values out of range, files that do not exist.
     """
+    data, arcsim, notes = _without_ignored(data)
+    if isinstance(data, dict) and isinstance(pattern := data.get("obstacles"), str):
+        data["obstacles"] = _numbered_obstacles(pattern, path, data.get("motions"))
     scene = validated(OriginalScene, data, file=path)
-    files = [_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)]
+    files = [_mesh_file(cloth.mesh, path, f"cloths[{i}].mesh") for i, cloth in enumerate(scene.cloths)]
     vertices = cache(lambda cloth: read_vertices(files[cloth]))  # few scenes need them
     several = len(scene.cloths) > 1
+    step, every = scene.frame_time / scene.frame_steps, scene.frame_time
+    if scene.timestep is not None and "frame_time" not in data:
+        step, every = scene.timestep, scene.timestep * scene.save_frames * scene.save_every
     ours: dict[str, Any] = {
         "title": one_line(path.stem),
         "mesh": [],
         "material": [],
-        "time": {"step": scene.frame_time / scene.frame_steps, "integrator": "semi-implicit"},
-        "output": {"every": scene.frame_time},
+        "time": {"step": step, "integrator": "semi-implicit"},
+        "output": {"every": every},
     }
-    ends = [scene.end_time, scene.end_frame and scene.end_frame * scene.frame_time]
+    ends = [scene.end_time, scene.end_frame and scene.end_frame * scene.frame_time, scene.duration]
     if any(ends):
         ours["time"]["end"] = min(end for end in ends if end)
     if scene.gravity is not None and any(scene.gravity):
         ours["gravity"] = list(scene.gravity)
-    if scene.wind.density > 0 or scene.wind.drag > 0:
-        ours["wind"] = {**scene.wind.model_dump(), "velocity": list(scene.wind.velocity)}
+    density = scene.wind.density if scene.wind.density is not None else float(arcsim)
+    if density > 0 or scene.wind.drag > 0:
+        ours["wind"] = {"density": density, "drag": scene.wind.drag, "velocity": list(scene.wind.velocity)}
     for i, cloth in enumerate(scene.cloths):
-        if cloth.transform.scale != 1.0 and vertices(i).textured:
-            raise InputError(
-                "scales the material coordinates (vt) as well, which is not there yet; scale the mesh file",
-                file=path,
-                key=f"cloths[{i}].transform.scale",
-            )
         name = {"name": f"cloth{i}"} if several else {}
         group = {"group": f"cloth{i}"} if several else {}
-        ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.to_our_keys(), **name})
-        ours["material"].append({**_material(cloth.materials[0], i, path), **group})
+        scale = cloth.transform.scale
+        uv = {"uv": scale} if scale != 1.0 and vertices(i).textured else {}
+        ours["mesh"].append({"file": str(files[i]), "transform": cloth.transform.to_our_keys(), **uv, **name})
+        ours["material"].append({**_material(cloth.materials[0], i, path, arcsim=arcsim), **group})
+    velocities = {cloth.velocity.linear for cloth in scene.cloths}
+    if len(velocities) == 1 and not any(any(cloth.velocity.angular) for cloth in scene.cloths):
+        if any(linear := velocities.pop()):
+            ours["initial"] = {"velocity": list(linear)}
+    else:
+        notes.append("cloths[].velocity: no effect here, unless it is linear and the same for all cloths")
     ours["motions"] = {
         f"motion{i}": _shortest_rotations([_keyframe(keyframe) for keyframe in keyframes])
         for i, keyframes in enumerate(scene.motions)
     }
-    ours["handles"] = [_handle(handle, i, vertices, path) for i, handle in enumerate(scene.handles)]
-    return ours
+    stiffness = scene.magic.handle_stiffness
+    ours["handles"] = [
+        _handle(handle, i, vertices, path) | {"stiffness": stiffness}
+        for i, handle in enumerate(scene.handles)
+    ]
+    if arcsim and "collision" not in scene.disable:
+        gap = scene.magic.repulsion_thickness
+        ours["contact"] = {"friction": scene.friction, **({} if gap is None else {"gap": gap})}
+        ours["obstacles"] = {f"obstacle{i}": _obstacle(scene, i, path) for i in range(len(scene.obstacles))}
+    elif scene.obstacles:
+        notes.append("obstacles: no effect, as disable names collision")
+    if "physics" in scene.disable:
+        notes.append("disable: no effect on physics, which is simulated all the same")
+    return ours, notes
 
 
-def _mesh_file(cloth: OriginalCloth, i: int, path: Path) -> Path:
-    key = f"cloths[{i}].mesh"
-    if not cloth.mesh.lower().endswith(".obj"):
-        raise InputError(f"must be an .obj file, not {shown(cloth.mesh)}", file=path, key=key)
-    found = find_beside(cloth.mesh, path)
-    if found is None:
-        raise InputError(f"no such file: {cloth.mesh}", file=path, key=key)
+def _numbered_obstacles(pattern: str, path: Path, motions: Any) -> list[dict[str, Any]]:
+    """The obstacles of the files ``pattern`` % 0, 1, …; the motion of the same number moves each."""
+    found: list[dict[str, Any]] = []
+    try:
+        while find_beside(name := pattern % len(found), path) is not None:
+            moves = isinstance(motions, list) and len(found) < len(motions)
+            found.append({"mesh": name, "motion": len(found) if moves else -1})
+    except (TypeError, ValueError):
+        name = pattern
+    if not found:
+        raise InputError(
+            f"no such file: {name} (a name with a number, as body%02d.obj)", file=path, key="obstacles"
+        )
     return found
 
 
-def _material(material: OriginalMaterial, i: int, path: Path) -> dict[str, Any]:
-    return {
-        **material_numbers(material.data, path, key=f"cloths[{i}].materials[0].data"),
-        "density_scale": material.density_mult,
-        "stretching_scale": material.stretching_mult,
-        "bending_scale": material.bending_mult,
-        "thicken": material.thicken,
-        "damping": material.damping,
-    }
+def _obstacle(scene: OriginalScene, i: int, path: Path) -> dict[str, Any]:
+    obstacle, key = scene.obstacles[i], f"obstacles[{i}]"
+    keyframes = [] if obstacle.motion is None else scene.motions[obstacle.motion]
+    scales = {keyframe.transform.scale for keyframe in keyframes} or {1.0}
+    if len(scales) > 1:
+        raise InputError(
+            f"motion {obstacle.motion} scales from {min(scales):g} to {max(scales):g}, but an obstacle is "
+            "rigid here; give its keyframes one scale",
+            file=path,
+            key=f"{key}.motion",
+        )
+    # the motion scales the obstacle where its transform has put it
+    (scale,), placed = scales, obstacle.transform.to_our_keys()
+    placed |= {"scale": scale * placed["scale"], "translate": [scale * x for x in placed["translate"]]}
+    mesh = {"file": str(_mesh_file(obstacle.mesh, path, f"{key}.mesh")), "transform": placed}
+    block: dict[str, Any] = {"mesh": mesh, "friction": scene.obs_friction}
+    if keyframes:
+        rigid = [_keyframe(keyframe) | {"scale": 1.0} for keyframe in keyframes]
+        block |= {"motion": _shortest_rotations(rigid), "interpolation": "hermite"}
+    return block
+
+
+def _mesh_file(name: str, path: Path, key: str) -> Path:
+    if not name.lower().endswith(".obj"):
+        raise InputError(f"must be an .obj file, not {shown(name)}", file=path, key=key)
+    found = find_beside(name, path)
+    if found is None:
+        raise InputError(f"no such file: {name}", file=path, key=key)
+    return found
+
+
+def _material(material: OriginalMaterial, i: int, path: Path, *, arcsim: bool) -> dict[str, Any]:
+    scales = material.stretching_mult, material.bending_mult
+    if not material.data:
+        assert material.density is not None
+        assert material.thickness is not None
+        numbers = {
+            "young": material.elastic_modulus,
+            "poisson": material.poisson_ratio,
+            "thickness": material.thickness,
+            "density": material.density * material.thickness,
+            "bending_model": "hinge",
+        }
+    else:
+        numbers = material_numbers(material.data, path, key=f"cloths[{i}].materials[0].data")
+        numbers |= {"density_scale": material.density_mult, "thicken": material.thicken}
+        if arcsim:  # there bending is proportional to the thickness, here to its cube
+            scales = material.stretching_mult, material.bending_mult / material.thicken**2
+    return {**numbers, "stretching_scale": scales[0], "bending_scale": scales[1], "damping": material.damping}
 
 
 def _keyframe(keyframe: OriginalKeyframe) -> dict[str, Any]:
@@ -416,7 +601,6 @@ def _handle(
         "from": handle.start_time,
         "until": handle.end_time,
         "fade": handle.fade_time,
-        "stiffness": HANDLE_STIFFNESS,
     }
     if handle.motion is not None:
         block |= {"motion": f"motion{handle.motion}", "interpolation": "hermite"}

@@ -1458,11 +1458,17 @@ class Scene(Block):
     _given: dict[str, Any] | None = PrivateAttr(default=None)
     _directory: Path | None = PrivateAttr(default=None)
     _trusts_meshes: bool = PrivateAttr(default=False)
+    _notes: list[str] = PrivateAttr(default_factory=list)
 
     @property
     def source(self) -> Path | None:
         """The file from which the scene was read, for messages; ignored in comparisons."""
         return self._source
+
+    @property
+    def notes(self) -> list[str]:
+        """What in a file of another program has no effect, for the user."""
+        return self._notes
 
     @property
     def trusts_meshes(self) -> bool:

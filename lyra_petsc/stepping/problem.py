@@ -253,6 +253,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         sources=mesh.sources,
         barrier=_barrier(rest),
         notes=[
+            *scene.notes,
             *mesh.notes,
             *rest.notes,
             *unit_notes(rest),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -232,6 +233,27 @@ def test_what_nothing_holds_in_a_static_analysis_is_noted(
     found = notes(done(["check", write_scene(tmp_path, TWO + more)], tmp_path, ranks=2))
     assert len(found) == len(words)
     assert all(f"nothing holds {word}" in note for word, note in zip(words, found, strict=True))
+
+
+def test_what_of_another_program_has_no_effect_is_noted(tmp_path: Path) -> None:
+    (tmp_path / "square.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 4\nf 1 4 3\n")
+    cloth = {"mesh": "square.obj", "materials": [{"data": "paper"}], "remeshing": {"size": [0.01, 0.1]}}
+    floor = {"mesh": "square.obj", "transform": {"scale": 5, "translate": [-2, -2, -1]}}
+    scene = {
+        "frame_time": 0.01,
+        "end_time": 0.02,
+        "cloths": [cloth],
+        "obstacles": [floor],
+        "gravity": [0, 0, -9.8],
+    }
+    (tmp_path / "conf.json").write_text(json.dumps(scene))
+    found = notes(done(["check", "conf.json"], tmp_path))
+    assert [note.partition(",")[0] for note in found] == [
+        "cloths[0].remeshing: no effect here: the triangles stay those of the mesh file"
+    ]
+    left = done(["run", "conf.json", "--out", "out"], tmp_path)
+    assert "note: cloths[0].remeshing: no effect here" in left.err
+    assert "obstacle0" in (tmp_path / "out" / "obstacles.csv").read_text()
 
 
 def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:

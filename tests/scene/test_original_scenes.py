@@ -7,10 +7,15 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.build import build_scene_mesh
+from lyra_petsc.mesh.obstacles import build_obstacles
 from lyra_petsc.scene.load import dump_scene, load_scene
+from lyra_petsc.scene.materials.library import resolve_material
+from lyra_petsc.terms.handles.motion import Motion
 
 SHIPPED = """\
 {
@@ -170,7 +175,13 @@ ONE = {"mesh": "meshes/square.obj", "materials": [{"data": "paper"}]}
 
 BAD = [
     ({"gravty": [0, 0, 1]}, "gravty", "did you mean 'gravity'"),
-    ({"obstacles": []}, "obstacles", "unknown key"),
+    ({"obstacles": [{"mesh": "meshes/none.obj"}]}, "obstacles[0].mesh", "no such file: meshes/none.obj"),
+    ({"obstacles": [{"mesh": "meshes/square.obj", "motion": 0}]}, "obstacles[0].motion", "no motion 0"),
+    ({"obstacles": "meshes/part%d.obj"}, "obstacles", "no such file: meshes/part0.obj"),
+    ({"obstacles": "meshes/square.obj"}, "obstacles", "a name with a number"),
+    ({"obstacles": [{"mesh": "meshes/square.obj", "motion": 0}],
+      "motions": [[{"time": 0}, {"time": 1, "transform": {"scale": 0.5}}]]},
+     "obstacles[0].motion", "scales from 0.5 to 1, but an obstacle is rigid"),
     ({"cloths": None}, "cloths", "missing"),
     ({"cloths": []}, "cloths", "at least one"),
     ({"cloths": 3}, "cloths", "must be a list"),
@@ -180,12 +191,11 @@ BAD = [
     ({"cloths": [{**ONE, "materials": []}]}, "cloths[0].materials", "one material"),
     ({"cloths": [{**ONE, "materials": [{"data": "materials/grey-interlock.json"}]}]},
      "cloths[0].materials[0].data", "did you mean 'gray-interlock'"),
-    ({"cloths": [{**ONE, "materials": [{"data": "paper", "yield_curv": 1}]}]},
-     "cloths[0].materials[0].yield_curv", "plasticity is not simulated"),
+    ({"cloths": [{**ONE, "materials": [{"thickness": 1e-4, "density": 800}]}]},
+     "cloths[0].materials[0].elastic_modulus", "missing"),
+    ({"magic": {"repulsion": 1}}, "magic.repulsion", "unknown key"),
     ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0]}}]}, "cloths[0].transform.rotate", "[degrees,"),
     ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0, 0]}}]}, "cloths[0].transform.rotate", "axis"),
-    ({"cloths": [{**ONE, "mesh": "meshes/textured.obj", "transform": {"scale": 2}}]},
-     "cloths[0].transform.scale", "material coordinates"),
     ({"handles": [{"motion": 0, "nodes": [1]}]}, "handles[0].motion", "no motion 0"),
     ({"handles": [{"nodes": [1], "cloth": 1}]}, "handles[0].cloth", "no cloth 1"),
     ({"handles": [{"nodes": [-1]}]}, "handles[0].nodes[0]", ">= 0"),
@@ -211,6 +221,117 @@ def test_mistakes_are_refused(folder: Path, changes: dict[str, Any], key: str, m
     assert message in caught.value.message
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
+
+
+# a cloth on a moving ball, with the blocks that ARCSim's own scenes have
+ARCSIM = {
+    "end_time": None,
+    "duration": 2,
+    "cloths": [
+        {
+            "mesh": "meshes/square.obj",
+            "materials": [
+                {"data": "isotropic", "thicken": 2, "bending_mult": 3, "strain_limits": [0.9, 1.1]},
+            ],
+            "remeshing": {"refine_angle": 0.3, "size": [0.01, 0.2]},
+            "velocity": {"linear": [1, 0, 0]},
+        }
+    ],
+    "handles": [{"nodes": [2]}],
+    "motions": [
+        [
+            {"time": 0, "transform": {"scale": 0.1, "translate": [0, 0, 1]}},
+            {"time": 1, "transform": {"scale": 0.1, "translate": [2, 0, 1], "rotate": [90, 0, 0, 1]}},
+        ]
+    ],
+    "obstacles": [
+        {"mesh": "meshes/square.obj", "motion": 0, "transform": {"translate": [5, 0, 0], "scale": 3}},
+        {"mesh": "meshes/square.obj", "end_time": 3, "transform": {"translate": [0, 0, -4]}},
+    ],
+    "gravity": [0, 0, -9.8],
+    "disable": ["popfilter", "plasticity"],
+    "magic": {"repulsion_thickness": 5e-3, "collision_stiffness": 1e6, "handle_stiffness": 500},
+}
+
+
+def test_a_scene_of_arcsim(folder: Path) -> None:
+    """Contact, still air, bending in proportion to the thickness, and notes on what has no effect."""
+    scene = load_scene(write(folder, **ARCSIM))
+    assert (scene.time.end, scene.time.step, scene.output.every) == (2.0, 0.005, 0.04)
+    assert scene.wind is not None
+    assert (scene.wind.velocity, scene.wind.density, scene.wind.drag) == ((0.0, 0.0, 0.0), 1.0, 0.0)
+    assert scene.initial is not None
+    assert scene.initial.velocity == (1.0, 0.0, 0.0)
+    assert scene.handles[0].stiffness == 500.0
+    assert scene.contact is not None
+    assert (scene.contact.friction, scene.contact.gap) == (0.6, 5e-3)
+    thick, _ = resolve_material(scene.material[0])
+    thin, _ = resolve_material(load_scene(write(folder)).material[0])
+    assert thick.bending == pytest.approx([6.0 * b for b in thin.bending])
+    assert (thick.density, thick.c11) == pytest.approx((2.0 * thin.density, 2.0 * thin.c11))
+    assert [note.partition(":")[0] for note in scene.notes] == [
+        "magic.collision_stiffness",
+        "obstacles[1].end_time",
+        "cloths[0].remeshing",
+        "cloths[0].materials[0].strain_limits",
+    ]
+    assert all("no effect here" in note for note in scene.notes)
+    assert scene.changed({"time.end": 3.0}).notes == scene.notes
+
+
+def test_an_obstacle_of_arcsim_is_where_its_motion_puts_it(folder: Path) -> None:
+    """A motion there is the whole transform of an obstacle, after that in which it is placed."""
+    scene = load_scene(write(folder, **ARCSIM))
+    mesh = build_scene_mesh(scene)
+    moving, still = build_obstacles(scene, mesh.obstacles, Motion)
+    corner = np.array([3.0, 3.0, 0.0]) + [5.0, 0.0, 0.0]  # of the square, scaled and moved
+    assert moving.motion is not None
+    for time, turned in ((0.0, corner), (1.0, [-corner[1], corner[0], corner[2]])):
+        matrix, shift = moving.motion(time)
+        expected = 0.1 * np.asarray(turned) + [2.0 * time, 0.0, 1.0]
+        assert (moving.points @ matrix.T + shift)[3] == pytest.approx(expected)
+    assert still.motion is None
+    assert still.points[3] == pytest.approx([1.0, 1.0, -4.0])
+    assert moving.friction == (0.3, 0.3)
+    assert scene.obstacles is not None
+    assert scene.obstacles["obstacle0"].interpolation == "hermite"
+
+
+def test_numbers_of_a_material_and_a_time_step_of_arcsim(folder: Path) -> None:
+    paper = {
+        "thickness": 1e-4, "density": 800, "elastic_modulus": 4e9, "poisson_ratio": 0.2, "bending_mult": 5,
+        "toughness": 1e7, "yield_curv": 200,
+    }  # fmt: skip
+    cloth = {"mesh": "meshes/textured.obj", "transform": {"scale": 0.2}, "materials": [paper]}
+    scene = load_scene(
+        write(folder, cloths=[cloth], frame_time=None, frame_steps=None, end_time=None, timestep=0.001,
+              save_frames=5, save_every=2, duration=4, disable=["collision"])
+    )  # fmt: skip
+    assert (scene.time.step, scene.output.every, scene.time.end) == (0.001, 0.01, 4.0)
+    shell, _ = resolve_material(scene.material[0])
+    assert (shell.density, shell.c11) == pytest.approx((0.08, 4e5 / 0.96))
+    assert shell.bending[0] == pytest.approx(5.0 * 4e9 * 1e-12 / 12.0 / 0.96)
+    assert shell.model == "hinge"
+    assert scene.contact is None
+    assert scene.mesh[0].uv == (0.2, 0.2)
+    assert any("plasticity is not simulated" in note for note in scene.notes)
+
+
+def test_obstacles_of_arcsim_by_number(folder: Path) -> None:
+    for number in range(3):
+        (folder / "meshes" / f"part{number:02d}.obj").write_text(SQUARE)
+    motions = [[{"time": 0}, {"time": 1, "transform": {"translate": [0, 0, -number]}}] for number in (1, 2)]
+    scene = load_scene(write(folder, obstacles="meshes/part%02d.obj", motions=motions))
+    assert scene.obstacles is not None
+    ends = [
+        scene.keyframes(each)[-1].translate[2] if each.motion else 0.0 for each in scene.obstacles.values()
+    ]
+    assert ends == [-1.0, -2.0, 0.0]
+
+
+def test_a_scene_of_lyra_has_no_contact_and_no_air(folder: Path) -> None:
+    scene = load_scene(write(folder))
+    assert (scene.contact, scene.obstacles, scene.wind, scene.notes) == (None, None, None, [])
 
 
 BROKEN = [
