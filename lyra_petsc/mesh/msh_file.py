@@ -480,6 +480,8 @@ def assemble_sheet(
     if len(triangles) == 0:
         highest = max((block.dimension for block in blocks if len(block.nodes)), default=0)
         raise NoTrianglesError("no triangles" + _WITHOUT_TRIANGLES.get(highest, ""))
+    if n_solids := sum(len(block.nodes) for block in blocks if block.dimension == 3):
+        notes.append(f"{n_solids} solid elements left out")
     triangles, members = _drop_repeated(triangles, entity, members)
     groups = [NamedSet(names.get((2, tag), str(tag)), 2, inside) for tag, inside in members.items()]
     for dimension in (1, 0):

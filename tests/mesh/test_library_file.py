@@ -260,8 +260,10 @@ def test_empty_files_and_solids_are_refused(tmp_path: Path, suffix: str) -> None
         mesh_of(file)
 
 
-def test_solid_elements_alone_are_named(tmp_path: Path) -> None:
+def test_solid_elements_are_named(tmp_path: Path) -> None:
     file = tmp_path / "solid.inp"
     file.write_text(INP[: INP.index("*ELEMENT")] + "*ELEMENT, TYPE=C3D4\n1, 10, 20, 50, 60\n")
     with pytest.raises(InputError, match="only solid elements"):
         mesh_of(file)
+    file.write_text(INP + "*ELEMENT, TYPE=C3D4\n8, 10, 20, 50, 60\n")
+    assert "solid.inp: 1 solid elements left out" in mesh_of(file).notes
