@@ -392,7 +392,7 @@ class Recorder:
         arrays |= term_states.vertex_arrays(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
         edges |= term_states.edge_arrays(system)
-        scalars |= {"last_state": last_state, "scheme": simulation.scene.time.scheme}
+        scalars["last_state"] = last_state
         began = clock.monotonic()
         elements = term_states.element_arrays(system)
         yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)

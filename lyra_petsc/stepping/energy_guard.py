@@ -17,8 +17,10 @@ the scale ::
 
     S = largest value so far of T + U + |V − V₀| + Σ|W| + ΣD
 
-whose T includes the coordinates that handles drive: if these start gently, little else moves at first.
-G < 0 is numerical dissipation, which is allowed and summed up.
+whose T includes the coordinates that handles drive: if these start gently, little else moves at first. T, V
+and W are those of an observer who moves with the scene's initial velocity: a sheet whose surroundings drift
+along with it is judged as one at rest. (Another observer finds another G, as the trapezoidal rule does not
+give the change of momentum.) G < 0 is numerical dissipation, which is allowed and summed up.
 
 Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
 
@@ -31,7 +33,7 @@ air brakes a sheet within a step, the force at its start times the displacement 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -116,7 +118,8 @@ class Balance:
     potential_before, potential : float
         V at both ends of the step.
     stored_before, stored : float
-        T + U at both ends, with the coordinates that handles drive.
+        T + U at both ends, with the coordinates that handles drive. These energies, V and W are those of the
+        observer who moves with the initial velocity.
     inertia, bracket : float
         ½ ‖Δv‖²_M, and this plus the change of energy that the work of the stage's forces does not explain.
     noise : float
@@ -141,9 +144,11 @@ class EnergyGuard:
     Parameters
     ----------
     system : StageEquations
+    drift : (3,)
+        The scene's initial velocity [m/s].
     """
 
-    def __init__(self, system: StageEquations) -> None:
+    def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
         self._system = system
         elastic = system.active.elastic
         self._targets = [t for t in elastic if t.moving or t.registration.role is Role.CONSTRAINT]
@@ -154,6 +159,7 @@ class EnergyGuard:
         self._next_pull: tuple[float, Array] | None = None
         self._stiffness: float | None = None
         self.gains = GuardState()
+        self._drift = np.array(drift)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -170,6 +176,7 @@ class EnergyGuard:
         x1, v1, at = system.x, system.v, system.prescribed.indices
         change = kinetic_energy(system.mass, v1[:n] - v0[:n])
         moved = x1[:n] - x0[:n]
+        moved[: layout.n_vertices] -= system.dt * self._drift
         works, extra_heat = self._with_least_heat(x0, x1, works)
         # kinetic energies of prescribed coordinates, which the budget includes
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
@@ -183,12 +190,15 @@ class EnergyGuard:
         sums = [float(value) for value in layout.global_sum(*local)]
         driven0, driven1, change, work, elastic, by_targets, *springs, moving, stiff, extra_heat = sums
         work += by_targets
-        kinetic = (after.kinetic - driven1) - (before.kinetic - driven0)
+        drift0, drift1, pushed, lifted, by_drift = self._of_drift(x0, v0, v1)
+        work += by_drift
+        kinetic = (after.kinetic - driven1) - (before.kinetic - driven0) - pushed
+        potential0, potential1 = before.potential - lifted * system.t0, after.potential - lifted * system.t1
         elastic += after.elastic - before.elastic - moving
         heat = works.heat + extra_heat
-        gain = kinetic + elastic + after.potential - before.potential + heat - work
-        energy = after.kinetic + after.elastic + springs[1]
-        energy_before = before.kinetic + before.elastic + springs[0]
+        gain = kinetic + elastic + potential1 - potential0 + heat - work
+        energy = after.kinetic - drift1 + after.elastic + springs[1]
+        energy_before = before.kinetic - drift0 + before.elastic + springs[0]
         sizes = energy + energy_before + before.kinetic + after.kinetic
         sizes += abs(work) + abs(heat) + abs(before.potential) + abs(after.potential)
         noise = ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy) * stiff) + ROUND_OFF * stiff)
@@ -197,14 +207,39 @@ class EnergyGuard:
             gain=gain,
             work=work,
             heat=heat,
-            potential_before=before.potential,
-            potential=after.potential,
+            potential_before=potential0,
+            potential=potential1,
             stored_before=energy_before,
             stored=energy,
             inertia=change,
             bracket=unexplained + change,
             noise=noise,
         )
+
+    def _of_drift(self, x0: Array, v0: Array, v1: Array) -> tuple[float, float, float, float, float]:
+        """What the drift adds in a step from x0 and v0 to v1 (n_local, 3); collective.
+
+        Kinetic energy [J] at both ends, its change in free coordinates, power [W] against the weight, and the
+        work [J] of targets and obstacles, by the mean of their forces at both ends, to be subtracted.
+        """
+        if not self._drift.any():
+            return 0.0, 0.0, 0.0, 0.0, 0.0
+        system, drift, mass = self._system, self._drift, self._system.mass
+        x1, rows = system.x, slice(0, system.points.n_vertices)
+        momenta = [float((mass @ (v[: len(mass)] - 0.5 * drift)) @ drift) for v in (v0, v1)]
+        change = np.where(system.prescribed.free, (v1 - v0)[: len(mass)], 0.0)
+        lifted = sum(load.potential(x0 + drift) - load.potential(x0) for load in self._weights)
+        force = np.zeros_like(x1)
+        near = [term for term in self._plain if term.detects_collisions]
+        for x, time in ((x0, system.t0), (x1, system.t1)):
+            for term, frozen in self._frozen([*self._targets, *near], time, x).items():
+                term.add_gradient(x, frozen, force)
+        by_targets = 0.5 * system.dt * float(force[rows].sum(axis=0) @ drift)
+        if system.contact_impulses:
+            by_targets += system.dt * float(system.contact_impulses.force.sum(axis=0) @ drift)
+        sums = system.points.global_sum(*momenta, float((mass @ change) @ drift), lifted, by_targets)
+        first, last, pushed, lifted, by_targets = map(float, sums)
+        return first, last, pushed, lifted, by_targets
 
     def _with_least_heat(self, x0: Array, x1: Array, works: Works) -> tuple[Works, float]:
         """Works with the damping forces of uniform motion from x0 to x1 (n_local, 3), and the heat [J] of

@@ -220,7 +220,8 @@ class SteppedScene:
             self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
         self._scene_integrator = system.integrator
         self.energy_balance = EnergyBalance(system)
-        self.guard = EnergyGuard(system) if system.integrator.dynamic else None
+        drift = scene.initial.velocity if scene.initial else (0.0, 0.0, 0.0)
+        self.guard = EnergyGuard(system, drift) if system.integrator.dynamic else None
 
     def _create_control(self, step: float, end: float) -> StepControl:
         """Create the control of fixed steps, of steps by a tolerance, or of load increments."""
@@ -656,6 +657,7 @@ class SteppedScene:
         scalars = {
             "time": time,
             "step": self.step_number,
+            "scheme": self.scene.time.scheme,
             "budget": budget,
             "totals": dict(self.totals),
             "stability": self.stability,

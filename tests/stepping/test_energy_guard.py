@@ -43,6 +43,55 @@ def run(one: SteppedScene) -> list[float]:
     return energies
 
 
+def surrounded(drift: list[float], *, contact: bool) -> dict[str, Any]:
+    """A sheet in wind, with handles that hold and let go, and a floor that it falls on; all drift."""
+    along = {"motion": "drift", "interpolation": "linear"}
+    held = [{"nodes": [0, 1], "until": 0.06}, {"nodes": [29], "stiffness": 50.0}]
+    floor = {"plane": {"point": [0, 0, -0.03], "normal": [0, 0, 1]}} | along
+    return {
+        "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
+        "material": {"density": 0.15, "damping": 0.002, **SHELL},
+        "gravity": [0.0, 0.0, -9.81],
+        "wind": {"velocity": [1.0 + drift[0], drift[1], drift[2] - 2.0], "density": 1.2},
+        "initial": {"noise": 0.005, "angular_velocity": [0.0, 3.0, 0.0], "velocity": drift},
+        "motions": {"drift": [{"time": 0.0}, {"time": 1.0, "translate": drift}]},
+        "handles": [handle | along for handle in held],
+    } | ({"contact": {"gap": 0.005}, "obstacles": {"floor": floor}} if contact else {})
+
+
+@pytest.mark.parametrize(
+    ("integrator", "contact", "end", "step"),
+    [
+        *((name, False, 0.1, 0.02) for name in ("beuler", "midpoint", "alpha2", "bdf2")),
+        ("alpha2", True, 0.1, 0.02),
+        ("alpha2", False, 0.002, 0.0005),  # far below the time between keyframes of the handles
+    ],
+)
+def test_who_moves_along_sees_the_same_steps(
+    integrator: str,
+    contact: bool,
+    end: float,
+    step: float,
+) -> None:
+    def taken(drift: list[float]) -> tuple[list[float], dict[str, Any], NDArray[np.float64]]:
+        one = simulation(MPI.COMM_SELF, integrator, surrounded(drift, contact=contact), end, step)
+        times = []
+        while not one.finished:
+            times.append(one.step().time)
+        assert one.guard is not None
+        content, x = one.guard.content(), shape(one) - one.time * np.array(drift)
+        one.destroy()
+        return times, content, x
+
+    (times, content, x), (others, other, y) = taken([0.0, 0.0, 0.0]), taken([-2.0, 1.0, 3.0])
+    np.testing.assert_allclose(others, times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(y, x, rtol=0, atol=1e-6 * step / 0.02)
+    assert other["repeated"] == content["repeated"]
+    assert content["repeated"] > 0 or integrator in ("beuler", "midpoint") or step < 0.02
+    for name in ("scale", "numerical_dissipation", "numerical_gain"):
+        assert other[name] == pytest.approx(content[name], rel=1e-5, abs=1e-9), name
+
+
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
 def test_a_free_sheet_gains_nothing(integrator: str, comm: MPI.Comm) -> None:

@@ -280,7 +280,7 @@ class Motion:
         """Time derivative (n, 3) [m/s] of ``moved``; where it jumps, the mean of both sides."""
         if len(self._times) == 1:
             return np.zeros_like(points)
-        step = 1e-6 * float(np.diff(self._times).min())
+        step = 1e-9 * float(np.diff(self._times).min())  # much shorter than steps in time
         a0, d0 = self.transform(start)
         rates = [self._rate(each) for each in (time - step, time + step)]
         a, d = (0.5 * (before + after) for before, after in zip(*rates, strict=True))
