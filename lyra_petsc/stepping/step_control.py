@@ -8,6 +8,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+ROUND_OFF = 1e-9
+"""Fraction of Δt by which times differ that are computed in different ways."""
+
 SLACK = 1e-6
 """Fraction of Δt by which a step may be longer to avoid an extra tiny one."""
 
@@ -68,9 +71,22 @@ class StepControl:
     def next_end(self, time: float) -> float:
         """End of the step that starts at ``time`` [s]."""
         dt = self.step * self.factor
-        target = min(self._next_event(time), self._next_state(time))
+        event, state = self._next_event(time), self._next_state(time)
+        target = event if event <= state + ROUND_OFF * dt else self._rounded(state)
         # end exactly at the event even if it is a round-off error beyond the step
-        return target if target - time <= dt * (1.0 + SLACK) else time + self._partial_step(dt, target - time)
+        if target - time <= dt * (1.0 + SLACK):
+            return target
+        return self._rounded(time + self._partial_step(dt, target - time))
+
+    def _rounded(self, time: float) -> float:
+        """A time [s] that is a multiple of Δt up to round-off as that multiple, however it was computed.
+
+        In contact, round-off of Δt grows to other motions, which then depended on the interval between
+        states.
+        """
+        dt = self.step * self.factor
+        multiple = round(time / dt) * dt if math.isfinite(time) else math.inf
+        return multiple if abs(multiple - time) <= ROUND_OFF * dt else time
 
     def planned_steps(self) -> int:
         """Number of steps to the end, all of the full Δt but for those cut to end at states and events."""

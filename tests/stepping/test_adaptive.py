@@ -175,3 +175,17 @@ def test_the_planned_number_of_steps_is_that_of_a_run(step: float, every: float 
         states += control.writes_at(time)
     assert control.planned_steps() == steps
     assert every is None or states == math.ceil(1.0 / every - 1e-9) + 1
+
+
+@pytest.mark.parametrize("step", [0.01, 0.004, 0.3])
+def test_steps_end_at_the_same_times_however_often_states_are_written(step: float) -> None:
+    """To the last digit, if the interval is a multiple of the step."""
+
+    def ends(every: float | None) -> list[float]:
+        control, times = StepControl(step, 60.0 * step, every, [], 1e-9), [0.0]
+        while not control.is_end(times[-1]):
+            times.append(control.next_end(times[-1]))
+        return times
+
+    for multiple in (1, 2, 3, 5, 20):
+        assert ends(multiple * step) == ends(None)
