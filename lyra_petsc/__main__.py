@@ -5,7 +5,7 @@ import io
 import os
 import sys
 
-if not __package__:  # started by the name of the folder, which Python has put on the import path
+if __package__ == "":  # started by the name of the folder, which Python has put on the import path
     sys.path[0] = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 

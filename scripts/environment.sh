@@ -22,6 +22,11 @@ pictures=(libegl1)
 browser=(chromium chromium-driver)
 manual="see \"Other ways to install\" in README.md"
 
+# empty entries stand for the working directory, whose files may be a stranger's
+PYTHONPATH=$(tr -s : <<<":${PYTHONPATH:-}:")
+PYTHONPATH=${PYTHONPATH#:} PYTHONPATH=${PYTHONPATH%:}
+[[ $PYTHONPATH ]] || unset PYTHONPATH
+
 say() { printf 'set-up: %s\n' "$*" >&2; }
 give_up() {
     say "$*"
@@ -146,7 +151,7 @@ make_venv() {
     mkdir -p -- "$venv" 2>/dev/null || give_up "cannot write $venv; set LYRA_VENV to a folder you may write"
     log=$venv/set-up.log
     foundation >"$mark"
-    "$base" -B -m venv "$venv" >"$log" 2>&1 ||
+    "$base" -IB -m venv "$venv" >"$log" 2>&1 ||
         give_up "$base -m venv failed: $(tail -n 1 "$log") (on Debian and Ubuntu: apt-get install python3-venv)"
     "$base" -B "$helper" layer "$venv/bin/python" "${folders[@]}" >"$venv/constraints.new"
     mv -- "$venv/constraints.new" "$venv/constraints.txt"
@@ -168,7 +173,7 @@ install_missing() {
     if [[ -n $wanted ]]; then
         say "installing from PyPI into $venv: ${wanted[*]}"
         # the variables would lead pip elsewhere than into the environment
-        if ! env -u PIP_TARGET -u PIP_PREFIX PIP_USER=0 "$venv/bin/python" -m pip install --no-input \
+        if ! env -u PIP_TARGET -u PIP_PREFIX PIP_USER=0 "$venv/bin/python" -I -m pip install --no-input \
             --disable-pip-version-check -c "$venv/constraints.txt" "${wanted[@]}" >"$log" 2>&1; then
             tail -n 5 "$log" >&2
             give_up "pip could not install these; its whole output is in $log"

@@ -25,7 +25,9 @@ crowded=0
 export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-$crowded}
 trap 'exit 143' USR1
 set_up "${extras[@]}"
-start=("${python[@]}" -m lyra_petsc)
+# by the folder's name, as with -m Python would look for the program in the working directory first
+export PYTHONSAFEPATH=1
+start=("${python[@]}" "$root/lyra_petsc")
 # a signal before Python's first line would end it with another exit code; the program unblocks it
 ! env --block-signal=USR1 true 2>/dev/null || start=(env --block-signal=USR1 "${start[@]}")
 ((ranks == 1)) || start=("${launcher[@]}" -n "$ranks" "${start[@]}")

@@ -8,7 +8,7 @@ import venv
 from pathlib import Path
 
 import pytest
-from environments import ROOT, YIELD, activated, call, make, site_packages
+from environments import NEEDED, ROOT, YIELD, activated, call, make, site_packages
 
 HELPER = ROOT / "scripts" / "environment.py"
 
@@ -34,7 +34,9 @@ def test_a_complete_environment_is_used_unchanged(environment, tmp_path):
     before = listing(environment)
     done = call("run.sh", "my scene.yaml", "-ts_monitor", cwd=tmp_path, **activated(environment))
     python = environment / "bin" / "python3"
-    expected = f"launched in {tmp_path}: -n 2 {BLOCKING}{python} -m lyra_petsc run my scene.yaml -ts_monitor"
+    expected = (
+        f"launched in {tmp_path}: -n 2 {BLOCKING}{python} {ROOT}/lyra_petsc run my scene.yaml -ts_monitor"
+    )
     assert done.stdout.strip() == expected, done.stderr
     assert done.stderr == ""
     assert listing(environment) == before
@@ -44,7 +46,7 @@ def test_a_complete_environment_is_used_unchanged(environment, tmp_path):
 def test_python_variable_ranks_and_exit_code(environment, tmp_path):
     python = str(environment / "bin" / "python")
     done = call("run.sh", cwd=tmp_path, PYTHON=python, RANKS="5", LAUNCHER_EXIT="3")
-    assert f"-n 5 {BLOCKING}{python} -m lyra_petsc run" in done.stdout
+    assert f"-n 5 {BLOCKING}{python} {ROOT}/lyra_petsc run" in done.stdout
     assert done.returncode == 3
 
 
@@ -96,6 +98,18 @@ def test_other_folders_are_not_changed(environment, tmp_path):
     assert done.returncode == 1
     assert "was not made by these scripts and is left alone" in done.stderr
     assert mine.read_text() == "made by hand"
+
+
+def test_nothing_is_imported_from_the_working_directory(environment, tmp_path):
+    (site_packages(environment) / "rich" / "__init__.py").unlink()
+    (site_packages(environment) / "rich").rmdir()
+    stranger, mark = tmp_path / "stranger", tmp_path / "mark"
+    stranger.mkdir()
+    for name in {*sys.stdlib_module_names, *NEEDED, "pip", "sitecustomize"}:
+        (stranger / f"{name}.py").write_text(f"open({str(mark)!r}, 'a').write(__name__)\n")
+    done = call("run.sh", cwd=stranger, PYTHONPATH=":", **activated(environment))
+    assert "installing from PyPI" in done.stderr
+    assert not mark.exists(), mark.read_text()
 
 
 def test_missing_launcher_is_named(environment, tmp_path):
@@ -160,7 +174,7 @@ def test_one_script_runs_every_verb(environment: Path, tmp_path: Path) -> None:
     done = call("lyra.sh", "check", "a scene.yaml", "-ksp_view", cwd=tmp_path, **variables)
     assert done.returncode == 0, done.stderr
     assert f"launched in {tmp_path}: -n 3 " in done.stdout
-    assert done.stdout.strip().endswith("-m lyra_petsc check a scene.yaml -ksp_view")
+    assert done.stdout.strip().endswith("/lyra_petsc check a scene.yaml -ksp_view")
     done = call("lyra.sh", "run", cwd=tmp_path, **activated(environment))
     assert ": -n 2 " in done.stdout
     done = call("lyra.sh", "report", "x", cwd=tmp_path, **{**variables, "RANKS": "many"})
