@@ -31,7 +31,7 @@ import h5py
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = map(str, (ROOT, ROOT / "tests" / "surviving", ROOT / "tests" / "cli"))
+sys.path[:0] = map(str, (ROOT, *(ROOT / "tests" / name for name in ("", "surviving", "cli"))))
 from leftovers import announced, ranks_in  # noqa: E402
 
 from lyra_petsc.api.mpirun import environment, find_launcher  # noqa: E402
@@ -74,7 +74,7 @@ class WrongResult(Exception):
 
 def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[bytes]:
     """Start the program; its output goes to ``output.txt``."""
-    words = [sys.executable, "-m", "lyra_petsc", "run", *arguments, *DIRECT]
+    words = [sys.executable, str(ROOT / "lyra_petsc"), "run", *arguments, *DIRECT]
     if ranks > 1:
         words = [*find_launcher(ranks), *words, "-pc_factor_mat_solver_type", "mumps"]
     variables = environment() | {"OMPI_MCA_mpi_yield_when_idle": "1"}

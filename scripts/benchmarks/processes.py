@@ -68,8 +68,7 @@ def run(
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         began, cpu = time.perf_counter(), _cpu_of_children()
         variables = environment()
-        if program != HERE:
-            variables["PYTHONPATH"] = os.pathsep.join([str(program), variables.get("PYTHONPATH", "")])
+        variables["PYTHONPATH"] = os.pathsep.join(filter(None, [str(program), variables.get("PYTHONPATH")]))
         try:
             process = subprocess.Popen(
                 command,
