@@ -15,7 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "tests" / "fuzz")]
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = map(str, (ROOT, ROOT / "tests", ROOT / "tests" / "fuzz"))
 
 from all_cases import KINDS, for_each  # noqa: E402
 from judge import Case, judge, warm  # noqa: E402
