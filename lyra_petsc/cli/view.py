@@ -16,7 +16,6 @@ from lyra_petsc.cli.options import Session, results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import raise_on_all_ranks
-from lyra_petsc.show.view.live import PACKAGES
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -70,6 +69,8 @@ class Served:
         InputError
             For missing packages, or an address that cannot be used.
         """
+        from lyra_petsc.show.view.live import PACKAGES
+
         require_packages(what, PACKAGES, "view")
         from lyra_petsc.show.view.server import check_address
 
