@@ -65,7 +65,9 @@ def nothing_holds(
     On rank 0, with all elements of the ``terms``. In contact obstacles may hold a piece, so there are none.
     """
     scene, mesh = rest.scene, rest.mesh
-    loads = [entry for entry in terms if entry.role is Role.LOAD]
+    # moments on edges have no resultant
+    on_edges = {name for name, each in elements.items() if each.edges is not None}
+    loads = [entry for entry in terms if entry.role is Role.LOAD and entry.name not in on_edges]
     if not scene.time.static or scene.contact is not None or not loads:
         return []
     from lyra_petsc.mesh.patches import connected_pieces  # with kernels; needed in statics only
@@ -76,7 +78,7 @@ def nothing_holds(
     for entry in loads:
         term = make_term(entry, elements.get(entry.name), scene, rest.mass)
         assert isinstance(term, Load)
-        term.add_force_on_vertices(mesh.positions, 0.0, 1.0, force)
+        term.add_force(mesh.positions, 0.0, 1.0, force)
     held = np.zeros((piece.max() + 1, 3), dtype=bool)
     for number, handle in enumerate(scene.handles):
         vertices = select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)

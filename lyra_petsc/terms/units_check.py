@@ -17,8 +17,8 @@ from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.rest import RestShape
 
-LIGHTEST, DENSEST = 10.0, 25e3
-"""Density [kg/m³] of light foams, and above that of osmium."""
+LIGHTEST, LIGHTEST_CLOTH, DENSEST = 10.0, 22.0, 25e3
+"""Density [kg/m³] of light foams, below that of the airiest knits, and above that of osmium."""
 
 SOFTEST, STIFFEST = 500.0, 1e14
 """Modulus [Pa] below those of gels, and a hundred times that of diamond."""
@@ -103,8 +103,11 @@ class Figures:
         units = "bending in N·mm (1e-3 N·m) or gf·cm²/cm (1e-4 N·m), or membrane in N/mm (1e3 N/m)"
         if isotropic:
             units = "young in GPa or MPa (1e9 or 1e6 Pa), or thickness in mm (1e-3 m)"
-        if weighs and volume < LIGHTEST:
-            return f"{volume:.2g} kg/m³, if {1e3 * h:.3g} mm thick, is lighter than any foam: is {units}?"
+        if weighs and volume < (LIGHTEST if isotropic else LIGHTEST_CLOTH):
+            lighter = "foam" if isotropic else "cloth"
+            return (
+                f"{volume:.2g} kg/m³, if {1e3 * h:.3g} mm thick, is lighter than any {lighter}: is {units}?"
+            )
         if h and self.membrane < SOFTEST * h:
             return f"a modulus of {self.membrane / h:.2g} Pa is softer than any gel: is {units}?"
         if h and self.membrane > STIFFEST * h:

@@ -27,6 +27,11 @@ on a diagonal grid bend with 0.8 B."""
 STABLE = {"stable": True, "negative_pivots": 0, "neutral_pivots": 0, "rigid_motions": 0}
 
 
+def notes(simulation: SteppedScene) -> list[str]:
+    """Its notes, but for the one that no sheet has the numbers of these strips."""
+    return [note for note in simulation.notes if not note.startswith("material: ")]
+
+
 def strip(weight: float) -> dict[str, Any]:
     """An upright strip, clamped below, with a multiple of its critical weight."""
     upright = {"transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
@@ -43,7 +48,7 @@ def strip(weight: float) -> dict[str, Any]:
 def test_a_strip_below_its_critical_weight_stays_upright(comm: MPI.Comm) -> None:
     with finished(comm, strip(0.95)) as simulation:
         assert simulation.stability == STABLE
-        assert not simulation.notes
+        assert not notes(simulation)
         assert np.abs(shape(simulation)[:, 1]).max() < 1e-6 * LENGTH
 
 
@@ -53,7 +58,7 @@ def test_a_strip_below_its_critical_weight_stays_upright(comm: MPI.Comm) -> None
 def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.Comm) -> None:
     with finished(comm, strip(weight)) as simulation:
         assert simulation.stability == STABLE
-        assert "its lowest mode was followed once" in simulation.notes[0]
+        assert "its lowest mode was followed once" in notes(simulation)[0]
         tip = shape(simulation)[-1]
         assert np.abs(tip[1]) > 0.3 * LENGTH
         system = simulation.problem.system
@@ -67,8 +72,8 @@ def test_an_equilibrium_that_remains_unstable_is_noted(
     monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
     with finished(comm, strip(1.5)) as simulation:
         assert simulation.stability == STABLE | {"stable": False, "negative_pivots": 1}
-        assert "unstable" in simulation.notes[0]
-        assert "followed 0 times" in simulation.notes[0]
+        assert "unstable" in notes(simulation)[0]
+        assert "followed 0 times" in notes(simulation)[0]
 
 
 def test_unknowns_on_edges_do_not_change_the_counts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
