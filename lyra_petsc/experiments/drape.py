@@ -50,6 +50,7 @@ def drape_scene(
     material: dict[str, Any],
     seed: int,
     gap: float = DRAPE_GAP,
+    iterations: int = 50,
 ) -> dict[str, Any]:
     """The scene of a cloth that falls over the disc; collective.
 
@@ -66,6 +67,9 @@ def drape_scene(
         Seed of the noise that is added to the start.
     gap : float
         Contact gap [m]; must be below the shortest edge.
+    iterations : int
+        Newton iterations after which a step is halved. Many steps of soft cloths on fine meshes do not
+        converge in 200; stiff sheets fold slowly, and shorter steps would cost more.
     """
     disc = {"mesh": bench.mesh(*disc_mesh(np.radians(np.linspace(0.0, 360.0, 49))))}
     return {
@@ -76,8 +80,7 @@ def drape_scene(
         "initial": {"noise": NOISE, "seed": seed},
         "contact": {"gap": gap, "friction": 0.3, "self": False},
         "obstacles": {"disc": disc},
-        # many iterations, as stiff sheets fold slowly; shorter steps would cost more
-        "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
+        "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": iterations},
     }
 
 

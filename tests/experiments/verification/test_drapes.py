@@ -48,7 +48,14 @@ def starts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array,
     seen: list[tuple[Array, Ints, Array]] = []
 
     def scene(
-        bench: Bench, start: Array, faces: Ints, rest: Array, material: object, seed: int, gap: float
+        bench: Bench,
+        start: Array,
+        faces: Ints,
+        rest: Array,
+        material: object,
+        seed: int,
+        gap: float,
+        **_: int,
     ) -> Array:
         assert lengths(rest, edges(faces)[0]).min() > gap
         seen.append((start, faces, rest))

@@ -668,7 +668,8 @@ def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
     random = np.random.default_rng([MESHES.index(kind), start])
     flat, faces = _disc(kind, n, random)
     lifted, rest = _wavy(flat, random), CLOTH * flat[:, :2]
-    x = drape_cloth(bench, drape_scene(bench, lifted, faces, rest, material, start, SHORT), AT_REST)
+    scene = drape_scene(bench, lifted, faces, rest, material, start, SHORT, iterations=200)
+    x = drape_cloth(bench, scene, AT_REST)
     return drape_coefficient(shadow(x, faces, PIXELS))
 
 
