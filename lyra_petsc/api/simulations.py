@@ -200,7 +200,9 @@ class Simulation:
 
     @property
     def obstacle_forces(self) -> dict[str, Array]:
-        """Force [N] and torque [N m] about the origin, (6,), of the sheets on each obstacle, by its name."""
+        """Force [N] and torque [N m] about the origin of the sheets on each obstacle, and the sums over
+        contacts of the magnitudes of normal force and friction [N], (8,), by its name.
+        """
         names = list(self.scene.obstacles or {})
         return dict(zip(names, self._running.energy_balance.obstacle_forces(len(names)), strict=True))
 

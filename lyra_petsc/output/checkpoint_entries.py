@@ -61,12 +61,11 @@ class Totals(_Entries):
 
 
 class IntegratorHistory(_Entries):
-    """Lengths [s] of past steps and a surplus of energy [J], see ``saved_state`` of the integrators."""
+    """Lengths [s] of past steps, see ``saved_state`` of the integrators."""
 
     past_dt_0: Duration = ABSENT
     past_dt_1: Duration = ABSENT
     slope_dt: NonNegative = ABSENT
-    surplus: Number = ABSENT
 
 
 class ExtrapolationHistory(_Entries):

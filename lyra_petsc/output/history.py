@@ -36,7 +36,7 @@ HISTORY_COLUMNS = (
     "wall_seconds",
 )
 
-OBSTACLE_COLUMNS = ("step", "time", "obstacle", "fx", "fy", "fz", "tx", "ty", "tz")
+OBSTACLE_COLUMNS = ("step", "time", "obstacle", "fx", "fy", "fz", "tx", "ty", "tz", "normal", "friction")
 
 
 def vector_columns(names: Sequence[str]) -> tuple[str, ...]:

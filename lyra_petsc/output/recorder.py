@@ -438,7 +438,7 @@ class Recorder:
 
 
 def _obstacle_row(report: StepReport, name: str, load: Array) -> dict[str, float | str]:
-    """A row of obstacles.csv; ``load`` (6,) is the force [N] and the torque [N·m] on an obstacle."""
+    """A row of obstacles.csv; ``load`` (8,) as in `EnergyBalance.obstacle_forces`."""
     values: list[float | str] = [report.step, report.time, name, *map(float, load)]
     return dict(zip(OBSTACLE_COLUMNS, values, strict=True))
 

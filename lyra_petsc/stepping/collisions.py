@@ -257,8 +257,8 @@ class Collisions:
         system = self._system
         if not self._discretisation.has_near_elements:
             return False
-        acting = system.acting_elements(x).values()
-        return any(system.points.global_max(any(mask.any() for mask in acting)))
+        acts = [mask.any() for term, mask in system.acting_elements(x).items() if not term.slips]
+        return any(system.points.global_max(any(acts)))
 
     @property
     def may_impact(self) -> bool:

@@ -251,18 +251,18 @@ class EnergyBalance:
         return list(total)
 
     def obstacle_forces(self, count: int) -> Array:
-        """Force [N] and torque [N m] about the origin, (count, 6), of the sheets on each of a scene's
-        ``count`` obstacles at the end of the last step, with the dashpots of the step; collective.
+        """Force [N] and torque [N m] about the origin of the sheets on each of a scene's ``count`` obstacles
+        in the last step, and sums over contacts of the magnitudes of normal force and friction [N], (count,
+        8); collective.
         """
-        system, total = self._system, np.zeros((count, 6))
+        system, total = self._system, np.zeros((count, 8))
         for term in system.active.elastic:
             found = term.obstacle_forces(system.x, system.active.frozen[term], count)
             if found is not None:
                 total += found
         if impulses := system.contact_impulses:
             on = impulses.obstacle < count  # not symmetry planes
-            torque = np.cross(impulses.position[on], impulses.force[on])
-            np.add.at(total, impulses.obstacle[on], np.column_stack([impulses.force[on], torque]))
+            np.add.at(total, impulses.obstacle[on], impulses.loads[on])
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

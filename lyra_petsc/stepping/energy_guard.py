@@ -236,7 +236,7 @@ class EnergyGuard:
                 term.add_gradient(x, frozen, force)
         by_targets = 0.5 * system.dt * float(force[rows].sum(axis=0) @ drift)
         if system.contact_impulses:
-            by_targets += system.dt * float(system.contact_impulses.force.sum(axis=0) @ drift)
+            by_targets += system.dt * float(system.contact_impulses.loads[:, :3].sum(axis=0) @ drift)
         sums = system.points.global_sum(*momenta, float((mass @ change) @ drift), lifted, by_targets)
         first, last, pushed, lifted, by_targets = map(float, sums)
         return first, last, pushed, lifted, by_targets
@@ -246,7 +246,7 @@ class EnergyGuard:
         that motion on this rank, less the heat in ``works``.
         """
         system = self._system
-        if not system.damping.active or system.integrator.order == 1 or system.integrator.exact_work:
+        if not system.damping.active or system.integrator.order == 1 or system.integrator.moves_uniformly:
             return works, 0.0
         moved = x1 - x0
         # at the middle, the displacements of a rotation cause no strain
@@ -338,22 +338,19 @@ class EnergyGuard:
 
     # -- the verdict -------------------------------------------------------------------------------
 
-    def accept(self, step: Balance, *, strict: bool) -> bool:
-        """Whether the step is accepted; if so, it is recorded. The same on all ranks; collective.
-
-        ``strict``: apply `IMPACT_GAIN` and `IMPACT_SUM` during contact under an integrator of second order.
-        """
+    def accept(self, step: Balance) -> bool:
+        """Whether the step is accepted; if so, it is recorded. The same on all ranks; collective."""
         new = self._updated(step)
         over = self._system.integrator.gain_window
         # a step without a gain of its own would not improve the mean if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self._judged = of_step, of_steps, new.scale
-        impact = strict and self._system.has_active_pairs and self._system.integrator.order > 1
+        impact = self._system.has_active_pairs and self._system.integrator.order > 1
         max_gain, max_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
         accepted = of_step <= max(max_gain * new.scale, step.noise)
         # repeating a step without a gain would not reduce the sum
-        accepted &= of_steps <= max(max_sum * new.scale, new.noise) or new.recent[-1] <= 0.0
+        accepted &= of_steps <= max(max_sum * new.scale, new.noise) or new.recent[-1] <= step.noise
         accepted = bool(self._system.points.comm.bcast(accepted, root=0))
         if accepted:
             self.gains, self._pull = new, self._next_pull

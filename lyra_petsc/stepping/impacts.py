@@ -1,43 +1,31 @@
-"""Impulses on velocities at the end of a step with contact, and friction at the start of one.
+"""Impulses on velocities at the end of a step with contact: dashpots, and friction by the normal forces of
+the step.
 
-**All integrators**: a barrier stores the energy of an impact and would return it as a bounce. `damp_impacts`
-damps the rates of change of the distances in contact, by dashpots of half the critical damping of barrier and
-mass along the lines between the nearest points. After an impact parts separate with about a tenth of their
-speed, whatever Δt is, and come to rest within a few periods of the barrier. Parts that lie, slide or roll at
-a constant distance are not damped. (Without damping sheets bounce for long under backward Euler with short
-steps, and under integrators of second order with any. Bouncing parts slide where they should stick, as their
-normal force is too small half of the time.) `correct_friction` then adapts friction to the normal forces of
-the step, dashpots included.
+**Impacts.** A barrier stores the energy of an impact and would return it as a bounce. Dashpots of critical
+damping of barrier and mass damp the rates of change of the distances in contact, along the lines
+between the nearest points. Parts that lie, slide or roll at a constant distance are not damped. A dashpot
+reduces the normal force of a step at most to 0: contact never pulls.
 
-**The midpoint rule**: energy that contact adds is removed from the velocities. The rule works with the forces
-at its stage, and a barrier that stiffens within a step stores less energy than the work of these forces, or
-returns more. The surplus of a step ::
+**Friction.** The equations of a step have the normal forces at its start. Its own normal force N, dashpots
+included, is known at its end, where the friction f of each pair becomes that of Coulomb's law: with the
+friction f_0 in the equations, the relative tangential velocity v_t and the mass m of the pair,
 
-    E(x_{n+1}) − E(x_n) − ∇E(x_s) · (x_{n+1} − x_n)
+    f = projection of f_0 − m v_t / Δt on the disc |f| ≤ μ N,
 
-is summed over the steps. A negative sum is bounded by the energy stored in contact, because only that can be
-returned. A positive sum is removed from the kinetic energy by impulses between the pairs in contact, in
-proportion to their normal forces and along the lines between their nearest points at the end of the step, so
-that momentum and angular momentum are conserved. (Energy by projection: Hairer, Lubich & Wanner, Geometric
-Numerical Integration, sec. IV.4.)
+which stops the pair if it can, and else opposes the motion (the proximal form of Coulomb's law; Jean,
+Computer Methods in Applied Mechanics and Engineering 177 (1999) 235-257).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.contact import dashpots
-from lyra_petsc.terms.term import Elastic
-
-DAMPING = 0.5
-"""Damping of the distances in contact, over the critical damping."""
+from lyra_petsc.terms.term import Contacts, Elastic, EndFriction
 
 END = 1e-3
 """Last part of a step by whose motion the velocities of obstacles at its end are measured."""
@@ -52,192 +40,109 @@ class ContactImpulses(NamedTuple):
 
     Attributes
     ----------
-    normal_force : (n_owned,)
-        Mean normal forces [N] of impulses on vertices, for friction.
     handle_force : (m,)
         Mean reaction forces [N] of handles, at the prescribed unknowns.
     work, heat : float
         Work of the obstacles by the impulses, and energy that became heat [J].
-    obstacle, position, force : (m,), (m, 3), (m, 3)
-        Numbers of obstacles, positions [m] of the mean forces on them, and these forces [N].
+    obstacle, loads : (m,), (m, 8)
+        Numbers of obstacles, and loads on them as in `Elastic.obstacle_forces`.
     """
 
-    normal_force: Array
     handle_force: Array
     work: float
     heat: float
     obstacle: Ints
-    position: Array
-    force: Array
+    loads: Array
 
 
-def apply_impulses(system: StageEquations, x_before: Array, contact_energy: float | None) -> ContactImpulses:
-    """Apply all impulses at the end of a step from x_before (n_owned, 3) [m]; collective.
+def end_step(system: StageEquations) -> ContactImpulses:
+    """Apply all impulses at the end of a step that something may touch in; collective."""
+    last, impulses = _last_times(system), []
+    for contact in system.active.separating:
+        contacts = contact.contacts(system.x, system.v, system.active.frozen[contact], last)
+        if contacts is None:
+            continue
+        damped, push = _damp(system, contacts)
+        impulses.append(damped)
+        normal_force = contacts.force + push
+        for term in system.active.changing:
+            if term.slips:
+                impulses.append(_slide(system, term, contacts, normal_force))
+    handle_force = np.zeros(len(system.prescribed.indices))
+    for each in impulses:
+        handle_force += each.handle_force
+    obstacle = np.concatenate([np.empty(0, np.int64), *(each.obstacle for each in impulses)])
+    loads = np.concatenate([np.empty((0, 8)), *(each.loads for each in impulses)])
+    work, heat = sum(each.work for each in impulses), sum(each.heat for each in impulses)
+    return ContactImpulses(handle_force, work, heat, obstacle, loads)
 
-    ``contact_energy`` [J] is this rank's energy of contact there, or None if no surplus is removed.
+
+def _damp(system: StageEquations, contacts: Contacts) -> tuple[ContactImpulses, Array]:
+    """Damp the rates at which distances in contact change; returns also the forces (m,) [N]; collective.
+
+    A pair with the rate r gets the impulse −w r of a dashpot, which keeps second order, with
+    w/m = 1 − e^−q, q = 2 √(Δt² b″/m), m of `_pair_masses`.
     """
-    normal_force, integrator = np.zeros(system.points.n_owned), system.integrator
-    if contact_energy is not None:
-        integrator.surplus, normal_force = remove_surplus(
-            system, contact_energy, x_before, integrator.surplus
-        )
-    impulses = damp_impacts(system, normal_force)
-    for term in system.active.changing:
-        if term.slips:
-            impulses = correct_friction(system, term, impulses)
-    return impulses
+    points, beta, dt = contacts.points, contacts.sheet_beta, system.dt
+    mass = _pair_masses(system, points, np.abs(beta), contacts.stiffness)
+    rate = np.einsum("ei,eik,ek->e", beta, system.v[points], contacts.normal)
+    approach = np.einsum("ek,ek->e", contacts.velocity, contacts.normal)
+    q = 2.0 * dt * np.sqrt(contacts.stiffness / np.maximum(mass, np.finfo(float).tiny))
+    push = np.maximum(mass * np.expm1(-q) * (rate - approach) / dt, -contacts.force)
+    along = push[:, None] * contacts.normal
+    impulse = _sums(points, dt * beta[:, :, None] * along[:, None, :], len(system.x))
+    handle_force, heat = _apply(system, impulse, work := dt * float(push @ approach))
+    loads = _loads(system, points, beta, contacts.obstacle, along, push)
+    return ContactImpulses(handle_force, work, heat, *loads), push
 
 
-def remove_surplus(
-    system: StageEquations, before: float, x_before: Array, surplus_before: float
-) -> tuple[float, Array]:
-    """Remove the energy that contact has added from the velocities of the present state; collective.
-
-    ``before`` [J] is this rank's energy of contact at x_before (n_owned, 3), ``surplus_before`` [J] the
-    surplus of the steps before. Returns the surplus [J] that remains, and the mean normal forces [N] of the
-    impulses on vertices, (n_owned,), for friction.
+def _slide(system: StageEquations, term: Elastic, contacts: Contacts, normal_force: Array) -> ContactImpulses:
+    """Change the friction of the step to that of Coulomb's law with the ``normal_force`` (m,) [N] of the
+    step; collective.
     """
-    n = system.points.n_owned
-    terms, frozen = system.active.separating, system.active.frozen
-    moved, work, after = system.x[:n] - x_before, 0.0, 0.0
-    for term in terms:
-        term.add_gradient(system.stage_positions, frozen[term], pull := np.zeros_like(system.x))
-        work += float(np.vdot(pull[:n], moved))
-        after += float(term.energies(system.x, frozen[term]).sum())
-    gain, stored = (float(value) for value in system.points.global_sum(after - before - work, after))
-    remaining, normal_force = max(surplus_before + gain, -stored), np.zeros(n)
-    if not remaining > 0.0:
-        return remaining, normal_force
-    impulse = np.zeros_like(system.x)
-    for term in terms:
-        normal_force += _add_impulses(term, system, frozen[term], impulse)
-    system.points.add_to_owners(impulse)
-    impulse = np.where(system.prescribed.free, impulse[:n], 0.0)
-    mass = system.mass[:, None]
-    change = np.divide(impulse, mass, out=np.zeros_like(impulse), where=mass > 0.0)
-    local = float(np.vdot(impulse, change)), float(np.vdot(impulse, system.v[:n]))
-    square, rate = (float(value) for value in system.points.global_sum(*local))
-    if not square > 0.0:
-        return remaining, np.zeros(n)
-    # solve ½ square s² + rate s = −remaining, or minimise the left side if there is no solution
-    discriminant = max(rate * rate - 2.0 * square * remaining, 0.0)
-    size = (-rate + math.copysign(math.sqrt(discriminant), rate)) / square
-    system.state.set(system.x[:n], system.v[:n] + size * change)
-    return remaining + (0.5 * square * size + rate) * size, size / system.dt * normal_force
+    frozen, last, dt = system.active.frozen[term], _last_times(system), system.dt
+    friction = term.end_friction(system.x, system.v, frozen, contacts, normal_force, last)
+    points, gradients = friction.points, friction.gradients
+    of_obstacles = np.einsum("eck,ek->ec", friction.tangents, friction.velocity)
+    mass = _pair_masses(system, points, _sizes(gradients, friction.beta), friction.normal_force)
+    before = np.einsum("ecik,eik->ec", gradients, system.v[points]) - of_obstacles
+    force, sticks = _coulomb(friction, before, mass / dt, friction.still / dt)
+    change = force - friction.force
+    impulse = _sums(points, dt * np.einsum("ec,ecik->eik", change, gradients), len(system.x))
+    work = dt * float(np.vdot(change, of_obstacles))
+    handle_force, heat = _apply(system, impulse, work)
+    after = np.einsum("ecik,eik->ec", gradients, system.v[points]) - of_obstacles
+    # of the change, with the mean of the velocities before and after, as external work
+    of_change = -0.5 * dt * float(np.vdot(change, before + after))
+    sliding = np.where(sticks, 0.0, np.maximum(-dt * np.einsum("ec,ec->e", force, after), 0.0))
+    term.set_end_friction(friction, force, sticks, sliding)
+    along = np.einsum("ec,eck->ek", change, friction.tangents)
+    loads = _loads(system, points, friction.beta, friction.obstacle, along, np.zeros(len(along)))
+    return ContactImpulses(handle_force, work - of_change, heat - of_change, *loads)
 
 
-def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array) -> Array:
-    """Add impulses, up to a factor, of the counted pairs in contact at the stage to out (n_local, 3); returns
-    their sums for vertices in contact, (n_owned,).
+def _coulomb(
+    friction: EndFriction, velocity: Array, mass: Array, still: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Friction (m, 2) [N] of pairs with relative velocities (m, 2) [m/s] and ``mass`` (m,) [kg/s], the mass
+    over Δt, and which of them stick.
     """
-    points, beta, normal, force, vertex = term.contact_points(system.stage_positions, frozen)
-    sheet = points >= 0
-    between = sheet.all(axis=1)
-    beta = np.where(sheet, beta, 0.0)
-    rows = np.where(sheet, points, 0)
-    separation = np.einsum("ei,eik->ek", beta[between], system.x[rows[between]])
-    normal = normal.copy()
-    length = np.maximum(np.linalg.norm(separation, axis=1), np.finfo(float).tiny)
-    normal[between] = separation / length[:, None]
-    np.add.at(out, rows, (force[:, None] * beta)[:, :, None] * normal[:, None, :])
-    at = vertex >= 0
-    return np.bincount(vertex[at], force[at], system.points.n_owned).astype(np.float64)
-
-
-def damp_impacts(system: StageEquations, normal_force: Array) -> ContactImpulses:
-    """Damp the rates at which distances in contact change; collective.
-
-    ``normal_force`` (n_owned,) are mean normal forces [N] of earlier impulses of the step on vertices.
-    A pair with the rate r gets the impulse −w r of a dashpot in Δt, which keeps second order, with
-    w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m). The mass m of `_inverse_masses` is such that no impulse is too large;
-    the masses of vertices are divided in proportion to b″, so that a pair that hardly touches takes no mass
-    from others, and two halves of a pair are damped as the whole.
-    """
-    layout, n, dt = system.points, system.points.n_owned, system.dt
-    last = _last_times(system)
-    all_pairs = [
-        term.dashpots(system.x, system.v, system.active.frozen[term], last)
-        for term in system.active.separating
-    ]
-    if not any(layout.global_max(sum(len(pairs.points) for pairs in all_pairs))):
-        reactions, obstacle = np.zeros(len(system.prescribed.indices)), np.empty(0, dtype=np.int64)
-        return ContactImpulses(normal_force, reactions, 0.0, 0.0, obstacle, *np.empty((2, 0, 3)))
-    # a pair is handled by the rank of one of its vertices, which knows all pairs with the same nearest points
-    owned = [np.empty(len(pairs.points), dtype=bool) for pairs in all_pairs]
-    for pairs, own in zip(all_pairs, owned, strict=True):
-        dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
-    sheets = _corrects_sheets(system)
-    both = list(zip(all_pairs, owned, strict=True))
-    inverse = _inverse_masses(system, [(*pairs[:2], pairs.stiffness, own) for pairs, own in both])
-    work, impulse, pushes = 0.0, np.zeros_like(system.x), []
-    for pairs, own in both:
-        push = np.empty(len(own))
-        given = *pairs[:4], pairs.approach, own, dt, DAMPING
-        dashpots.damp(system.v, inverse, *given, push, impulse)
-        vertex = np.flatnonzero(own & (pairs.vertex >= 0) & (sheets | (pairs.obstacle >= 0)))
-        normal_force = normal_force + np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
-        work += float(push @ pairs.approach)
-        on = np.flatnonzero(own & (pairs.obstacle >= 0))
-        force = (push[on] / dt)[:, None] * pairs.normal[on]
-        pushes.append(_obstacle_forces(system, pairs.points[on], pairs.beta[on], pairs.obstacle[on], force))
-    handle_force, heat = _apply_impulse(system, impulse, work)
-    on_obstacles = (np.concatenate(part) for part in zip(*pushes, strict=True))
-    return ContactImpulses(normal_force, handle_force, work, heat, *on_obstacles)
-
-
-def correct_friction(system: StageEquations, term: Elastic, before: ContactImpulses) -> ContactImpulses:
-    """Correct the friction of sliding pairs by impulses: add what is missing, remove what was too much.
-
-    Returns the effects of all impulses of the step, those ``before`` included; collective. An impulse is at
-    most the sliding speed times m of `_inverse_masses`, so that missing friction reverses no pair, and
-    removed friction at most doubles its speed. (Friction of a light vertex that others press on an obstacle's
-    edge is balanced by them; without the bound the vertex would be thrown off.) Friction forces have no
-    moment at the positions where the step begins. The moment that they and these impulses have elsewhere is
-    removed under the midpoint rule, so that angular momentum is conserved.
-    """
-    stage, x, dt = system.stage_positions, system.x, system.dt
-    frozen, sheets = system.active.frozen[term], _corrects_sheets(system)
-    last = _last_times(system)
-    corrections = term.friction_corrections(
-        stage, x, system.v, frozen, before.normal_force, dt, sheets=sheets, last=last
-    )
-    points, beta, weight, direction, gradient, missing, obstacle, moved = corrections
-    pairs, moments = np.empty((0, 4), dtype=np.int64), np.empty((0, 3))
-    if system.integrator.exact_work:
-        pairs, moments = term.moments(stage, frozen)
-    if not any(system.points.global_max(float(np.abs(missing).max(initial=0.0)), len(pairs))):
-        return before
-    impulse = np.zeros_like(x)
-    size = np.linalg.norm(gradient, axis=2)
-    stopped = _stoppable_masses(system, points, size, weight, missing != 0.0)
-    speed = np.einsum("eik,eik->e", system.v[points], gradient) - np.einsum("ek,ek->e", moved, direction) / dt
-    stopping = stopped * np.maximum(speed, 0.0) / dt
-    push = -np.clip(missing, -stopping, stopping)
-    force, impulses = push[:, None] * direction, (dt * push)[:, None, None] * gradient
-    np.add.at(impulse, points, impulses)
-    if system.integrator.exact_work:
-        between = obstacle < 0
-        theirs = np.cross(x[points[between]], impulses[between]).sum(axis=1)
-        pairs, moments = np.concatenate([pairs, points[between]]), np.concatenate([dt * moments, theirs])
-        dashpots.add_couples(x, pairs, -moments, impulse)
-    work, on = float(np.vdot(force, moved)), obstacle >= 0
-    pushed = _obstacle_forces(system, points[on], beta[on], obstacle[on], force[on])
-    handle_force, heat = _apply_impulse(system, impulse, work)
-    # the work of friction, with the mean of the speeds before and after, is external work
-    after = np.einsum("eik,eik->e", system.v[points], gradient) - np.einsum("ek,ek->e", moved, direction) / dt
-    friction_work = -0.5 * dt * push * (speed + after)
-    term.set_impulse_work(points[:, 0], friction_work)
-    total = float(friction_work.sum())
-    sums = before.handle_force + handle_force, before.work + work - total, before.heat + heat - total
-    on_obstacles = (np.concatenate(part) for part in zip(before[4:], pushed, strict=True))
-    return ContactImpulses(before.normal_force, *sums, *on_obstacles)
+    moves = friction.slides | (np.linalg.norm(velocity, axis=1) > still)
+    stopping = friction.force - np.where(moves, mass, 0.0)[:, None] * velocity
+    size = np.linalg.norm(stopping, axis=1)
+    # a spring that still yields less than its limit need not stop the pair within the step
+    holds = friction.held & (np.linalg.norm(friction.force, axis=1) <= friction.static)
+    sticks = holds | (size <= np.where(friction.slides, friction.kinetic, friction.static))
+    limit = np.where(sticks, friction.static, friction.kinetic)
+    return stopping * np.minimum(limit / np.maximum(size, 1e-300), 1.0)[:, None], sticks
 
 
 def hold_by_friction(system: StageEquations, term: Elastic, v: Array, acceleration: Array) -> Array:
     """The accelerations (n_owned, 3) [m/s²] at the start of a step with the friction that opposes motion.
 
     ``acceleration`` has the friction of the elastic slip, which the forces that begin to act have not yet
-    changed. Friction as a constraint stops the relative displacements in a step with velocities v
+    changed; the slip becomes that of the friction found, as the springs of sticking pairs would otherwise
+    overshoot and yield. Friction as a constraint stops the relative displacements in a step with velocities v
     (n_local, 3) [m/s], as far as its limit allows; collective. (Projected gradients with momentum: Nesterov,
     Soviet Mathematics Doklady 27 (1983) 372-376.)
     """
@@ -248,12 +153,11 @@ def hold_by_friction(system: StageEquations, term: Elastic, v: Array, accelerati
     largest = layout.global_max(float(limit.max(initial=0.0)))[0]
     if not largest > 0.0:
         return acceleration
-    stopped = _stoppable_masses(system, points, size, weight, np.ones(len(points), dtype=np.bool_))
+    stopped = _pair_masses(system, points, size, weight)
     moves = system.prescribed.free & (mass > 0.0)
 
     def with_friction(friction: Array) -> Array:
-        pull = np.zeros_like(v)
-        np.add.at(pull, points, np.einsum("ec,ecik->eik", friction - elastic, gradients))
+        pull = _sums(points, np.einsum("ec,ecik->eik", friction - elastic, gradients), len(v))
         layout.add_to_owners(pull)
         change = pull[: layout.n_owned]
         return acceleration + np.divide(change, mass, out=np.zeros_like(change), where=moves)
@@ -269,6 +173,7 @@ def hold_by_friction(system: StageEquations, term: Elastic, v: Array, accelerati
         friction, tried = after, after + sweep / (sweep + 3.0) * (after - friction)
         if layout.global_max(change)[0] <= SETTLED * largest:
             break
+    term.set_starting_friction(friction)
     return with_friction(friction)
 
 
@@ -280,57 +185,58 @@ def _last_times(system: StageEquations) -> tuple[float, float]:
     return system.t1 - part * system.dt, system.t1
 
 
-def _corrects_sheets(system: StageEquations) -> bool:
-    """Whether friction between sheets is corrected, too: if the stage is not the end of the step."""
-    return system.stage.offset < system.dt
+def _sizes(gradients: Array, beta: Array) -> Array:
+    """Largest norms (m, 4) of ``gradients`` (m, 2, 4, 3) over all tangential directions.
 
-
-def _stoppable_masses(
-    system: StageEquations, points: Ints, size: Array, weight: Array, own: NDArray[np.bool_]
-) -> Array:
-    """The m (m,) [kg] of `_inverse_masses` of pairs whose gradients have the norms ``size`` (m, 4);
-    collective.
+    A gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d.
     """
-    inverse = _inverse_masses(system, [(points, size, weight, own)])
-    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
-    return np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0.0)
+    return np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
 
 
-def _inverse_masses(
-    system: StageEquations, all_pairs: Iterable[tuple[Ints, Array, Array, NDArray[np.bool_]]]
-) -> Array:
-    """1/m (n_local, 3) [1/kg] of the share of a vertex's mass that a pair of weight 1 may stop; collective.
+def _sums(points: Ints, values: Array, n: int) -> Array:
+    """Sums (n, 3) of ``values`` (m, 4, 3) over the rows ``points`` (m, 4)."""
+    rows = points.reshape(-1)
+    columns = [np.bincount(rows, column, n) for column in values.reshape(-1, 3).T]
+    return np.stack(columns, axis=1).astype(np.float64)
 
-    It is 0 for prescribed unknowns. ``all_pairs`` are points, β, weights c and masks of the pairs of this
-    rank. With m_e = c_e times the least over the vertices i of a pair of mass over Σ_e c_e |β_ei| Σ_j |β_ej|,
-    summed over all pairs e, the sum Σ_e w_e a_e a_eᵀ with w_e ≤ m_e does not exceed the mass matrix. All
-    impulses together then reverse no motion, however many pairs a vertex has.
+
+def _pair_masses(system: StageEquations, points: Ints, size: Array, weight: Array) -> Array:
+    """Masses m (m,) [kg] that pairs of this rank may stop, whose gradients have the norms ``size`` (m, 4);
+    collective.
+
+    The masses of vertices are divided in proportion to ``weight`` (m,), so that a pair that hardly touches
+    takes no mass from others, and two halves of a pair are damped as the whole. With m_e = c_e times the
+    least over the vertices i of a pair of mass over Σ_e c_e s_ei Σ_j s_ej, summed over all pairs e, the sum
+    Σ_e w_e a_e a_eᵀ with w_e ≤ m_e does not exceed the mass matrix. All impulses together then reverse no
+    motion, however many pairs a vertex has. It is 0 for pairs with prescribed unknowns.
     """
     n, mass = system.points.n_owned, system.mass[:, None]
+    shares = weight[:, None] * size * size.sum(axis=1, keepdims=True)
     shared, inverse = np.zeros((2, *system.x.shape))
-    for points, beta, weight, own in all_pairs:
-        dashpots.share(points, beta, weight, own, shared)
+    shared[:, 0] = np.bincount(points.reshape(-1), shares.reshape(-1), len(shared))
     system.points.add_to_owners(shared)
     free = system.prescribed.free & (mass > 0.0)
     np.divide(shared[:n, :1], mass, out=inverse[:n], where=free)
     system.points.update_ghosts(inverse)
-    return inverse
+    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
+    return np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0.0)
 
 
-def _obstacle_forces(
-    system: StageEquations, points: Ints, beta: Array, obstacle: Ints, force: Array
-) -> tuple[Ints, Array, Array]:
-    """Obstacles of pairs, positions (m, 3) [m] of the forces on them, and these forces (m, 3) [N].
-
-    A sheet's points get ``force`` (m, 3) [N] times β.
+def _loads(
+    system: StageEquations, points: Ints, beta: Array, obstacle: Ints, force: Array, normal_force: Array
+) -> tuple[Ints, Array]:
+    """Numbers of obstacles and loads (m, 8) on them by forces β times ``force`` (m, 3) [N] on the points of
+    sheets, of which ``normal_force`` (m,) [N] are the normal forces.
     """
-    of_sheet = np.where(points >= 0, beta, 0.0)
-    side = of_sheet.sum(axis=1, keepdims=True)
-    at = np.einsum("ei,eik->ek", of_sheet, system.x[np.maximum(points, 0)]) / side
-    return obstacle, at, -side * force
+    on = np.flatnonzero(obstacle >= 0)
+    side = beta[on].sum(axis=1, keepdims=True)
+    at = np.einsum("ei,eik->ek", beta[on], system.x[points[on]]) / side
+    on_obstacle = -side * force[on]
+    magnitudes = np.column_stack([normal_force[on], np.zeros(len(on))])
+    return obstacle[on], np.hstack([on_obstacle, np.cross(at, on_obstacle), magnitudes])
 
 
-def _apply_impulse(system: StageEquations, impulse: Array, work: float) -> tuple[Array, float]:
+def _apply(system: StageEquations, impulse: Array, work: float) -> tuple[Array, float]:
     """Apply impulses (n_local, 3) [N s] to the velocities; collective.
 
     Returns the mean reaction forces [N] of handles, and the heat [J]: ``work`` of obstacles minus the change
@@ -343,5 +249,5 @@ def _apply_impulse(system: StageEquations, impulse: Array, work: float) -> tuple
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
     heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
-    system.integrator.shift_past_velocities(change)
+    system.in_contact.shift_past_velocities(change)
     return -impulse[:n].take(system.prescribed.indices) / system.dt, heat

@@ -63,7 +63,7 @@ class LocalError:
 
     def record_step(self, v_before: Array, dt: float) -> None:
         """Record the slope of the accepted step."""
-        if self._system.integrator.order > 1:
+        if self._system.usual.order > 1:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
 

@@ -36,7 +36,6 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.energy_balance import EnergyBalance
-from lyra_petsc.stepping.integrators.integrator import Integrator
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
@@ -102,10 +101,6 @@ class Neighbour:
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
     prescribed_force: Array | None = None
-    integrator: Integrator = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.integrator = self.system.integrator
 
     @property
     def system(self) -> StageEquations:
@@ -300,7 +295,7 @@ class Sensitivities:
                 if each.energy_balance is not None:
                     each.energy_balance.record(before.x + each.offset * delta * tangent.x)
                 if taken is not usual:
-                    each.system.go_on_with(each.integrator, before.v + each.offset * delta * tangent.v)
+                    each.system.follow_step(before.v + each.offset * delta * tangent.v)
             self._update_tangent(tangent, neighbours, delta)
             for each in neighbours:
                 each.system.set_references(end)

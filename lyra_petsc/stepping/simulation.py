@@ -31,6 +31,7 @@ from lyra_petsc.stepping.failure.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure.failure_report import FailedAttempt, Failure
 from lyra_petsc.stepping.failure.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
+from lyra_petsc.stepping.integrators.integrator import Integrator
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.newton.roundoff import residual_roundoff
 from lyra_petsc.stepping.problem import Problem, build_problem, event_times, refuse_contact
@@ -55,12 +56,6 @@ LARGEST_FRACTION = 0.1
 
 IMPACT_DT = 0.2
 """Δt over the nominal one below which backward Euler repeats steps that fail in contact."""
-
-IMPACT_DT_EXACT_WORK = 0.02
-"""The same under the midpoint rule, which conserves angular momentum over an impact if it converges."""
-
-UNRESOLVED_SKINS = 20.0
-"""Displacement in a step, over the skin of the contact search, above which halvings resolve no impact."""
 
 IMPACT_SKIN_FRACTION, IMPACT_RUN_FRACTION = 0.02, 1e-4
 """Displacement in a step over the skin of the contact search, and Δt over the length of the run, below which
@@ -218,7 +213,6 @@ class SteppedScene:
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor
             self._equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
-        self._scene_integrator = system.integrator
         self.energy_balance = EnergyBalance(system)
         drift = scene.initial.velocity if scene.initial else (0.0, 0.0, 0.0)
         self.guard = EnergyGuard(system, drift) if system.integrator.dynamic else None
@@ -288,13 +282,11 @@ class SteppedScene:
         x_before, v_before = system.x, system.v
         newton = linear = rejected = halvings = 0
         self._failed_attempts = []
-        system.integrator = self._scene_integrator
-        starts = False
-        if not self._scene_integrator.iterates and system.collisions.touches(system.x):
-            system.integrator = LaggedBackwardEuler()
+        system.integrator = system.in_contact if system.touches else system.usual
+        starts, touched = False, system.touches
         while True:
             end = self.control.next_end(self.time)
-            past, past_error = system.integrator.saved_state(), self.estimated_error
+            past, past_error = system.saved_histories(), self.estimated_error
             past_slope = self.local_error.saved_state() if self.local_error is not None else None
             with self.phases("solve"):
                 self.stepper.follow_integrator()
@@ -306,16 +298,19 @@ class SteppedScene:
                 if not self._switch_at_crossing(attempt, end - self.time):
                     self._recover_from_failure(attempt, end)
             else:
-                once = not system.integrator.iterates
-                solved = not (once and system.collisions.touches(system.stage_positions))
+                if system.suits_contact:
+                    solved = system.resolves_contact()
+                else:
+                    solved = not system.collisions.touches(system.stage_positions)
                 accurate = solved and self._is_accurate(v_before[:n], end - self.time)
                 if accurate and self._conserves_energy(x_before, v_before, end):
                     break
                 system.state.set(x_before[:n], v_before[:n])
-                system.integrator.restore(*past)
+                system.restore_histories(*past)
                 self.stepper.start(self.time, self.step_number)
                 if not solved:
-                    system.integrator = LaggedBackwardEuler()
+                    takes_it = touched and not system.suits_contact
+                    system.integrator = system.in_contact if takes_it else self._backward_euler()
                 elif accurate:
                     self.estimated_error = past_error
                     if self.local_error is not None and past_slope is not None:
@@ -327,10 +322,10 @@ class SteppedScene:
                         halvings += 1
             rejected += 1
         self.last_integrator = system.integrator
-        if system.integrator is not self._scene_integrator:
-            system.go_on_with(self._scene_integrator, v_before[:n])
-            if self.local_error is not None:
-                self.local_error.restart()
+        if system.integrator is system.in_contact is not system.usual and system.usual.iterates:
+            name = system.in_contact.name
+            self._note_once("in contact", f"{name} takes the steps in which something touches")
+        system.follow_step(v_before[:n])
         if self._equilibrium is not None and self.control.is_end(end):
             with self.phases("solve"):
                 settled = self._equilibrium.settle(self.time, end)
@@ -410,10 +405,10 @@ class SteppedScene:
         if accepted:
             self.local_error.record_step(v_before, dt)
             self.estimated_error += error
-            if self._scene_integrator.order == 1 and self.step_number >= FIRST_ORDER_STEPS:
+            if system.usual.order == 1 and self.step_number >= FIRST_ORDER_STEPS:
                 self._note_once(
                     "order",
-                    f"{self.step_number} steps to t = {self.time:g} s: {self._scene_integrator.name} is of "
+                    f"{self.step_number} steps to t = {self.time:g} s: {system.usual.name} is of "
                     "first order, with Δt in proportion to time.tolerance; bdf2 or alpha2 take fewer steps",
                 )
             if error > share and dt <= NEAR_MINIMUM * max(minimum, control.smallest):
@@ -450,10 +445,7 @@ class SteppedScene:
             snapshot = self.energy_balance.snapshot()
             after = self.energy_balance.record(x_before[: system.points.n_owned])
             balance = self.guard.balance(x_before, v_before, snapshot[0], after, self.energy_balance.works)
-            # short steps of the midpoint rule are judged leniently: backward Euler would not conserve
-            # angular momentum as they do
-            strict = not system.integrator.exact_work or end - self.time > IMPACT_DT * self.control.step
-            accepted = self.guard.accept(balance, strict=strict)
+            accepted = self.guard.accept(balance)
             if not accepted:
                 self.energy_balance.revert(snapshot)
             return accepted
@@ -461,27 +453,14 @@ class SteppedScene:
     def _switch_at_crossing(self, attempt: Attempt, dt: float) -> bool:
         """Let another integrator repeat a step of dt [s] in which parts would cross; return whether one does.
 
-        The midpoint rule and generalised-α extrapolate from their stage to the end of the step, with small
-        gaps across the contact that held the sheet at the stage. BDF2, also of second order, has its stage
-        at the end, but dissipates more energy than a few halvings of Δt where these resolve the impact.
+        The midpoint rule and generalised-α extrapolate from their stage to the end of the step.
         """
-        system, usual = self.problem.system, self._scene_integrator
-        if system.integrator is usual and attempt.message.startswith(WOULD_CROSS):
-            if not usual.iterates:
-                system.integrator = LaggedBackwardEuler()
-                return True
-            stage_at_end = system.stage.offset == system.dt
-            unresolved = dt > UNRESOLVED_SKINS * self._time_through_skin()
-            if stage_at_end or self.scene.time.adaptive or not unresolved:
-                return self._switch_to_backward_euler(dt, "finds no collision-free step")
-            from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # needed at impacts only
-
-            system.integrator = Bdf2()
-            self._note_other_integrator("finds no collision-free step", "bdf2")
-            return True
-        if system.integrator is usual or system.integrator.order == 1:
+        system = self.problem.system
+        if not attempt.message.startswith(WOULD_CROSS):
             return False
-        system.integrator = usual
+        if system.integrator is system.usual and system.usual is not system.in_contact:
+            system.integrator = system.in_contact
+            return True
         return self._switch_to_backward_euler(dt, "finds no collision-free step")
 
     def _switch_after_gain(self, dt: float, *, jump: bool = False, last: bool = False) -> bool:
@@ -490,7 +469,7 @@ class SteppedScene:
         Not under the midpoint rule, which conserves angular momentum.
         """
         assert self.guard is not None
-        if self.problem.system.integrator.exact_work:
+        if self.problem.system.integrator.moves_uniformly:
             return False
         return self._switch_to_backward_euler(dt, self.guard.message, jump=jump, last=last)
 
@@ -504,24 +483,28 @@ class SteppedScene:
         stiff, generalised-α overshoots from the acceleration of a start or a jump. Adaptive steps are short
         near their minimum in contact.
         """
-        system, usual = self.problem.system, self._scene_integrator
+        system, usual = self.problem.system, self.problem.system.usual
         if self.scene.time.adaptive:
             long = dt > 2.0 * self._minimum_dt_in_contact()
         else:
-            long = dt > (IMPACT_DT_EXACT_WORK if usual.exact_work else IMPACT_DT) * self.control.step
+            long = dt > IMPACT_DT * self.control.step
         impact = system.has_active_pairs and not long
         if usual.name == "beuler" or not usual.dynamic or not (jump or last or impact):
             return False
-        if system.integrator is not usual and system.integrator.order == 1:
-            system.integrator = usual  # backward Euler failed, too
+        if system.integrator not in (usual, system.in_contact):
+            system.integrator = system.in_contact  # backward Euler failed, too
             return False
-        system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
+        system.integrator = self._backward_euler()
         self._note_other_integrator(why, "backward Euler", in_contact=system.has_active_pairs and not jump)
         return True
 
+    def _backward_euler(self) -> Integrator:
+        """Backward Euler with the loads of the scene's integrator."""
+        return LaggedBackwardEuler() if self.problem.system.usual.lagged_loads else BackwardEuler()
+
     def _note_other_integrator(self, why: str, by: str, *, in_contact: bool = True) -> None:
         """Note once which integrator repeats steps that fail."""
-        where = f"step {self.step_number + 1} ({self.time_text()}): {self._scene_integrator.name} {why}"
+        where = f"step {self.step_number + 1} ({self.time_text()}): {self.problem.system.usual.name} {why}"
         subject = "impact" if by == "backward Euler" else f"impact {by}"
         self._note_once(
             subject if in_contact else "energy",
@@ -650,7 +633,7 @@ class SteppedScene:
         With them `resume` continues as if the run had never stopped.
         """
         system, time = self.problem.system, self.time
-        arrays, integrator = system.integrator.saved_state()
+        arrays, integrator = system.saved_histories()
         balance, budget = self.energy_balance.saved_state()
         of_stepper, stepper = self.stepper.saved_state(time)
         arrays = arrays | balance | of_stepper
@@ -705,7 +688,7 @@ class SteppedScene:
         if self._equilibrium is not None:
             self._equilibrium.restore(arrays, scalars["equilibrium"], self.time)
         self.estimated_error = scalars["estimated_error"]
-        system.integrator.restore(arrays, scalars["integrator"])
+        system.restore_histories(arrays, scalars["integrator"])
         if self.guard is not None:
             self.guard.restore(scalars["energy"], same=scalars["scheme"] == self.scene.time.scheme)
         if self.local_error is not None:

@@ -18,7 +18,7 @@ This module works on arrays only, without PETSc. Methods that return sums over r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -47,6 +47,15 @@ from lyra_petsc.terms.term import Elastic, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import ContactImpulses
+
+
+FOLLOWED = 0.1
+"""Change of the normal forces in a step over their sum above which the step is solved again with friction by
+those at its end. Otherwise an impulse corrects friction."""
+
+RESOLVED = 0.2
+"""Mean displacement of the vertices in contact by the change of their normal forces in a step, over the skin
+of the contact search, up to which the step resolves contact."""
 
 
 class StageEquations:
@@ -89,6 +98,10 @@ class StageEquations:
         That of the Jacobian.
     solving_edges : bool
         Whether the edges' unknowns are being solved for at the end of the step.
+    usual, in_contact : Integrator
+        The scene's integrator, and the one that takes the steps in which something touches.
+    touches : bool
+        Whether anything touches at the positions of the state.
     has_active_pairs : bool
         Whether any pair of a term with changing stencils acted when the block rows were last renewed.
     prescribed_force : (n_owned, 3) or None
@@ -98,7 +111,8 @@ class StageEquations:
     prescribed_force: Array | None = None
     contact_impulses: ContactImpulses | None = None
     has_active_pairs = solving_edges = False
-    _contact_energy: float | None = None  # at the start of the step
+    touches = False
+    _normal_force = _next_normal_forces = np.empty(0)  # at the start and the end of the step
     _past_velocity: Array | None = None  # (n_owned, 3) before the last step, if there is contact
 
     def __init__(
@@ -114,6 +128,7 @@ class StageEquations:
     ) -> None:
         self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
         self.active = active = ActiveTerms(terms)
+        self.usual, self.in_contact = integrator, integrator.for_contact() if active.changing else integrator
         self.held = held
         rows = np.concatenate([held.reference_rows, *(term.reference_rows for term in terms)])
         self.reference = ReferencePositions(self.points, rows, starts)
@@ -171,6 +186,8 @@ class StageEquations:
         self.update_stencils(self.x)  # energies at the start of a run need all stencils
         for term in self.active.changing:
             term.initialise_pairs(self.x, self.active.frozen[term])
+        self.touches = self.collisions.touches(self.x)
+        self._normal_force = self._normal_forces()
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -178,6 +195,8 @@ class StageEquations:
         """Set up the equations of the step from t0 to t1 [s], and freeze its data; collective."""
         self.t0, self.t1 = t0, t1
         self.collisions.begin_step()
+        for term in self.active.changing:
+            term.begin_step()
         self.predicted_stress.forget()
         after = self.integrator.stage_offset(self.dt)
         self.prescribed.begin_step(t0, t1, self.x)
@@ -191,7 +210,6 @@ class StageEquations:
         self.start_acceleration.begin_step(t0 + after)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
-        self._contact_energy = self._energy_of_contact()
         self.history = self.v[:n] if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
@@ -294,7 +312,9 @@ class StageEquations:
         self.evaluate_at(v)  # for the forces that are asked for after the step
         before, rate_before = self.x[:n], self.v[:n]
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
-        self.integrator.record_step(before, rate_before, free, self.dt)
+        followers = {self.in_contact} if self.integrator is self.usual else set()
+        for integrator in {self.integrator} | followers:
+            integrator.record_step(before, rate_before, free, self.dt)
         self.prescribed.overwrite(moved, self.prescribed.goal)
         if given:
             self.prescribed.overwrite_with_end_velocity(rate)
@@ -304,24 +324,69 @@ class StageEquations:
         if self.active.changing and self.stage.offset < self.dt:
             # pairs that come near between the stage and the end
             self.update_stencils(self._xs, self.x - self._xs)
+        if self.active.changing:
+            self.touches = self.collisions.touches(self.x)
         if self.active.separating:
-            self._past_velocity = rate_before
-            if not self.discretisation.has_near_elements:
-                self.integrator.surplus, self.contact_impulses = max(self.integrator.surplus, 0.0), None
-                return
-            from lyra_petsc.stepping import impacts  # needed only if something is near
+            self._past_velocity, self.contact_impulses = rate_before, None
+            self._next_normal_forces = self._normal_forces()
+            if self.suits_contact and self.discretisation.has_near_elements:
+                from lyra_petsc.stepping import impacts  # needed only if something is near
 
-            self.contact_impulses = impacts.apply_impulses(self, before, self._contact_energy)
+                self.contact_impulses = impacts.end_step(self)
 
-    def go_on_with(self, integrator: Integrator, v_before: Array) -> None:
-        """Change the integrator after a step from velocities v_before (n_owned, 3) that another one took."""
-        by_end = self.integrator.order == 1
-        self.integrator = integrator
-        integrator.restart()
-        if by_end:  # from stage velocities: those after an impact would give stiff damping huge forces
-            rate = (self.stage_velocity - v_before) / self.dt
-            moves = self.prescribed.free & (self.mass[:, None] > 0.0)
-            integrator.set_acceleration(np.where(moves, rate, 0.0))
+    @property
+    def suits_contact(self) -> bool:
+        """Whether the integrator of the step is one for steps in which something touches."""
+        return self.integrator is not self.usual or self.usual is self.in_contact
+
+    def _normal_forces(self) -> Array:
+        """Normal forces [N] at the owned vertices of the state, (n_vertices,); collective."""
+        out = np.zeros_like(self.x)
+        for term in self.present(self.active.separating):
+            out[:, 0] += term.normal_forces(self.x, self.active.frozen[term])
+        if self.discretisation.has_near_elements:
+            self.points.add_to_owners(out)
+        return out[: self.points.n_vertices, 0].copy()
+
+    def resolves_contact(self) -> bool:
+        """Whether the normal forces changed so little in the step that integrators of second order follow
+        them; collective.
+
+        A formula of second order continues a motion that contact has ended in the step: parts would rebound
+        with up to their speed, and friction would reverse the sliding.
+        """
+        if self.integrator.order == 1 or not self.active.separating:
+            return True
+        before, now = self._normal_force, self._next_normal_forces
+        mass = self.mass[: self.points.n_vertices][np.maximum(before, now) > 0.0]
+        change, mass = self.points.global_sum(float(np.abs(now - before).sum()), float(mass.sum())).tolist()
+        skin = min(term.skin for term in self.active.separating)
+        return bool(change * self.dt**2 <= RESOLVED * skin * mass)
+
+    def saved_histories(self) -> tuple[dict[str, Array], dict[str, float]]:
+        """Arrays (n_owned, 3) and numbers of the histories of both integrators."""
+        (arrays, numbers), (more, others) = self.in_contact.saved_state(), self.usual.saved_state()
+        return arrays | more, numbers | others
+
+    def restore_histories(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
+        """Return to `saved_histories`."""
+        for each in {self.usual, self.in_contact}:
+            each.restore(arrays, numbers)
+
+    def follow_step(self, v_before: Array) -> None:
+        """Let the integrators that did not take the step just accepted, from velocities v_before (n_owned,
+        3), go on from its end.
+        """
+        self._normal_force = self._next_normal_forces
+        if self.integrator is self.usual:
+            return
+        rate = (self.stage_velocity - v_before) / self.dt
+        moves = self.prescribed.free & (self.mass[:, None] > 0.0)
+        for each in {self.usual, self.in_contact} - {self.integrator}:
+            each.restart()
+            if self.integrator.order == 1:  # velocities after an impact would give stiff damping huge forces
+                each.set_acceleration(np.where(moves, rate, 0.0))
+        self.integrator = self.usual
 
     def reopen(self, x_before: Array) -> None:
         """Let the equations of the step just accepted, from x_before (n_owned, 3), be evaluated again;
@@ -405,15 +470,6 @@ class StageEquations:
         before = self.active.moving_energy(self.x)
         self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
-
-    def _energy_of_contact(self) -> float | None:
-        """Energy [J] of this rank's contact; None if what a step adds to it is not known, as with moving
-        obstacles, and so not removed.
-        """
-        if not self.integrator.exact_work or not self.active.separating or self.active.pushing:
-            return None
-        frozen = self.active.frozen
-        return sum(float(term.energies(self.x, frozen[term]).sum()) for term in self.active.separating)
 
     def displacement(self, v: Array, increment: Array) -> tuple[Array, Array]:
         """Stage positions at velocities v (n_owned, 3), and displacements from there, both (n_local, 3) [m].
@@ -585,6 +641,26 @@ class StageEquations:
         if not self.discretisation.has_near_elements:
             return False
         return any(self.points.global_max(sum(term.n_friction_pairs for term in self.active.changing)))
+
+    def follow_contacts(self, v: Array) -> bool:
+        """Give friction the contacts at velocities v (n_owned, 3) that solve the stage, where these differ
+        notably from those of its equations; returns whether they do; collective.
+        """
+        if not (self.integrator.dynamic and self.discretisation.has_near_elements):
+            return False
+        terms = [term for term in self.active.changing if term.slips]
+        if not terms or self.solving_edges:
+            return False
+        x, _ = self.evaluate_at(v)
+        sums = [term.changed_contacts(x, self.x, self.active.frozen[term]) for term in terms]
+        change, total = self.points.global_sum(*np.sum(sums, axis=0)).tolist()
+        if change <= FOLLOWED * total:
+            return False
+        for term in terms:
+            term.take_contacts()
+        self.objective.forget()
+        self.evaluate_at(v)
+        return True
 
     def forget_forces(self) -> None:
         """Discard the remembered energies and forces."""

@@ -53,9 +53,10 @@ class StartAcceleration:
         """
         system = self._system
         everyone = (system.integrator, *self.followers)
+        jumping = {system.usual, system.in_contact, *everyone}
         # the start of a step may differ from the time of an event by round-off
         if any(abs(system.t0 - event) <= 1e-6 * system.dt for event in self._events):
-            for each in everyone:
+            for each in jumping:
                 each.restart()
         self.starts_anew = system.integrator.needs_acceleration
         asking = [each for each in everyone if each.needs_acceleration]

@@ -73,6 +73,9 @@ class Attempt:
 FIRST_DT_FRACTION = 1e-3
 """First Δt of an adaptive run over its length; the error estimate corrects it at once."""
 
+MAX_SOLVES = 8
+"""Largest number of solves of a step in which friction takes the contacts that the one before has found."""
+
 WOULD_CROSS = "something would pass through the sheet"
 """Message of an attempt whose step would lead through a contact."""
 
@@ -126,6 +129,7 @@ class Stepper:
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
+        self._start: Array | None = None
         self._shape = (points.n_owned, 3)
         self._extrapolation = Extrapolation(points.comm)
         self._create_objects()
@@ -258,10 +262,10 @@ class Stepper:
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
-        self._follow_stencils()
         if iteration > 0 and self._system.directors.update_frames():
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
+        self._follow_stencils()
 
     def _follow_stencils(self) -> bool:
         """Renew the matrices if stencils have changed; return whether they have; collective."""
@@ -320,13 +324,19 @@ class Stepper:
             failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
         velocity, message = self._solve(t0)
+        newton = linear = 0
+        for _ in range(MAX_SOLVES - 1):
+            if velocity is None or not (self._iterates and system.follow_contacts(velocity)):
+                break
+            newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
+            velocity, message = self._solve(t0, velocity)
         if (
             velocity is not None
             and system.discretisation.limits_motion
             and not system.collisions.end_is_free(velocity)
         ):
             velocity, message = None, WOULD_CROSS
-        newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
+        newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.remaining, outcome.at_roundoff
         if velocity is not None:
@@ -394,9 +404,12 @@ class Stepper:
                 return False
         return True
 
-    def _solve(self, t0: float) -> tuple[Array | None, str]:
-        """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective."""
-        system, stage = self._system, self._system.stage
+    def _solve(self, t0: float, start: Array | None = None) -> tuple[Array | None, str]:
+        """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective.
+
+        ``start``: those of a solve of the stage with other contacts, where this one starts.
+        """
+        system, stage, self._start = self._system, self._system.stage, start
         self._follow_stencils()
         self.velocity.setArray(system.history.ravel())
         # a TS step whose stage is at the integrator's time and whose shift is the integrator's σ
@@ -529,6 +542,9 @@ class Stepper:
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
+        if self._start is not None:
+            guess[:] = self._start
+            return
         if first_guess(self._system, guess):
             self._newton.curve_guess(self._system.stationary_velocity(), guess)
         if not self._iterates:

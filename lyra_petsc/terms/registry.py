@@ -167,7 +167,7 @@ REGISTRY: list[Registration] = [
         Role.CONSTRAINT,
         columns={"friction_work": "sum"},
         neighbours=True,
-        state=("friction_work", "friction_owed"),
+        state=("friction_work",),
         element_vertices=4,
         module_name=".contact.friction",
     ),

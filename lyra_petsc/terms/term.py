@@ -193,64 +193,75 @@ class Term(ABC):
                 add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], values)
 
 
-class Dashpots(NamedTuple):
-    """Pairs in contact whose rate of change of distance is damped.
+class Contacts(NamedTuple):
+    """Pairs in contact at the end of a step that this rank counts.
 
     Attributes
     ----------
-    points, beta, normal : (m, 4), (m, 4), (m, 3)
-        As from `Elastic.contact_points`.
-    stiffness : (m,)
-        Second derivative b″ of the energy with respect to the distance [N/m], > 0.
-    vertex, obstacle : (m,)
-        Vertex of a sheet that is in contact, −1 for other kinds of pairs; number of the obstacle, −1 between
-        sheets.
-    approach : (m,)
-        Speed [m/s] with which the obstacle's motion reduces the distance of the pair.
+    points, sheet_beta, beta : (m, 4)
+        Local rows of the vertices, their coefficients β, 0 for points of obstacles, and those of all points:
+        the vector between the nearest points is Σ β_i p_i.
+    normal : (m, 3)
+        Unit normals towards the first simplex.
+    force, stiffness : (m,)
+        Normal force [N] and second derivative b″ of the energy with respect to the distance [N/m], > 0.
+    obstacle : (m,)
+        Number of the obstacle, −1 between sheets.
+    velocity : (m, 3)
+        Velocity [m/s] of the obstacle at the contact, times Σ β_i; 0 between sheets.
+    pair : (m,)
+        Numbers of the term's elements.
     """
 
     points: Ints
+    sheet_beta: Array
     beta: Array
     normal: Array
+    force: Array
     stiffness: Array
-    vertex: Ints
     obstacle: Ints
-    approach: Array
+    velocity: Array
+    pair: Ints
 
 
-class FrictionCorrections(NamedTuple):
-    """Changes of the friction force of a step, to be applied as impulses at its end.
-
-    Pairs that slid get the friction that is missing for the normal forces which acted; pairs that stick, if
-    the kinetic coefficient is below the static one, may be stopped by additional friction.
+class EndFriction(NamedTuple):
+    """Friction of the counted pairs in the equations of a step, and its limits at the end of the step.
 
     Attributes
     ----------
     points, beta : (m, 4)
-        As from `Elastic.contact_points`.
-    weight : (m,)
-        Normal forces [N] in the step's equations, > 0, in proportion to which masses are divided.
-    direction : (m, 3)
-        Unit vectors of the relative motion, tangential to the contact.
-    gradient : (m, 4, 3)
-        Gradients of the relative displacement along ``direction`` with respect to the points' positions.
-    force : (m,)
-        Missing friction [N] of sliding pairs, below 0 where there was too much; largest additional friction
-        of sticking ones.
-    obstacle : (m,)
-        Number of the obstacle, −1 between sheets.
-    moved : (m, 3)
-        Displacement of the obstacle in a step at its last velocity, times Σ β_i of the sheet's points [m].
+        As in `Contacts`.
+    tangents : (m, 2, 3)
+        Unit vectors perpendicular to the normal and to each other.
+    gradients : (m, 2, 4, 3)
+        Gradients of the relative displacement along ``tangents`` with respect to the points' positions.
+    normal_force : (m,)
+        Normal force of the step [N], 0 for pairs that are no longer in contact.
+    force : (m, 2)
+        Friction [N] along ``tangents`` in the equations of the step.
+    static, kinetic : (m,)
+        Largest friction [N] of sticking pairs, and of sliding ones.
+    slides, held : (m,)
+        Whether the pair slides in the equations of the step, and whether it sticks in them.
+    obstacle, velocity : (m,), (m, 3)
+        As in `Contacts`.
+    still : float
+        Displacement [m] in a step up to which a sticking pair counts as at rest.
     """
 
     points: Ints
     beta: Array
-    weight: Array
-    direction: Array
-    gradient: Array
+    tangents: Array
+    gradients: Array
+    normal_force: Array
     force: Array
+    static: Array
+    kinetic: Array
+    slides: NDArray[np.bool_]
+    held: NDArray[np.bool_]
     obstacle: Ints
-    moved: Array
+    velocity: Array
+    still: float
 
 
 class StartingFriction(NamedTuple):
@@ -467,8 +478,9 @@ class Elastic(Term):
         raise NotImplementedError
 
     def obstacle_forces(self, x: Array, frozen: Any, count: int) -> Array | None:
-        """Force [N] of this rank's elements on each of a scene's obstacles, and its torque [N m] about the
-        origin, (count, 6); None: the term does not act on obstacles.
+        """Force [N] of this rank's elements on each of a scene's obstacles, its torque [N m] about the
+        origin, and the sums over contacts of the magnitudes of normal force and friction [N], (count, 8);
+        None: the term does not act on obstacles.
         """
         return None
 
@@ -486,32 +498,17 @@ class Elastic(Term):
         """
         raise NotImplementedError
 
-    def contact_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints]:
-        """The pairs in contact at positions x (n_local, 3), of those that this rank counts.
+    def normal_forces(self, x: Array, frozen: Any) -> Array:
+        """Sum of the normal forces [N] at each local vertex, (n_local,), of this rank's counted pairs."""
+        return np.zeros(len(x))
 
-        Returns
-        -------
-        points, beta : (m, 4)
-            Local rows, or below 0 points of obstacles, and their coefficients β: the vector between the
-            nearest points is Σ β_i p_i.
-        normal : (m, 3)
-            Unit normals towards the first simplex.
-        force : (m,)
-            Normal forces [N].
-        vertex : (m,)
-            The vertex of a sheet that is in contact, −1 for pairs of other kinds.
+    def contacts(self, x: Array, v: Array, frozen: Any, last: tuple[float, float]) -> Contacts | None:
+        """The pairs in contact at the end of the step, with positions x and velocities v (n_local, 3).
+
+        The velocities of obstacles are means between the two times ``last`` [s]. None: the term keeps nothing
+        apart.
         """
-        nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
-        return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
-
-    def dashpots(self, x: Array, v: Array, frozen: Any, last: tuple[float, float]) -> Dashpots:
-        """Pairs in contact at the end of the step, including those that other ranks count.
-
-        Positions x and velocities v are (n_local, 3). The speeds of obstacles are means between the two times
-        ``last`` [s].
-        """
-        points, beta, normal, force, vertex = Elastic.contact_points(self, x, frozen)
-        return Dashpots(points, beta, normal, force, vertex, vertex, force)
+        return None
 
     def moved_with_obstacles(self, x: Array, dx: Array, frozen: Any) -> Array:
         """Displacements dx (n_local, 3) [m] from x, for vertices in the path of moving obstacles changed to
@@ -599,38 +596,46 @@ class Elastic(Term):
         """Number of pairs in contact that may stick or slide in the next step."""
         return 0
 
-    def friction_corrections(
+    def end_friction(
         self,
-        stage: Array,
         x: Array,
         v: Array,
         frozen: Any,
+        contacts: Contacts,
         normal_force: Array,
-        dt: float,
-        *,
-        sheets: bool,
         last: tuple[float, float],
-    ) -> FrictionCorrections:
-        """Corrections of friction at the end of a step of length dt [s]; of a term that `slips`.
-
-        The step led over a ``stage`` to positions x, with velocities v (n_local, 3); impulses at its end had
-        the mean normal forces ``normal_force`` (n_owned,) [N]. Friction on obstacles, whose velocities are
-        means between the two times ``last`` [s], and with ``sheets`` also between sheets.
+    ) -> EndFriction:
+        """Friction at the end of a step to positions x, with velocities v (n_local, 3), in ``contacts`` whose
+        normal forces in the step are ``normal_force`` (m,) [N]; of a term that `slips`.
         """
         raise NotImplementedError
 
-    def set_impulse_work(self, vertex: Ints, work: Array) -> None:
-        """Work (m,) [J] of a step's impulses of friction at owned vertices; of a term that `slips`."""
+    def set_end_friction(
+        self, friction: EndFriction, force: Array, sticks: NDArray[np.bool_], work: Array
+    ) -> None:
+        """Set friction (m, 2) [N] of the step in the pairs of an `end_friction`, which of them stick, and the
+        heat (m,) [J] of sliding; of a term that `slips`.
+        """
         raise NotImplementedError
+
+    def begin_step(self) -> None:
+        """Prepare for an attempt at a step from the accepted state."""
+
+    def changed_contacts(self, x: Array, start: Array, frozen: Any) -> tuple[float, float]:
+        """Change of the normal forces of this rank's pairs since they were last taken, and their sum [N], at
+        a Newton iterate x of a step from ``start``, (n_local, 3) each; of a term that `slips`.
+        """
+        return 0.0, 0.0
+
+    def take_contacts(self) -> None:
+        """Take the pairs that `changed_contacts` found for the step's equations."""
 
     def starting_friction(self, frozen: Any) -> StartingFriction:
         """Friction at the start of the step; of a term that `slips`."""
         raise NotImplementedError
 
-    def moments(self, x: Array, frozen: Any) -> tuple[Ints, Array]:
-        """Vertices (m, 4) of the counted pairs between sheets and the moments (m, 3) [N m] of their forces
-        at positions x (n_local, 3); of a term that `slips`.
-        """
+    def set_starting_friction(self, friction: Array) -> None:
+        """Set the friction (m, 2) [N] of the pairs of `starting_friction`; of a term that `slips`."""
         raise NotImplementedError
 
     def element_state(self) -> tuple[Ints, Array]:

@@ -36,7 +36,19 @@ def test_forces_on_obstacles_equal_the_weight_at_rest(comm: MPI.Comm, shared_tmp
         return
     run = StoredRun(shared_tmp / "run")
     rows = {name: np.asarray(run.obstacles[name]) for name in run.obstacles}
-    assert list(rows) == ["step", "time", "obstacle", "fx", "fy", "fz", "tx", "ty", "tz"]
+    assert list(rows) == [
+        "step",
+        "time",
+        "obstacle",
+        "fx",
+        "fy",
+        "fz",
+        "tx",
+        "ty",
+        "tz",
+        "normal",
+        "friction",
+    ]
     assert rows["obstacle"].tolist() == ["a far, ball", "floor"] * 51
     assert rows["step"].tolist() == np.repeat(np.arange(51), 2).tolist()
     force = np.column_stack([rows[name] for name in ("fx", "fy", "fz", "tx", "ty", "tz")])

@@ -9,7 +9,6 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, gathered, grid, scene_of
 
-from lyra_petsc.stepping.impacts import damp_impacts
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact.barrier import ContactBarrier
 
@@ -82,7 +81,6 @@ def test_damping_is_a_multiple_of_the_stiffness_until_something_is_near() -> Non
         system.damping.freeze(system.x, system.active.frozen)
         assert system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
         assert not system.discretisation.has_near_elements
-        assert not damp_impacts(system, np.zeros(system.points.n_owned)).normal_force.any()
     floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
     with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system

@@ -219,10 +219,10 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
 
 
 def first_accelerations(comm: MPI.Comm, content: dict[str, Any]) -> Array:
-    """Accelerations [m/s²] of all vertices with which generalised-α starts."""
+    """Accelerations [m/s²] of all vertices with which the integrator for contact starts."""
     content = content | {"time": {"end": 0.02, "step": 0.02, "integrator": "alpha2"}}
     simulation = SteppedScene(comm, scene_of(content))
-    integrator, found = simulation.problem.system.integrator, []
+    integrator, found = simulation.problem.system.in_contact, []
     keep = integrator.set_acceleration
 
     def set_acceleration(acceleration: Array) -> None:
@@ -490,8 +490,8 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=6e-3)
 
 
-def test_sheets_with_friction_conserve_angular_momentum(comm: MPI.Comm) -> None:
-    """Thrown at each other, and rotating against each other, under the midpoint rule."""
+def test_sheets_with_friction_conserve_momentum(comm: MPI.Comm) -> None:
+    """Thrown at each other, and rotating against each other; angular momentum up to the error of bdf2."""
     side, gap, low = 0.2, 0.004, 49
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 40.0}
     upper = {"transform": {"rotate": turn, "translate": [0.02, 0.04, 0.13]}}
@@ -510,14 +510,18 @@ def test_sheets_with_friction_conserve_angular_momentum(comm: MPI.Comm) -> None:
     layout.update_ghosts(system.v)
     simulation.energy_balance.measure()
 
-    def angular() -> Array:
-        each = np.cross(system.x[:n], system.mass[:n, None] * system.v[:n])
-        return np.array(comm.allreduce(np.stack([each.sum(axis=0), np.abs(each).sum(axis=0)])))
+    def momenta() -> tuple[Array, Array]:
+        """Momentum and angular momentum, and the sums of their parts' magnitudes."""
+        momentum = system.mass[:n, None] * system.v[:n]
+        each = np.column_stack([momentum, np.cross(system.x[:n], momentum)])
+        both = comm.allreduce(np.stack([each.sum(axis=0), np.abs(each).sum(axis=0)]))
+        return both[0], both[1].reshape(2, 3).sum(axis=1).repeat(3)
 
-    (before, size), rubbed = angular(), 0.0
+    (before, size), rubbed = momenta(), 0.0
+    allowed = size * np.repeat([1e-11, 2e-3], 3)
     while not simulation.finished:
         simulation.step()
-        np.testing.assert_allclose(angular()[0], before, rtol=0, atol=1e-11 * size.sum())
+        assert (np.abs(momenta()[0] - before) < allowed).all()
         rubbed = simulation.energy_balance.columns()["friction_work"]
     assert rubbed > 0.05 * simulation.budget.total
     simulation.destroy()
@@ -624,27 +628,6 @@ def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, share
     np.testing.assert_allclose(after, unbroken, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parallel(1)
-def test_checkpoints_of_older_versions_have_no_impulses_left() -> None:
-    """In these an array of the same shape has another meaning."""
-    content = {
-        "mesh": grid(1.0, 1.0, 1, 1) | {"transform": {"translate": [0.0, 0.0, 5.0]}},
-        "contact": {"gap": GAP, "friction": 0.5},
-        "obstacles": {"slope": PLANE},
-    }
-    simulation = SteppedScene(MPI.COMM_SELF, scene_of(content))
-    term = simulation.problem.terms["friction"]
-    older = np.arange(3.0 * len(term.state()["friction_work"])).reshape(-1, 3)
-    term.restore({"friction_work": older})
-    kept = term.state()
-    term.restore(kept)
-    np.testing.assert_array_equal(kept["friction_work"], older * [1.0, 0.0, 0.0])
-    np.testing.assert_array_equal(term.state()["friction_owed"], 0.0)
-    term.restore(kept | {"friction_owed": older * [0.0, 1.0, 0.0]})
-    np.testing.assert_array_equal(term.state()["friction_owed"], older * [0.0, 1.0, 0.0])
-    simulation.destroy()
-
-
 def test_each_pair_remembers_its_own_slip(comm: MPI.Comm) -> None:
     """Pairs and their elements are in the same order, also if nearest points are on vertices or edges."""
     sheets = grid(0.4, 0.4, 8, 8, "alternating"), *2 * [grid(0.4, 0.4, 7, 9)]
@@ -657,8 +640,9 @@ def test_each_pair_remembers_its_own_slip(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(content))
     (friction,) = (term for term in simulation.problem.terms.values() if isinstance(term, CoulombFriction))
     for _ in range(4):
+        end = simulation.step().time
+        simulation.problem.system.begin_step(end, end + 1e-3)
         pairs, *_ = friction.contact_state()
-        simulation.step()
         numbers = simulation.problem.system.discretisation.layout.global_number
         np.testing.assert_array_equal(numbers[friction.stencil[: friction.n_owned]], pairs.stencil)
     assert comm.allreduce(len(pairs.stencil)) > 50

@@ -34,6 +34,11 @@ class GeneralisedAlpha(Integrator):
         self._a: Array | None = None
         self._next: Array | None = None
 
+    def for_contact(self) -> Integrator:
+        from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # in scenes with contact only
+
+        return Bdf2()
+
     @property
     def error_constant(self) -> float:
         # the stored accelerations lag by (γ − ½) Δt

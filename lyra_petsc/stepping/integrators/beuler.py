@@ -29,8 +29,13 @@ class SemiImplicit(BackwardEuler):
     lagged_loads = True
     iterates = False
 
+    def for_contact(self) -> Integrator:
+        return LaggedBackwardEuler()
+
 
 class LaggedBackwardEuler(BackwardEuler):
-    """Backward Euler with the loads of `SemiImplicit`, for steps in which one iteration is not enough."""
+    """Backward Euler with the loads of `SemiImplicit`, for steps in which something touches: one iteration
+    could neither follow the barrier's force nor decide between sticking and sliding.
+    """
 
     lagged_loads = True

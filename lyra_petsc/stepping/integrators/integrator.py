@@ -117,11 +117,8 @@ class Integrator(NoHistory, ABC):
     gain_window : int
         Number of steps over which the energy guard averages gains: multistep methods alternate between gains
         and losses.
-    exact_work : bool
-        Whether the change of kinetic energy is exactly the work of the stage's forces, so that the energy
-        that contact adds is known.
-    surplus : float
-        Energy [J] that contact has added and that is not yet removed, if ``exact_work``.
+    moves_uniformly : bool
+        Whether the velocity of the stage is the displacement of the step over Δt.
     handles_at_stage : bool
         Whether prescribed unknowns have their exact positions and velocities at the time of the stage. If
         not, they have the velocity with which the integrator reaches their position at the end of the step.
@@ -135,14 +132,19 @@ class Integrator(NoHistory, ABC):
     dynamic: ClassVar[bool] = True
     centred: ClassVar[bool] = False
     gain_window: ClassVar[int] = 1
-    exact_work: ClassVar[bool] = False
-    surplus: float = 0.0
+    moves_uniformly: ClassVar[bool] = False
     handles_at_stage: bool = False
 
     @property
     def starts_at_rest(self) -> bool:
         """Whether a solve starts from the positions at the start of the step, at rest."""
         return not (self.iterates and self.dynamic)
+
+    def for_contact(self) -> Integrator:
+        """The integrator for steps in which something touches: one whose stage is at the end of the step, and
+        which solves it by Newton's method.
+        """
+        return self
 
     @property
     @abstractmethod

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
+from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
 
 
 class Midpoint(Integrator):
@@ -17,10 +15,12 @@ class Midpoint(Integrator):
     ts_type = "theta"
     centred = True
     handles_at_stage = True
-    exact_work = True
+    moves_uniformly = True
 
-    def __init__(self) -> None:
-        self.surplus = 0.0
+    def for_contact(self) -> Integrator:
+        from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # in scenes with contact only
+
+        return Bdf2()
 
     def stage_offset(self, dt: float) -> float:
         return 0.5 * dt
@@ -30,9 +30,3 @@ class Midpoint(Integrator):
 
     def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
         return x + dt * stage_velocity, 2.0 * stage_velocity - v
-
-    def saved_state(self) -> tuple[Arrays, dict[str, float]]:
-        return {}, {"surplus": self.surplus}
-
-    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
-        self.surplus = numbers.get("surplus", 0.0)

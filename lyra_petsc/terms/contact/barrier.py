@@ -36,7 +36,7 @@ from lyra_petsc.terms.contact.one_sided import Springs
 from lyra_petsc.terms.contact.sheet_search import SheetSearch
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, StepInterval, UpcomingStep
+from lyra_petsc.terms.term import Contacts, Elastic, Offsets, Pair, StepInterval, UpcomingStep
 
 KEPT_FRACTION = 0.2
 """Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
@@ -254,15 +254,12 @@ class ContactBarrier(Elastic):
             return self._at_rest
         times = step.start, step.target_time, step.end
         search = self._obstacle_search
-        self._next_obstacle_x, shift = self.obstacles.step_positions(*times)
+        start, stage, end = self._next_obstacle_x = np.stack([self.obstacles.positions(t) for t in times])
         largest = np.linalg.norm(self._next_obstacle_x - search.x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
         self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         search.deviations = self.obstacles.path_deviations(step.start, step.end)
-        start, stage, end = self._next_obstacle_x
-        motions = self.obstacles.rigid_motions(*times[:2])
-        motions = [(rotation, t + more) for (rotation, t), more in zip(motions, shift, strict=True)]
-        return ObstaclePositions(start, stage, end, motions)
+        return ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(*times[:2]))
 
     @property
     def moving(self) -> bool:
@@ -524,9 +521,12 @@ class ContactBarrier(Elastic):
             yield int(obstacle), gradient
 
     def obstacle_forces(self, x: Array, frozen: ObstaclePositions, count: int) -> Array:
-        out = np.zeros((len(self.obstacles.each), 6))
+        out = np.zeros((len(self.obstacles.each), 8))
         for obstacle, force in self._obstacle_gradients(x, frozen.stage):
-            out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
+            out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
+        _, _, normal_force, _, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        on = self.obstacle[pair] >= 0
+        np.add.at(out[:, 6], self.obstacle[pair][on], normal_force[on])
         return out[:count]
 
     pushes = True
@@ -534,8 +534,7 @@ class ContactBarrier(Elastic):
     def work(self, x: Array, at: float, start: float, end: float) -> float:
         to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
         work = 0.0
-        obstacle_x, _ = self.obstacles.step_positions(start, at, end)
-        for obstacle, force in self._obstacle_gradients(x, obstacle_x[1]):
+        for obstacle, force in self._obstacle_gradients(x, self.obstacles.positions(at)):
             (r0, t0), (r1, t1) = to_start[obstacle], to_end[obstacle]
             work -= float(np.vdot(force, x @ (r1 - r0).T + t1 - t0))
         return work
@@ -561,57 +560,29 @@ class ContactBarrier(Elastic):
     def find_contacts(self, x: Array, obstacle_x: Array, n_counted: int) -> tuple[NDArray[Any], ...]:
         """The pairs with a contact force among the first ``n_counted``.
 
-        Returns β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers of the pairs (m,). For a
-        vertex of a sheet, pairs with the same nearest vertices occur once; all other pairs are returned
-        singly.
+        Returns β (m, 4), unit normals (m, 3), normal forces (m,) [N], distances less offset (m,) [m] and
+        numbers of the pairs (m,). For a vertex of a sheet, pairs with the same nearest vertices occur once;
+        all other pairs are returned singly.
         """
         active = self.active_pairs(x, obstacle_x)
         n = len(active.pair) + n_counted
-        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
+        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
         given = active.lower_bound, active.forces, n_counted
         n = contact_pairs.find_contacts(x, obstacle_x, *self._pair_data, *given, found)
-        beta, normal, force = (part[:n] for part in found[:3])
-        pair = found[3][:n]
-        kept = self._cancel_negative(pair, normal, force)
-        return beta[kept], normal[kept], force[kept], pair[kept]
+        beta, normal, force, delta, pair = (part[:n] for part in found)
+        if (force < 0.0).any():
+            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, force)
+        kept = force > 0.0
+        return beta[kept], normal[kept], force[kept], delta[kept], pair[kept]
 
-    def _cancel_negative(self, pair: Ints, normal: Array, values: Array) -> NDArray[np.bool_]:
-        """Subtract negative forces or stiffnesses from positive ones; returns which of them (m,) are left."""
-        if (values < 0.0).any():
-            contact_pairs.cancel_negative(self.kind[pair], self.points[pair, 0], normal, values)
-        return values > 0.0
-
-    def vertex_of(self, pair: Ints) -> Ints:
-        """The vertex of a sheet in each of pairs (m,), −1 for pairs of edges and of points of obstacles."""
-        has_vertex = (self.kind[pair] != EDGE_EDGE) & (self.points[pair, 0] >= 0)
-        return np.where(has_vertex, self.points[pair, 0], -1)
-
-    def contact_points(self, x: Array, frozen: ObstaclePositions) -> tuple[Ints, Array, Array, Array, Ints]:
-        beta, normal, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
-        return self.points[pair], beta, normal, force, self.vertex_of(pair)
-
-    def dashpots(self, x: Array, v: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Dashpots:
-        active = self.active_pairs(x, frozen.end)
-        square = active.square
-        stiffness = active.weight * active.stiffness
-        rows = np.flatnonzero((stiffness != 0.0) & (square > 0.0) & np.isfinite(stiffness))
-        normal = active.derivatives[rows, :3] / np.sqrt(square[rows])[:, None]
-        stiffness = stiffness[rows]
-        kept = self._cancel_negative(active.pair[rows], normal, stiffness)
-        rows, normal, stiffness = rows[kept], normal[kept], stiffness[kept]
-        pair, beta = active.pair[rows], active.beta[rows]
-        points, obstacle = self.points[pair], self.obstacle[pair]
-        # the mean for points of the obstacle that are at the contact before and after: chords of its rotation
-        # have components along the normal, even if the distance does not change
-        duration = last[1] - last[0]
-        moved, back = (
-            self.obstacles.contact_displacements(
-                at, points, beta, obstacle, self.obstacles.rigid_motions(*times)
-            )
-            for at, times in ((x, last), (x - duration * v, last[::-1]))
-        )
-        approach = 0.5 * np.einsum("ek,ek->e", moved - back, normal) / duration
-        return Dashpots(points, beta, normal, stiffness, self.vertex_of(pair), obstacle, approach)
+    def contacts(self, x: Array, v: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Contacts:
+        beta, normal, force, delta, pair = self.find_contacts(x, frozen.end, self.n_owned)
+        points, obstacle = self.stencil[pair].astype(np.int64), self.obstacle[pair]
+        _, slope, curvature = contact_pairs.barrier(delta, self.gap[pair])
+        of_sheet = np.where(self.points[pair] >= 0, beta, 0.0)
+        velocity = self.obstacles.contact_velocities(x, v, points, of_sheet, obstacle, last)
+        stiffness = -force * curvature / slope
+        return Contacts(points, of_sheet, beta, normal, force, stiffness, obstacle, velocity, pair)
 
     def normal_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
         """Sum of the normal forces [N] at each local vertex, (n_local,), of the pairs that this rank counts.
@@ -619,7 +590,7 @@ class ContactBarrier(Elastic):
         Only the owner of a vertex knows all pairs between which its force is divided.
         """
         out = np.zeros(len(x))
-        beta, _, force, pair = self.find_contacts(x, frozen.stage, self.n_owned)
+        beta, _, force, _, pair = self.find_contacts(x, frozen.stage, self.n_owned)
         contact_pairs.add_normal_forces(self.points[pair], beta, force, out)
         return out
 

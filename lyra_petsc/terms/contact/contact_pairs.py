@@ -1195,11 +1195,11 @@ def find_contacts(x, x_obs, kind, points, offset, gap, stiffness, parallel, boun
 
     For vertices of sheets these are active pairs as from `find_active` (``active``: numbers, weights, β and
     derivatives), for others each pair whose ``bound`` (E,) [m] is below the gap. To the first n rows of
-    ``found``, (m, 4), (m, 3), (m,), (m,), are written β, unit normals towards the first simplex, normal
-    forces [N], which may be negative, and numbers of pairs.
+    ``found``, (m, 4), (m, 3), (m,), (m,), (m,), are written β, unit normals towards the first simplex, normal
+    forces [N], which may be negative, distances less offset [m], and numbers of pairs.
     """
     p, g, slope, n = np.empty((4, 3)), np.empty(3), np.zeros(12), 0
-    beta, normal, force, numbers = found
+    beta, normal, force, delta, numbers = found
     pairs, weight, active_beta, derivatives = active
     for m in range(len(pairs) + n_counted):
         e = pairs[m] if m < len(pairs) else m - len(pairs)
@@ -1222,7 +1222,7 @@ def find_contacts(x, x_obs, kind, points, offset, gap, stiffness, parallel, boun
             continue
         for k in range(3):
             normal[n, k] = g[k] / d
-        numbers[n] = e
+        delta[n], numbers[n] = d - offset[e], e
         n += 1
     return n
 

@@ -4,13 +4,10 @@ Pairs, normals and normal forces are those of the last accepted state. A pair th
 vertex that moved on to a neighbouring triangle, keeps its elastic slip, so that sticking pairs do not creep.
 The owner of a pair's first vertex stores the pair and sends it to the owners of the others.
 
-The equations of a step use the normal forces at its start. Where other forces act in the step, the difference
-is added up for each sliding vertex as an impulse that is owed. At the end of each step a part of it is paid,
-and all of it when the vertex leaves (`CoulombFriction.friction_corrections`, `stepping.impacts`), so that
-friction adds up to μ times the impulse of the normal forces. Otherwise a sheet that lands on a slope would
-keep the velocity that its weight gives it in a step, and only the friction in excess of that would stop it.
-Between sheets, where normal forces oscillate and a knot would need 40 % more Newton iterations, this is done
-only if the stage is before the end of the step, so that the forces differ systematically.
+The equations of a step use the normal forces at its start. At its end, where the normal forces of the step
+are known, an impulse changes the friction of each pair to that of Coulomb's law with these: the point of the
+disc |f| ≤ μ N that is nearest to the friction which stops the pair (`stepping.impacts`). So friction never
+exceeds μ times the normal force of the same step, and it opposes the motion.
 """
 
 from __future__ import annotations
@@ -30,17 +27,7 @@ from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
 from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, FrictionCorrections, Offsets, StartingFriction, UpcomingStep
-
-WORK, OWED = 0, 1
-"""Columns of the data of vertices: work of friction [J]; impulse of normal forces [N s] whose friction is
-owed."""
-
-IS_WORK = np.arange(3) == WORK
-"""Mask of the column of the work."""
-
-PAID_FRACTION = 0.25
-"""Part of the owed impulse that is paid in a step: with all of it at once friction would oscillate."""
+from lyra_petsc.terms.term import Contacts, Elastic, EndFriction, Offsets, StartingFriction, UpcomingStep
 
 MAX_ELASTIC_SLIP = 0.01
 """Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
@@ -48,17 +35,9 @@ have this elastic slip: if lightly pressed pairs, such as those at a sheet's bor
 the sheet would slide too early. Otherwise lightly pressed pairs have a shorter one, because they have to
 build it up again whenever they separate and come back."""
 
-OVERSHOOT = 0.3
-"""Part by which the static limit may be exceeded to stop a sticking pair in a step, if the kinetic
-coefficient is lower: integrators of second order overshoot in steps longer than the period of the friction
-springs."""
-
-STILL = 1e-6
-"""Displacement in a step, over the largest elastic slip, up to which a sticking pair is not stopped: without
-the round-off in the velocities, Newton's method would start where round-off leaves it no smaller energy."""
-
-NOTHING_CORRECTED = -np.inf, 0.0, 0.0
-"""Corrections of friction before any step: its end [s], impulses [N s] owed and work [J] of impulses."""
+STILL = 1e-8
+"""Displacement in a step, over the gap, up to which a sticking pair is not stopped: without the round-off in
+velocities, Newton's method would start where round-off leaves it no smaller energy."""
 
 SHEET_SOFTNESS = 0.25
 """Friction stiffness between sheets over that on obstacles, for lightly pressed pairs. With springs as stiff
@@ -95,23 +74,37 @@ class ObstacleMotion(NamedTuple):
     ----------
     time : float
         The end of the step [s].
-    stage_fraction : float
-        Time from the start of the step to its stage over the length of the step; 1 also for a stage at the
-        start.
-    stage_motions, end_motions : list of (3, 3) and (3,)
+    motions : list of (3, 3) and (3,)
         Rotation and translation [m] of each obstacle from the time at which the pairs were found to the time
-        of the forces, and to the end of the step. Pairs are found at the start of the step, or in statics
-        after a part of a load step.
-    stage_points, end_points : (m, 3)
-        Points [m] and normals of the obstacles at the stage, and at the end.
+        of the forces. Pairs are found at the start of the step, or in statics after a part of a load step.
+    end_points : (m, 3)
+        Points [m] and normals of the obstacles at the end of the step.
     """
 
     time: float
-    stage_fraction: float
-    stage_motions: list[tuple[Array, Array]]
-    end_motions: list[tuple[Array, Array]]
-    stage_points: Array
+    motions: list[tuple[Array, Array]]
     end_points: Array
+
+
+class _EndedStep(NamedTuple):
+    """What friction is after a step that is not accepted yet.
+
+    Attributes
+    ----------
+    time : float
+        The end of the step [s].
+    pairs : Pairs
+        Pairs in contact there.
+    loads : (obstacles, 8)
+        As in `Elastic.obstacle_forces`.
+    work : (n_vertices,)
+        Heat [J] of sliding.
+    """
+
+    time: float
+    pairs: Pairs
+    loads: Array
+    work: Array
 
 
 def _no_pairs() -> Pairs:
@@ -138,11 +131,11 @@ class CoulombFriction(Elastic):
     def __init__(self, scene: Scene, n_vertices: int) -> None:
         assert scene.contact is not None
         self._sheet_friction = coefficients(scene.contact.friction)
-        self._vertex_data = np.zeros((n_vertices, 3))
+        self._work = np.zeros(n_vertices)  # of friction [J]
         self._pairs = self._element_pairs = _no_pairs()
         self._contact_time: float | None = None  # [s], of the last part of a load step
-        # until a step is accepted: its end, the impulses owed after it, and the work of its impulses
-        self._corrected: tuple[float, Array | float, Array | float] = NOTHING_CORRECTED
+        self._ended: _EndedStep | None = None  # until that step is accepted
+        self._next_pairs: Pairs | None = None  # of the present Newton iterate
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -151,21 +144,18 @@ class CoulombFriction(Elastic):
         self._contact = contact
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._sheet_friction]
         self._coefficients = np.array(each)
-        self._obstacle_loads = np.zeros((len(contact.obstacles.each), 6))  # in the last step
+        self._obstacle_loads = np.zeros((len(contact.obstacles.each), 8))  # in the last step
 
     def set_elements(self, elements: Elements) -> None:
         super().set_elements(elements)
         data = elements.data["what"].reshape(-1, COLUMNS)
         n = len(data)
-        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
-        arrays = [np.empty((n, *shape)) for shape in shapes]
-        friction_pairs.unpack(data, *arrays)
-        self._beta, self._tangents, self._gradients, self._constant, self._slip, self._contact_point = arrays
+        unpacked = self._unpacked(data)
+        self._beta, self._tangents, self._gradients, self._constant, self._slip, self._contact_point = (
+            unpacked
+        )
         self._obstacle = data[:, 1].astype(np.int64)
-        has_vertex = (data[:, 0] != EDGE_EDGE) & (data[:, 2] == 0.0)
-        self._vertex = np.where(has_vertex, self.stencil[:, 0], -1)
         self._force = self._limit = self._stiffness = data[:, FORCE].copy()
-        self._weakens = np.zeros(n, dtype=np.bool_)
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(data[:, SLID] > 0.5, kinetic, static) * self._force
@@ -173,11 +163,19 @@ class CoulombFriction(Elastic):
             softness = np.where(self._obstacle < 0, SHEET_SOFTNESS, 1.0)
             stiffness = softness * HALFWAY_CURVATURE * data[:, STIFFNESS]
             self._stiffness = np.maximum(stiffness, self._limit / max_elastic_slip)
-            self._weakens = weakens = kinetic < static
+            weakens = kinetic < static
             self._stiffness[weakens] = static[weakens] * self._force[weakens] / max_elastic_slip
             self._limit *= data[:, FACTOR]
             self._stiffness *= data[:, FACTOR]
-        self._stage_of: ObstacleMotion | None = None  # whose `_stage_data` are stored
+        self._data_of: ObstacleMotion | None = None  # whose `_data` are stored
+
+    @staticmethod
+    def _unpacked(data: Array) -> list[Array]:
+        """Arrays for pairs with ``data`` (E, 35), as from `friction_pairs.unpack`."""
+        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
+        arrays = [np.empty((len(data), *shape)) for shape in shapes]
+        friction_pairs.unpack(data, *arrays)
+        return arrays
 
     @property
     def n_friction_pairs(self) -> int:
@@ -186,8 +184,27 @@ class CoulombFriction(Elastic):
     # -- pairs -------------------------------------------------------------------------------------
 
     def current_elements(self) -> tuple[Ints, Array]:
-        self.stale, self._element_pairs = False, self._pairs
-        return self._pairs.stencil, self._pairs.data
+        self.stale, self._element_pairs = False, self._next_pairs or self._pairs
+        return self._element_pairs.stencil, self._element_pairs.data
+
+    def begin_step(self) -> None:
+        self._next_pairs = None
+        self.stale |= self._element_pairs is not self._pairs
+
+    def changed_contacts(self, x: Array, start: Array, frozen: ObstacleMotion) -> tuple[float, float]:
+        contact, given = self._contact, self._element_pairs
+        if not contact.n_elements and not len(given.key):
+            return 0.0, 0.0
+        beta, normal, force, _, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        self._next_pairs = now = self._pairs_of(x, start, (beta, normal, force, pair), self._pairs)[0]
+        rows = np.empty(len(now.key), dtype=np.int64)
+        friction_pairs.match_pairs(now.key, given.key, given.data, rows)
+        continued = np.bincount(rows + 1, now.data[:, FORCE], len(given.key) + 1)  # the first: none
+        change = continued[0] + np.abs(continued[1:] - given.data[:, FORCE]).sum()
+        return float(change), float(continued.sum())
+
+    def take_contacts(self) -> None:
+        self.stale = True
 
     def _update_pairs(self, x: Array, obstacle_x: Array, old: Pairs) -> None:
         """Store the pairs in contact at x (n_local, 3) and obstacle_x (m, 3); those in ``old`` keep their
@@ -196,7 +213,20 @@ class CoulombFriction(Elastic):
         contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
             return
-        beta, normal, force, pair = contact.find_contacts(x, obstacle_x, contact.n_owned)
+        beta, normal, force, _, pair = contact.find_contacts(x, obstacle_x, contact.n_owned)
+        self._pairs, self.stale = self._pairs_of(x, x, (beta, normal, force, pair), old)[0], True
+
+    def _pairs_of(
+        self, x: Array, start: Array, contacts: tuple[Array, Array, Array, Ints], old: Pairs
+    ) -> tuple[Pairs, Ints, Ints, Ints]:
+        """The pairs of ``contacts`` (β, unit normals, normal forces, numbers of elements) at x, whose slip
+        counts from ``start``, (n_local, 3) each.
+
+        Returns also the numbers (E,) of their elements and contacts, and of the pairs in ``old`` that they
+        continue, −1 for none; these keep their elastic slip.
+        """
+        contact, (beta, normal, force, pair) = self._contact, contacts
+        beta, normal, pair = beta.copy(), normal.copy(), pair.copy()
         key = np.empty((len(pair), 10), dtype=np.int64)
         pair_data = contact.points, contact.number, contact.kind, contact.obstacle
         friction_pairs.choose_triangles(x, contact.stencil, *pair_data, beta, normal, pair)
@@ -205,11 +235,11 @@ class CoulombFriction(Elastic):
         key, previous, data = key[order], np.empty(len(pair), dtype=np.int64), np.empty((len(pair), COLUMNS))
         friction_pairs.match_pairs(key, old.key, old.data, previous)
         pair = pair[order]
-        contacts = pair, beta[order], normal[order], force[order], contact.pair_stiffness[pair]
+        sorted_ = pair, beta[order], normal[order], force[order], contact.pair_stiffness[pair]
         friction_pairs.fill_columns(
-            x, contact.stencil, contact.points, key, contacts, previous, old.data, data
+            start, contact.stencil, contact.points, key, sorted_, previous, old.data, data
         )
-        self._pairs, self.stale = Pairs(key, data, contact.number[pair]), True
+        return Pairs(key, data, contact.number[pair]), pair, order, previous
 
     def initialise_pairs(self, x: Array, frozen: ObstacleMotion) -> None:
         self._update_pairs(x, frozen.end_points, self._pairs)
@@ -255,15 +285,10 @@ class CoulombFriction(Elastic):
     # -- a step ------------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> ObstacleMotion:
-        obstacles, fraction = self._contact.obstacles, 1.0
+        obstacles = self._contact.obstacles
         start = step.start if self._contact_time is None else self._contact_time
-        end_motions = stage_motions = obstacles.rigid_motions(start, step.end)
-        if step.start < step.target_time < step.end:
-            fraction = (step.target_time - step.start) / (step.end - step.start)
-        elif step.target_time < step.end:
-            stage_motions = obstacles.rigid_motions(start, step.target_time)
-        (_, stage_points, end_points), _ = obstacles.step_positions(step.start, step.target_time, step.end)
-        return ObstacleMotion(step.end, fraction, stage_motions, end_motions, stage_points, end_points)
+        motions = obstacles.rigid_motions(start, step.target_time)
+        return ObstacleMotion(step.end, motions, obstacles.positions(step.end))
 
     def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:
         """Tangential components (n, 2) of vectors (n, 3) at some pairs."""
@@ -287,21 +312,11 @@ class CoulombFriction(Elastic):
             constant[rows] += self._tangential(slip[rows] - old_slip - moved, rows)
         return (self.stencil, self._gradients, constant, self._stiffness, self._limit), slip
 
-    def _stage_data(self, frozen: ObstacleMotion) -> tuple[NDArray[Any], ...]:
-        """Arguments of the kernels for positions of the stage.
-
-        The stage is at a fraction a of the step. The potential is a D, with D at the positions at the end of
-        the step that follow from those of the stage, so that its gradient is that of D there. Otherwise
-        sticking pairs would oscillate for ever with the midpoint rule.
-        """
-        if self._stage_of is not frozen:
-            self._stage_of, fraction = frozen, frozen.stage_fraction
-            (stencil, gradients, constant, stiffness, limit), _ = self._kernel_data(frozen.stage_motions)
-            if fraction != 1.0:
-                constant = constant + (1.0 / fraction - 1.0) * (self._constant - self._tangential(self._slip))
-                gradients, stiffness, limit = gradients / fraction, fraction * stiffness, fraction * limit
-            self._stage = stencil, gradients, constant, stiffness, limit
-        return self._stage
+    def _data(self, frozen: ObstacleMotion) -> tuple[NDArray[Any], ...]:
+        """Arguments of the kernels after the obstacles' motion."""
+        if self._data_of is not frozen:
+            self._data_of, (self._moved_data, _) = frozen, self._kernel_data(frozen.motions)
+        return self._moved_data
 
     def _return_map(
         self, x: Array, state: tuple[NDArray[Any], ...], slip: Array
@@ -315,7 +330,7 @@ class CoulombFriction(Elastic):
         out = np.empty(self.n_owned)
         if not self.n_elements:
             return out
-        friction_pairs.energies(x, *self._stage_data(frozen), out)
+        friction_pairs.energies(x, *self._data(frozen), out)
         return out
 
     def work_of_targets(
@@ -324,7 +339,7 @@ class CoulombFriction(Elastic):
         # by forces: an obstacle moves by many times the elastic slip, so that energies would not do
         if not (self._contact.obstacles.moving and self.n_elements):
             return 0.0
-        n, data = self.n_owned, [self._stage_data(each) for each in frozen]
+        n, data = self.n_owned, [self._data(each) for each in frozen]
         slips, forces, energies = [], [], []
         for x, each, (stencil, gradients, constant, stiffness, limit) in zip(ends, frozen, data, strict=True):
             u = np.einsum("ecik,eik->ec", gradients, x[stencil]) + constant
@@ -343,7 +358,7 @@ class CoulombFriction(Elastic):
 
     def add_gradient(self, x: Array, frozen: ObstacleMotion, out: Array) -> None:
         if self.n_elements:
-            friction_pairs.add_gradient(x, *self._stage_data(frozen), out)
+            friction_pairs.add_gradient(x, *self._data(frozen), out)
 
     def add_hessian(
         self,
@@ -355,7 +370,7 @@ class CoulombFriction(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        data = self._stage_data(frozen)
+        data = self._data(frozen)
         # the potential is convex; with a secant for sliding pairs equilibria would converge only linearly
         blend = 0.0 if self._contact.static else blend
         friction_pairs.add_hessians(x, *data, weight, blend, offsets[self.name], values)
@@ -364,7 +379,7 @@ class CoulombFriction(Elastic):
         """Numbers of sticking and of sliding pairs of this rank at x (n_local, 3), and the sum of their
         normal forces [N] in the step's equations.
         """
-        owned, data = slice(self.n_owned), self._stage_data(frozen)
+        owned, data = slice(self.n_owned), self._data(frozen)
         *_, slides = self._return_map(x, data, self._slip)
         sliding = float(np.count_nonzero(slides[owned]))
         return self.n_owned - sliding, sliding, float(self._force[owned].sum())
@@ -374,118 +389,114 @@ class CoulombFriction(Elastic):
 
     def accept(self, x: Array, frozen: ObstacleMotion) -> None:
         self._contact_time = None
-        # not those of a rejected attempt
-        _, owed, work = self._corrected if self._corrected[0] == frozen.time else NOTHING_CORRECTED
-        self._vertex_data[:, OWED] = owed
-        self._vertex_data[:, WORK] += work
-        self._corrected = NOTHING_CORRECTED
-        if not self.n_elements:
+        if self._ended is not None and self._ended.time == frozen.time:  # not of a rejected attempt
+            self._pairs, self._obstacle_loads, self.stale = self._ended.pairs, self._ended.loads, True
+            self._work += self._ended.work
+        elif not self.n_elements:
             self._obstacle_loads = np.zeros_like(self._obstacle_loads)
             self._update_pairs(x, frozen.end_points, self._element_pairs)
-            return
-        data, slip = self._kernel_data(frozen.end_motions)
-        self._obstacle_loads = self._forces(x, data)
-        slip, heat, slides = self._return_map(x, data, slip)
-        first = self.stencil[: self.n_owned, 0]
-        np.add.at(self._vertex_data[:, WORK], first, heat[: self.n_owned])
-        old = self._element_pairs.data.copy()
-        old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
-        self._update_pairs(x, frozen.end_points, self._element_pairs._replace(data=old))
+        else:
+            old, data, heat = self._moved_pairs(x, frozen)
+            self._obstacle_loads, number = self._forces(x, data), self._obstacle[: self.n_owned]
+            on = np.flatnonzero(number >= 0)
+            slip = np.linalg.norm(old.data[:, friction_pairs.SLIP : SLID], axis=1)
+            np.add.at(self._obstacle_loads[:, 7], number[on], (self._stiffness[: self.n_owned] * slip)[on])
+            np.add.at(self._work, self.stencil[: self.n_owned, 0], heat)
+            self._update_pairs(x, frozen.end_points, old)
+        self._ended = None
 
-    def friction_corrections(
+    def _moved_pairs(self, x: Array, frozen: ObstacleMotion) -> tuple[Pairs, tuple[NDArray[Any], ...], Array]:
+        """The pairs of the step with their elastic slip at x (n_local, 3), arguments of the kernels, and the
+        heat (n_owned,) [J] of sliding.
+        """
+        (data, slip), owned = self._kernel_data(frozen.motions), slice(self.n_owned)
+        slip, heat, slides = self._return_map(x, data, slip)
+        old = self._element_pairs.data.copy()
+        old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[owned], slides[owned]
+        return self._element_pairs._replace(data=old), data, heat[owned]
+
+    def end_friction(
         self,
-        stage: Array,
         x: Array,
         v: Array,
         frozen: ObstacleMotion,
+        contacts: Contacts,
         normal_force: Array,
-        dt: float,
-        *,
-        sheets: bool,
         last: tuple[float, float],
-    ) -> FrictionCorrections:
-        contact = self._contact
-        *_, force, pair = contact.find_contacts(stage, frozen.stage_points, contact.n_owned)
-        vertex = contact.vertex_of(pair)
-        counted = (vertex >= 0) & (sheets | (contact.obstacle[pair] >= 0))
-        slip, _, slides = self._return_map(x, *self._kernel_data(frozen.end_motions))
-        considered = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
-        sliding = considered[slides[considered]]
-        # normal forces of vertices: at the stage; in the step's equations; in these of sliding pairs
-        acted, given, slid = (
-            np.bincount(first, each, minlength=len(self._vertex_data))
-            for first, each in (
-                (vertex[counted], force[counted]),
-                (self._vertex[considered], self._force[considered]),
-                (self._vertex[sliding], self._force[sliding]),
-            )
+    ) -> EndFriction:
+        old, data, _ = self._moved_pairs(x, frozen)
+        found = contacts.beta, contacts.normal, contacts.force, contacts.pair
+        pairs, pair, order, previous = self._pairs_of(x, x, found, old)
+        self._ended = _EndedStep(frozen.time, pairs, self._forces(x, data), np.zeros_like(self._work))
+        # several pairs that continue one share its friction in proportion to their normal forces; the last
+        # row of these arrays, −1, is for those that continue none
+        normal_force = normal_force[order]
+        total = np.bincount(previous % (len(old.key) + 1), normal_force, len(old.key) + 1)
+        share = np.divide(
+            normal_force, total[previous], out=np.zeros_like(normal_force), where=normal_force > 0.0
         )
-        owed = self._vertex_data[:, OWED] / dt + acted + normal_force[: len(acted)] - given
-        # vertices may come near after the stage, or leave
-        *_, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
-        touches = np.isin(np.arange(len(acted)), contact.vertex_of(pair))
-        paid = np.where(slid > 0.0, np.where(touches, PAID_FRACTION, 1.0) * owed, 0.0)
-        # sticking pairs are owed nothing, new contacts get everything later
-        is_owed = touches & ((slid > 0.0) | (given == 0.0))
-        self._corrected = frozen.time, np.where(is_owed, dt * (owed - paid), 0.0), 0.0
-        paid_fraction = paid / np.maximum(slid, np.finfo(float).tiny)
-        missing = self._limit[sliding] * paid_fraction[self._vertex[sliding]]
-        # sticking pairs are stopped at once: their springs would throw a sheet back that lands with a sliding
-        # speed, and oscillating springs would pull with twice the static force
-        owned = slice(self.n_owned)
-        points = self.stencil[owned].astype(np.int64)
-        beta, obstacle = self._beta[owned], self._obstacle[owned]
-        # impulses act at the end of the step, when obstacles may be faster than in the mean
-        motions = contact.obstacles.rigid_motions(*last)
-        moved = contact.obstacles.contact_displacements(x, points, beta, obstacle, motions)
-        moved *= dt / (last[1] - last[0])
-        velocity = np.einsum("ecik,eik->ec", self._gradients[owned], v[points])
-        velocity -= self._tangential(moved / dt, owned)
-        still = STILL * MAX_ELASTIC_SLIP * contact.barrier.gap
-        sticking = np.flatnonzero(~slides[owned] & (dt * np.linalg.norm(velocity, axis=1) > still))
-        rows = np.concatenate([sliding, sticking])
-        tangential = np.concatenate([self._tangential(slip[sliding], sliding), velocity[sticking]])
-        length = np.linalg.norm(tangential, axis=1, keepdims=True)
-        unit = np.divide(tangential, length, out=np.zeros_like(tangential), where=length > 0.0)
-        # friction reaches its limit with what is available against the motion
-        limit = np.where(self._weakens[sticking], 1.0 + OVERSHOOT, 1.0) * self._limit[sticking]
-        elastic = -self._stiffness[sticking, None] * self._tangential(slip[sticking], sticking)
-        along = (elastic * unit[len(sliding) :]).sum(axis=1)
-        rest = along * along + limit * limit - (elastic * elastic).sum(axis=1)
-        available = along + np.sqrt(np.maximum(rest, 0.0))
-        return FrictionCorrections(
-            points[rows],
-            beta[rows],
-            self._force[rows],
-            np.einsum("ec,eck->ek", unit, self._tangents[rows]),
-            np.einsum("ec,ecim->eim", unit, self._gradients[rows]),
-            np.concatenate([missing, available]),
-            obstacle[rows],
-            moved[rows],
+        of_slip = np.zeros((len(old.key) + 1, 3))
+        of_slip[:-1] = -self._stiffness[: self.n_owned, None] * old.data[:, friction_pairs.SLIP : SLID]
+        ended = np.flatnonzero(total[:-1] == 0.0)  # whose friction ends
+        arrays = self._unpacked(pairs.data)
+        beta, tangents, gradients = (
+            np.concatenate([new, given[ended]])
+            for new, given in zip(arrays[:3], (self._beta, self._tangents, self._gradients), strict=True)
+        )
+        force = np.concatenate([share[:, None] * of_slip[previous], of_slip[ended]])
+        slides = pairs.data[:, SLID] > 0.5
+        static, kinetic = self._coefficients[pairs.data[:, 1].astype(np.int64)].T
+        limit, none = pairs.data[:, FACTOR] * normal_force, np.zeros(len(ended))
+        points = np.concatenate([self._contact.stencil[pair], self.stencil[ended]]).astype(np.int64)
+        obstacle = np.concatenate([contacts.obstacle[order], self._obstacle[ended]])
+        velocity = self._contact.obstacles.contact_velocities(x, v, points, beta, obstacle, last)
+        return EndFriction(
+            points,
+            beta,
+            tangents,
+            gradients,
+            np.concatenate([normal_force, none]),
+            np.einsum("eck,ek->ec", tangents, force),
+            np.concatenate([static * limit, none]),
+            np.concatenate([kinetic * limit, none]),
+            np.concatenate([slides, none == 0.0]),
+            np.concatenate([~slides & (previous >= 0), none > 0.0]),
+            obstacle,
+            velocity,
+            STILL * self._contact.barrier.gap,
         )
 
-    def set_impulse_work(self, vertex: Ints, work: Array) -> None:
-        at_vertices = np.zeros(len(self._vertex_data))
-        np.add.at(at_vertices, vertex, work)
-        self._corrected = *self._corrected[:2], at_vertices
+    def set_end_friction(
+        self, friction: EndFriction, force: Array, sticks: NDArray[np.bool_], work: Array
+    ) -> None:
+        assert self._ended is not None
+        pairs, loads, at_vertices = self._ended[1:]
+        size, before = (np.linalg.norm(each, axis=1) for each in (force, friction.force))
+        limit = np.where(sticks, friction.static, friction.kinetic)
+        less = np.divide(limit, before, out=np.ones_like(size), where=before > limit)
+        n = len(pairs.key)
+        pairs.data[:, friction_pairs.SLIP : SLID] *= less[:n, None]
+        pairs.data[:, SLID] = ~sticks[:n]
+        on = np.flatnonzero(friction.obstacle >= 0)
+        np.add.at(loads[:, 7], friction.obstacle[on], size[on])
+        np.add.at(at_vertices, friction.points[:, 0], work)
 
     def starting_friction(self, frozen: ObstacleMotion) -> StartingFriction:
         owned = slice(self.n_owned)
         gradients, beta = self._gradients[owned], self._beta[owned]
         # a gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d
         size = np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
-        (_, _, constant, stiffness, limit), _ = self._kernel_data(frozen.end_motions)
+        (_, _, constant, stiffness, _), _ = self._kernel_data(frozen.motions)
         elastic = -(stiffness[:, None] * self._tangential(self._slip))[owned]
         moved, force = (constant - self._constant)[owned], self._force[owned]
         points = self.stencil[owned].astype(np.int64)
-        return StartingFriction(points, gradients, size, force, limit[owned], elastic, moved)
+        return StartingFriction(points, gradients, size, force, self._limit[owned], elastic, moved)
 
-    def moments(self, x: Array, frozen: ObstacleMotion) -> tuple[Ints, Array]:
-        rows = np.flatnonzero(self._obstacle[: self.n_owned] < 0)
-        stencil, *state = (part[rows] for part in self._stage_data(frozen))
-        moments = np.zeros((len(rows), 3))
-        friction_pairs.add_moments(x, stencil, *state, moments)
-        return stencil, -moments
+    def set_starting_friction(self, friction: Array) -> None:
+        owned, data = slice(self.n_owned), self._pairs.data.copy()
+        slip = np.einsum("eck,ec->ek", self._tangents[owned], -friction / self._stiffness[owned, None])
+        data[:, friction_pairs.SLIP : SLID] = slip
+        self._pairs, self.stale = self._pairs._replace(data=data), True
 
     def accept_substep(self, x: Array, frozen: ObstacleMotion) -> None:
         self.accept(x, frozen)
@@ -493,12 +504,12 @@ class CoulombFriction(Elastic):
 
     def friction_lag(self, x: Array, frozen: ObstacleMotion) -> dict[str, Array]:
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
-        (slip, _, slides), count = self._return_map(x, *self._kernel_data(frozen.end_motions)), len(names)
+        (slip, _, slides), count = self._return_map(x, *self._kernel_data(frozen.motions)), len(names)
         owned, friction = slice(self.n_owned), self._stiffness * np.linalg.norm(slip, axis=1)
-        *_, force, pair = self._contact.find_contacts(x, frozen.end_points, self._contact.n_owned)
+        _, _, force, _, pair = self._contact.find_contacts(x, frozen.end_points, self._contact.n_owned)
 
         def by_vertex(vertex: NDArray[np.int32], obstacle: Ints, each: Array) -> Array:
-            bins, n_bins = vertex.astype(np.int64) * count + obstacle % count, len(self._vertex_data) * count
+            bins, n_bins = vertex.astype(np.int64) * count + obstacle % count, len(self._work) * count
             return np.bincount(bins, each, n_bins).reshape(-1, count).astype(np.float64)
 
         acted = by_vertex(self._contact.stencil[pair, 0], self._contact.obstacle[pair], force)
@@ -512,9 +523,9 @@ class CoulombFriction(Elastic):
         return dict(zip(names, sums, strict=True))
 
     def slip_under_changed_forces(self, x: Array, dx: Array, frozen: ObstacleMotion) -> tuple[float, float]:
-        contact, n = self._contact, len(self._vertex_data)
-        obstacles, motions, owned = contact.obstacles, frozen.end_motions, slice(self.n_owned)
-        beta, normal, force, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        contact, n = self._contact, len(self._work)
+        obstacles, motions, owned = contact.obstacles, frozen.motions, slice(self.n_owned)
+        beta, normal, force, _, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
         points, obstacle = contact.points[pair], contact.obstacle[pair]
         moved = obstacles.contact_displacements(x, points, beta, obstacle, motions)
         found = np.einsum("ei,eik->ek", np.where(points >= 0, beta, 0.0), dx[np.maximum(points, 0)]) - moved
@@ -535,33 +546,33 @@ class CoulombFriction(Elastic):
         return float(np.vdot(np.abs(after - given), slip)), float(np.maximum(after, given).sum())
 
     def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
-        return self._pairs, self._vertex_data.copy(), self._obstacle_loads, self._contact_time
+        return self._pairs, self._work.copy(), self._obstacle_loads, self._contact_time
 
     def restore_contacts(self, state: tuple[Pairs, Array, Array, float | None]) -> None:
-        self._pairs, self._vertex_data, self._obstacle_loads, self._contact_time = state
+        self._pairs, self._work, self._obstacle_loads, self._contact_time = state
         self.stale = True
 
     def _forces(self, x: Array, data: tuple[NDArray[Any], ...]) -> Array:
-        """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
+        """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 8)."""
         number = self._obstacle[: self.n_owned]
-        out = np.zeros((len(self._contact.obstacles.each), 6))
+        out = np.zeros((len(self._contact.obstacles.each), 8))
         for obstacle in np.unique(number[number >= 0]):
             rows, force = np.flatnonzero(number == obstacle), np.zeros_like(x)
             friction_pairs.add_gradient(x, *(part[rows] for part in data), force)
-            out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
+            out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         return out
 
     def obstacle_forces(self, x: Array, frozen: ObstacleMotion, count: int) -> Array:
         return self._obstacle_loads[:count]
 
     def state(self) -> dict[str, Array]:
-        return {"friction_work": self._vertex_data * IS_WORK, "friction_owed": self._vertex_data * ~IS_WORK}
+        return {"friction_work": np.outer(self._work, [1.0, 0.0, 0.0])}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self._vertex_data = state["friction_work"] * IS_WORK + state["friction_owed"]
+        self._work = state["friction_work"][:, 0].copy()
 
     def history(self, x: Array, frozen: ObstacleMotion) -> Mapping[str, float]:
-        return {"friction_work": float(self._vertex_data[:, WORK].sum())}
+        return {"friction_work": float(self._work.sum())}
 
 
 def elements(rest: RestShape) -> None:

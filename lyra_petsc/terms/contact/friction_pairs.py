@@ -168,19 +168,6 @@ def add_gradient(x, stencil, gradients, constant, stiffness, limit, out):  # typ
 
 
 @kernel()
-def add_moments(x, stencil, gradients, constant, stiffness, limit, out):  # type: ignore[no-untyped-def]
-    """Add the moments [N m] of the gradients of pairs between sheets to out (E, 3)."""
-    for e in range(len(stencil)):
-        f1, f2 = _force(x, e, stencil, gradients, constant, stiffness, limit)
-        vertex = point(x, stencil[e, 0])
-        for i in range(1, 4):
-            force = combined(f1, _gradient(gradients, e, 0, i), f2, _gradient(gradients, e, 1, i))
-            moment = cross(minus(point(x, stencil[e, i]), vertex), force)
-            for k in range(3):
-                out[e, k] += moment[k]
-
-
-@kernel()
 def add_hessians(x, stencil, gradients, constant, stiffness, limit, weight, blend, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add weight (E,) times the Hessians [N/m], all positive semidefinite, to block rows values (n, 3, 3).
 

@@ -85,7 +85,6 @@ class Obstacles:
         }
         radius, first, begins = np.zeros(len(obstacles) + 1), 0, []
         smooth_points, smooth_edges = [np.empty(0, dtype=np.bool_)], [np.empty((0, 2), dtype=np.int64)]
-        is_point = [np.empty(0, dtype=np.bool_)]
         for number, obstacle in enumerate(obstacles):
             n = len(obstacle.points)
             begins.append(first)
@@ -120,7 +119,6 @@ class Obstacles:
                 parts["segments"].append(rows(np.array([[0, n - 1]])))
             if not isinstance(obstacle, Solid):
                 smooth_points.append(np.zeros(n, dtype=np.bool_))
-            is_point.append(np.arange(n) < len(obstacle.points))  # else normals
             first += n
         radius[self.first_wall : -1] = wall_radius
         smooth = np.concatenate(smooth_edges)
@@ -133,7 +131,6 @@ class Obstacles:
         self.radius, self.n_points = radius, first
         self.moving = any(obstacle.motion is not None for obstacle in obstacles)
         self._first = np.array(begins, dtype=np.int64)
-        self._is_point = np.concatenate(is_point)
         self.places = {each.name: (number, begins[number]) for number, each in enumerate(obstacles)}
         self._at_rest = [(np.eye(3), np.zeros(3))] * len(obstacles)
         self._fixed_positions: Array | None = None
@@ -150,26 +147,6 @@ class Obstacles:
             if isinstance(obstacle, Container) and obstacle.kind == "planes":
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
-
-    def step_positions(self, start: float, stage: float, end: float) -> tuple[Array, Array]:
-        """Points and normals (3, m, 3) at the start, the stage and the end of a step at these times [s], and
-        the distance (obstacles, 3) [m] of each obstacle at the stage from its path.
-
-        At the stage the centre of its points is on the straight line between both ends of the step, as the
-        stage of a sheet is. On the path of an obstacle with acceleration a the midpoint rule would find a
-        sheet at rest on it by a Δt²/8 nearer or farther than at the ends.
-        """
-        x, shift = (
-            np.stack([self.positions(time) for time in (start, stage, end)]),
-            np.zeros((len(self.each), 3)),
-        )
-        if self.moving and start < stage < end:
-            fraction, count = (stage - start) / (end - start), self._is_point.astype(float)
-            from_path = (1.0 - fraction) * x[0] + fraction * x[2] - x[1]
-            shift = np.add.reduceat(from_path * count[:, None], self._first)
-            shift /= np.add.reduceat(count, self._first)[:, None]
-            x[1] += count[:, None] * np.repeat(shift, np.diff(self._first, append=len(count)), axis=0)
-        return x, shift
 
     def bounding_boxes(self, x: Array) -> tuple[Array, Array]:
         """Low and high corners (obstacles, 3) [m] of each obstacle over k positions x (k, m, 3) [m]."""
@@ -219,6 +196,30 @@ class Obstacles:
             contact = np.einsum("ei,eik->ek", sheet_beta, x[np.maximum(points[rows], 0)]) / side
             out[rows] = side * (contact - (contact - translation) @ rotation)
         return out
+
+    def contact_velocities(
+        self,
+        x: Array,
+        v: Array,
+        points: Ints,
+        beta: Array,
+        obstacle: Ints,
+        last: tuple[float, float],
+    ) -> Array:
+        """Mean velocities (m, 3) [m/s] of obstacles at their contacts between the times ``last`` [s], times Σ
+        β_i; positions x and velocities v (n_local, 3) are those at the end.
+
+        They are means for the points of the obstacle that are at the contact before and after: chords of its
+        rotation have components along the normal, even if the distance does not change.
+        """
+        if not self.moving:
+            return np.zeros((len(points), 3))
+        duration = last[1] - last[0]
+        moved, back = (
+            self.contact_displacements(at, points, beta, obstacle, self.rigid_motions(*times))
+            for at, times in ((x, last), (x - duration * v, last[::-1]))
+        )
+        return 0.5 * (moved - back) / duration
 
 
 def _triangle_edges(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
