@@ -83,8 +83,9 @@ def restore_changing(
     """
     layout = system.points
     for term in system.active.elastic:
-        if all(f"{term.name}.{name}" in arrays for name in term.registration.state):
-            term.restore({name: arrays[f"{term.name}.{name}"] for name in term.registration.state})
+        names = term.registration.state
+        if names and all(f"{term.name}.{name}" in arrays for name in names):
+            term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
         if term.name in elements and term.registration.neighbours:
             own = range(layout.start, layout.start + layout.n_owned)
             term.restore_elements(*_send_to_owners(system, *elements[term.name]), own, places)
