@@ -232,8 +232,14 @@ class EnergyGuard:
         force = np.zeros_like(x1)
         near = [term for term in self._plain if term.detects_collisions]
         for x, time in ((x0, system.t0), (x1, system.t1)):
-            for term, frozen in self._frozen([*self._targets, *near], time, x).items():
+            both = [term for term in (*self._targets, *near) if not term.slips]
+            for term, frozen in self._frozen(both, time, x).items():
                 term.add_gradient(x, frozen, force)
+        stage = np.zeros_like(x1)
+        for term in system.active.changing:
+            if term.slips:  # by the force at the stage, which the impulses complete
+                term.add_gradient(system.stage_positions, system.active.frozen[term], stage)
+        force += 2.0 * stage
         by_targets = 0.5 * system.dt * float(force[rows].sum(axis=0) @ drift)
         if system.contact_impulses:
             by_targets += system.dt * float(system.contact_impulses.loads[:, :3].sum(axis=0) @ drift)

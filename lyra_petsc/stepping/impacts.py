@@ -31,8 +31,8 @@ END = 1e-3
 """Last part of a step by whose motion the velocities of obstacles at its end are measured."""
 
 MAX_SWEEPS, SETTLED = 30, 1e-4
-"""Largest number of sweeps over the friction at the start of a step, and change of it in a sweep over the
-largest one below which they end."""
+"""Largest number of sweeps over the friction at the start or the end of a step, and change of it in a sweep
+over the largest one below which they end."""
 
 
 class ContactImpulses(NamedTuple):
@@ -104,17 +104,31 @@ def _slide(system: StageEquations, term: Elastic, contacts: Contacts, normal_for
     friction = term.end_friction(system.x, system.v, frozen, contacts, normal_force, last)
     points, gradients = friction.points, friction.gradients
     of_obstacles = np.einsum("eck,ek->ec", friction.tangents, friction.velocity)
-    mass = _pair_masses(system, points, _sizes(gradients, friction.beta), friction.normal_force)
-    before = np.einsum("ecik,eik->ec", gradients, system.v[points]) - of_obstacles
-    force, sticks = _coulomb(friction, before, mass / dt, friction.still / dt)
-    change = force - friction.force
-    impulse = _sums(points, dt * np.einsum("ec,ecik->eik", change, gradients), len(system.x))
+    mass = _pair_masses(system, points, _sizes(gradients, friction.beta), friction.normal_force) / dt
+
+    def rates(v: Array) -> Array:
+        relative: Array = np.einsum("ecik,eik->ec", gradients, v[points]) - of_obstacles
+        return relative
+
+    def impulse_of(change: Array) -> Array:
+        return _sums(points, dt * np.einsum("ec,ecik->eik", change, gradients), len(system.x))
+
+    before, force = rates(system.v), friction.force - friction.applied
+    largest = system.points.global_max(float(friction.static.max(initial=0.0)))[0]
+    for _ in range(MAX_SWEEPS):
+        v = system.v + _velocity_change(system, impulse_of(force - friction.applied))
+        tried, (force, sticks) = force, _coulomb(friction, force, rates(v), mass, dt)
+        moved = float(np.abs(force - tried).max(initial=0.0))
+        if system.points.global_max(moved)[0] <= SETTLED * largest:
+            break
+    change = force - friction.applied
+    impulse = impulse_of(change)
     work = dt * float(np.vdot(change, of_obstacles))
     handle_force, heat = _apply(system, impulse, work)
-    after = np.einsum("ecik,eik->ec", gradients, system.v[points]) - of_obstacles
+    after = rates(system.v)
     # of the change, with the mean of the velocities before and after, as external work
     of_change = -0.5 * dt * float(np.vdot(change, before + after))
-    sliding = np.where(sticks, 0.0, np.maximum(-dt * np.einsum("ec,ec->e", force, after), 0.0))
+    sliding = np.where(sticks, 0.0, -dt * np.einsum("ec,ec->e", force, after))
     term.set_end_friction(friction, force, sticks, sliding)
     along = np.einsum("ec,eck->ek", change, friction.tangents)
     loads = _loads(system, points, friction.beta, friction.obstacle, along, np.zeros(len(along)))
@@ -122,13 +136,13 @@ def _slide(system: StageEquations, term: Elastic, contacts: Contacts, normal_for
 
 
 def _coulomb(
-    friction: EndFriction, velocity: Array, mass: Array, still: float
+    friction: EndFriction, force: Array, velocity: Array, mass: Array, dt: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Friction (m, 2) [N] of pairs with relative velocities (m, 2) [m/s] and ``mass`` (m,) [kg/s], the mass
-    over Δt, and which of them stick.
+    """Friction (m, 2) [N] of pairs with relative velocities (m, 2) [m/s] under the friction ``force`` (m, 2)
+    [N], and which of them stick; ``mass`` (m,) [kg/s] is the mass over Δt.
     """
-    moves = friction.slides | (np.linalg.norm(velocity, axis=1) > still)
-    stopping = friction.force - np.where(moves, mass, 0.0)[:, None] * velocity
+    moves = friction.slides | (dt * np.linalg.norm(velocity, axis=1) > friction.still)
+    stopping = force - np.where(moves, mass, 0.0)[:, None] * velocity
     size = np.linalg.norm(stopping, axis=1)
     # a spring that still yields less than its limit need not stop the pair within the step
     holds = friction.held & (np.linalg.norm(friction.force, axis=1) <= friction.static)
@@ -236,17 +250,27 @@ def _loads(
     return obstacle[on], np.hstack([on_obstacle, np.cross(at, on_obstacle), magnitudes])
 
 
+def _velocity_change(system: StageEquations, impulse: Array) -> Array:
+    """Change (n_local, 3) [m/s] of the velocities by impulses (n_local, 3) [N s]; collective.
+
+    Prescribed unknowns keep their velocities. ``impulse`` gets the sums over ranks in its owned rows.
+    """
+    n, mass = system.points.n_owned, system.mass[:, None]
+    system.points.add_to_owners(impulse)
+    change, free = np.zeros_like(impulse), system.prescribed.free & (mass > 0.0)
+    np.divide(impulse[:n], mass, out=change[:n], where=free)
+    system.points.update_ghosts(change)
+    return change
+
+
 def _apply(system: StageEquations, impulse: Array, work: float) -> tuple[Array, float]:
     """Apply impulses (n_local, 3) [N s] to the velocities; collective.
 
     Returns the mean reaction forces [N] of handles, and the heat [J]: ``work`` of obstacles minus the change
     of kinetic energy.
     """
-    n, mass = system.points.n_owned, system.mass[:, None]
-    system.points.add_to_owners(impulse)
-    # prescribed unknowns keep their velocities, with reactions against the impulses
-    free = system.prescribed.free & (mass > 0.0)
-    change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
+    n = system.points.n_owned
+    change = _velocity_change(system, impulse)[:n]
     heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
     system.in_contact.shift_past_velocities(change)

@@ -237,8 +237,9 @@ class EndFriction(NamedTuple):
         Gradients of the relative displacement along ``tangents`` with respect to the points' positions.
     normal_force : (m,)
         Normal force of the step [N], 0 for pairs that are no longer in contact.
-    force : (m, 2)
-        Friction [N] along ``tangents`` in the equations of the step.
+    force, applied : (m, 2)
+        Friction [N] along ``tangents`` in the equations of the step: that with which a pair of the end
+        begins, and that of the pairs of the equations, which follow them and end.
     static, kinetic : (m,)
         Largest friction [N] of sticking pairs, and of sliding ones.
     slides, held : (m,)
@@ -255,6 +256,7 @@ class EndFriction(NamedTuple):
     gradients: Array
     normal_force: Array
     force: Array
+    applied: Array
     static: Array
     kinetic: Array
     slides: NDArray[np.bool_]

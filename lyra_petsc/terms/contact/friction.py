@@ -430,25 +430,27 @@ class CoulombFriction(Elastic):
         self._ended = _EndedStep(frozen.time, pairs, self._forces(x, data), np.zeros_like(self._work))
         # several pairs that continue one share its friction in proportion to their normal forces; the last
         # row of these arrays, −1, is for those that continue none
-        normal_force = normal_force[order]
+        normal_force, owned = normal_force[order], slice(self.n_owned)
         total = np.bincount(previous % (len(old.key) + 1), normal_force, len(old.key) + 1)
         share = np.divide(
             normal_force, total[previous], out=np.zeros_like(normal_force), where=normal_force > 0.0
         )
         of_slip = np.zeros((len(old.key) + 1, 3))
-        of_slip[:-1] = -self._stiffness[: self.n_owned, None] * old.data[:, friction_pairs.SLIP : SLID]
-        ended = np.flatnonzero(total[:-1] == 0.0)  # whose friction ends
+        of_slip[:-1] = -self._stiffness[owned, None] * old.data[:, friction_pairs.SLIP : SLID]
         arrays = self._unpacked(pairs.data)
         beta, tangents, gradients = (
-            np.concatenate([new, given[ended]])
+            np.concatenate([new, given[owned]])
             for new, given in zip(arrays[:3], (self._beta, self._tangents, self._gradients), strict=True)
         )
-        force = np.concatenate([share[:, None] * of_slip[previous], of_slip[ended]])
+        force = np.concatenate([share[:, None] * of_slip[previous], of_slip[:-1]])
+        force = np.einsum("eck,ek->ec", tangents, force)
+        applied = force.copy()
+        applied[: len(pairs.key)] = 0.0
         slides = pairs.data[:, SLID] > 0.5
         static, kinetic = self._coefficients[pairs.data[:, 1].astype(np.int64)].T
-        limit, none = pairs.data[:, FACTOR] * normal_force, np.zeros(len(ended))
-        points = np.concatenate([self._contact.stencil[pair], self.stencil[ended]]).astype(np.int64)
-        obstacle = np.concatenate([contacts.obstacle[order], self._obstacle[ended]])
+        limit, none = pairs.data[:, FACTOR] * normal_force, np.zeros(self.n_owned)
+        points = np.concatenate([self._contact.stencil[pair], self.stencil[owned]]).astype(np.int64)
+        obstacle = np.concatenate([contacts.obstacle[order], self._obstacle[owned]])
         velocity = self._contact.obstacles.contact_velocities(x, v, points, beta, obstacle, last)
         return EndFriction(
             points,
@@ -456,7 +458,8 @@ class CoulombFriction(Elastic):
             tangents,
             gradients,
             np.concatenate([normal_force, none]),
-            np.einsum("eck,ek->ec", tangents, force),
+            force,
+            applied,
             np.concatenate([static * limit, none]),
             np.concatenate([kinetic * limit, none]),
             np.concatenate([slides, none == 0.0]),
