@@ -30,7 +30,7 @@ from lyra_petsc.terms.term import Contacts, Elastic, EndFriction
 END = 1e-3
 """Last part of a step by whose motion the velocities of obstacles at its end are measured."""
 
-MAX_SWEEPS, SETTLED = 30, 1e-4
+MAX_SWEEPS, SETTLED = 30, 1e-7
 """Largest number of sweeps over the friction at the start or the end of a step, and change of it in a sweep
 over the largest one below which they end."""
 
