@@ -15,7 +15,9 @@ def leave_working_directory() -> None:
         here = os.getcwd()
     except OSError:  # it was removed
         here = ""
-    sys.path[:] = [folder for folder in sys.path if folder not in ("", here)]
+    own = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    # last, so that nothing beside the program hides an installed module where it is the working directory
+    sys.path[:] = [*(folder for folder in sys.path if folder not in ("", here, own)), own]
     os.environ["PYTHONSAFEPATH"] = "1"  # for processes that libraries start
 
 

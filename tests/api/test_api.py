@@ -93,7 +93,7 @@ def test_forces_on_obstacles_after_each_step(shared_tmp, comm):
         for _ in simulation:
             forces.append(simulation.obstacle_forces)
     run = lyra_petsc.run(scene, shared_tmp / "out")
-    names = ["fx", "fy", "fz", "tx", "ty", "tz"]
+    names = ["fx", "fy", "fz", "tx", "ty", "tz", "normal", "friction"]
     table = np.column_stack([np.asarray(run.obstacles[name]) for name in names])
     assert list(forces[0]) == ["floor", "ball"]
     assert table[-2, 2] < -0.1

@@ -141,6 +141,7 @@ MEMBRANE_SCENE = {
     "remembered",
     "rest",
     "term",
+    "units_check",
 }
 """Modules of ``terms`` that every scene needs."""
 
