@@ -221,6 +221,8 @@ def test_every_array_has_its_type_shape_and_bounds(tmp_path: Path) -> None:
             ):
                 if kind == "elements" and damage in ("missing", "fewer", "more"):
                     continue  # pairs come and go
+                if (name, damage) == ("friction.friction_work", "missing"):
+                    continue  # as if the scene had had no friction then
                 shutil.rmtree(damaged, ignore_errors=True)
                 shutil.copytree(whole, damaged)
                 with import_h5py().File(damaged / CHECKPOINT, "a") as file:
