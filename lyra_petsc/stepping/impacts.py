@@ -6,9 +6,9 @@ damping of barrier and mass damp the rates of change of the distances in contact
 between the nearest points. Parts that lie, slide or roll at a constant distance are not damped. A dashpot
 reduces the normal force of a step at most to 0: contact never pulls.
 
-**Friction.** The equations of a step have the normal forces at its start. Its own normal force N, dashpots
-included, is known at its end, where the friction f of each pair becomes that of Coulomb's law: with the
-friction f_0 in the equations, the relative tangential velocity v_t and the mass m of the pair,
+**Friction.** The equations of a step have normal forces from before the solve. Its own normal force N,
+dashpots included, is known at its end, where the friction f of each pair becomes that of Coulomb's law: with
+the friction f_0 in the equations, the relative tangential velocity v_t and the mass m of the pair,
 
     f = projection of f_0 − m v_t / Δt on the disc |f| ≤ μ N,
 

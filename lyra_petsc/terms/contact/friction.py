@@ -4,10 +4,11 @@ Pairs, normals and normal forces are those of the last accepted state. A pair th
 vertex that moved on to a neighbouring triangle, keeps its elastic slip, so that sticking pairs do not creep.
 The owner of a pair's first vertex stores the pair and sends it to the owners of the others.
 
-The equations of a step use the normal forces at its start. At its end, where the normal forces of the step
-are known, an impulse changes the friction of each pair to that of Coulomb's law with these: the point of the
-disc |f| ≤ μ N that is nearest to the friction which stops the pair (`stepping.impacts`). So friction never
-exceeds μ times the normal force of the same step, and it opposes the motion.
+The equations of a step use the normal forces at its start, or where these change much, those at the end of
+the solve before (`Stepper.attempt`). When the normal forces of the step are known, an impulse changes the
+friction of each pair to that of Coulomb's law with these: the point of the disc |f| ≤ μ N that is nearest to
+the friction which stops the pair (`stepping.impacts`). So friction never exceeds μ times the normal force of
+the same step, and it opposes the motion.
 """
 
 from __future__ import annotations
