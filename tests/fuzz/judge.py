@@ -176,6 +176,7 @@ def _wait(pid: int) -> int:
 def _child(case: Case, inside: Path, folder: Path) -> None:
     """Run the program in the child process; never returns."""
     code = 99
+    gc.freeze()  # else the collector would find here, and warn of, files that earlier tests left open
     try:
         os.setsid()
         os.chdir(inside)
