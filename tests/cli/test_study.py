@@ -200,8 +200,9 @@ def test_ranks_option_starts_an_mpirun_for_each_case(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_signal_stops_all_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
-    process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
-    wait_until((tmp_path / "out" / "cases" / "dt0.0001" / "history.csv").exists, process)
+    # 80,000 steps, so that the signal comes before the end
+    process = start([*LONG[:3], "dt=0.000001", *LONG[4:], "--ranks", "2"], tmp_path)
+    wait_until(lambda: list(tmp_path.glob("out/cases/*/history.csv")), process)
     process.send_signal(signal.SIGTERM)
     left = finish(process)
     assert left.code == 143
