@@ -23,6 +23,7 @@ LEVELS = [
     {"mesh"},
     {"terms"},
     {"linear"},
+    {"contact"},
     {"stepping"},
     {"output"},
     {"api"},

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
+from lyra_petsc.contact.crossings import have_common_vertex, self_crossings
+from lyra_petsc.contact.overlaps import Overlaps, behind_wall, find_overlaps
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.overlaps import Overlaps, behind_wall, find_overlaps
 from lyra_petsc.mesh.symmetry import Wall, symmetry_walls
 from lyra_petsc.output.file_operations import on_every_rank
 from lyra_petsc.output.read_run import StoredRun

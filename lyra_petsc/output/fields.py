@@ -15,10 +15,10 @@ from lyra_petsc.output.tensors import six_components
 from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
+    from lyra_petsc.contact.barrier import ContactBarrier
     from lyra_petsc.terms.bending.hinge import Bending
     from lyra_petsc.terms.bending.midedge import MidEdge
     from lyra_petsc.terms.bending.midedge_shape import Frames
-    from lyra_petsc.terms.contact.barrier import ContactBarrier
 
     OnHinges = Callable[[Bending, "Array"], "Array"]
     OnTriangles = Callable[[MidEdge, "Array", Frames], "Array"]

@@ -208,8 +208,8 @@ class Recorder:
         scene, mesh = simulation.scene, simulation.problem.mesh
         if scene.contact is None or mesh is None:
             return
+        from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
-        from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
         positions = read_stored(checkpoint.file, "vertices/position", (mesh.n_vertices, 3), kinds="f")
         obstacles = build_obstacles(scene, mesh.obstacles, Motion)

@@ -51,8 +51,8 @@ from lyra_petsc.terms.term import Elastic, Load, Term
 from lyra_petsc.terms.units_check import unit_notes
 
 if TYPE_CHECKING:
+    from lyra_petsc.contact.barrier import Barrier
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
-    from lyra_petsc.terms.contact.barrier import Barrier
 
 
 TOO_NEAR = 1e-3
@@ -235,8 +235,8 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
     positions = None
     if scene.contact is not None:
+        from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
-        from lyra_petsc.mesh.overlaps import refuse_crossings  # with kernels
 
         positions = data.get("start", mesh.positions)
         _refuse_unconnected(scene, mesh, positions)
@@ -364,7 +364,7 @@ def _barrier(rest: RestShape) -> Barrier | None:
     """Parameters of contact for all ranks, or None if the scene has no contact."""
     if rest.scene.contact is None:
         return None
-    from lyra_petsc.terms.contact.barrier import barrier  # only contact needs its kernels
+    from lyra_petsc.contact.barrier import barrier  # only contact needs its kernels
 
     return barrier(rest)
 
@@ -375,15 +375,15 @@ def _set_up_contact(
     """Pass the obstacles to the contact and friction terms; collective."""
     if whole.barrier is None or scene.contact is None:
         return
+    from lyra_petsc.contact.barrier import ContactBarrier
     from lyra_petsc.mesh.obstacles import build_scene_obstacles
-    from lyra_petsc.terms.contact.barrier import ContactBarrier
 
     obstacles = build_scene_obstacles(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
     self_contact, static = scene.contact.self, scene.time.static
     contact.set_up(whole.barrier, obstacles, self_contact=self_contact, static=static)
     if "friction" in terms:
-        from lyra_petsc.terms.contact.friction import CoulombFriction
+        from lyra_petsc.contact.friction import CoulombFriction
 
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 

@@ -159,7 +159,7 @@ REGISTRY: list[Registration] = [
         {"contacts": "sum", "smallest_gap": "min", "friction_work": "sum"},
         neighbours=True,
         limits_step=True,
-        module_name=".contact.barrier",
+        module_name="lyra_petsc.contact.barrier",
     ),
     Registration(
         "friction",
@@ -169,7 +169,7 @@ REGISTRY: list[Registration] = [
         neighbours=True,
         state=("friction_work",),
         element_vertices=4,
-        module_name=".contact.friction",
+        module_name="lyra_petsc.contact.friction",
     ),
     Registration(
         "clamp",

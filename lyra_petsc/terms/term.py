@@ -24,7 +24,6 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
 if TYPE_CHECKING:
-    from lyra_petsc.terms.contact.one_sided import Springs
     from lyra_petsc.terms.handles.motion import Window
     from lyra_petsc.terms.registry import Registration
 
@@ -422,7 +421,7 @@ class Elastic(Term):
         """
         return 1.0
 
-    def springs(self, x: Array, approach: float, frozen: Any) -> Springs | None:
+    def springs(self, x: Array, approach: float, frozen: Any) -> Any:
         """One-sided springs for the pairs that are in contact at x (n_local, 3), or may be after points have
         approached each other by ``approach`` [m], the same on all ranks. Their elements count as active until
         `release_springs`. None: the term has no such springs.

@@ -150,6 +150,7 @@ MEMBRANE_SCENE = {
 def test_a_membrane_scene_imports_and_compiles_no_other_term(of_membrane: set[str]) -> None:
     terms = {m.removeprefix("lyra_petsc.terms.") for m in of_membrane if m.startswith("lyra_petsc.terms.")}
     assert terms == MEMBRANE_SCENE
+    assert not {m for m in of_membrane if m.startswith("lyra_petsc.contact")}
     assert not of_membrane & set(HEAVY)
 
 

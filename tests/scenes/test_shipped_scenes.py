@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import finished
 
-from lyra_petsc.mesh.crossings import self_crossings
+from lyra_petsc.contact.crossings import self_crossings
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene
 

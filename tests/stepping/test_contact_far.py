@@ -9,8 +9,8 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, gathered, grid, scene_of
 
+from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.5, 0.5, 12, 12),

@@ -21,11 +21,11 @@ from physics import (
     symmetry_planes,
 )
 
+from lyra_petsc.contact import barrier as contact_barrier
+from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.newton.contact_model import springs_along
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact import barrier as contact_barrier
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 

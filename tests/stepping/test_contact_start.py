@@ -11,9 +11,9 @@ import pytest
 from mpi4py import MPI
 from physics import Simulation, grid, obj_file
 
+from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 pytestmark = pytest.mark.parallel(2)
 

@@ -12,12 +12,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import gathered, grid, scene_of
 
+from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.crossings import self_crossings
+from lyra_petsc.contact.overlaps import find_overlaps
 from lyra_petsc.errors import SolverError
-from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import CLOTH, end_on_one_rank, finished, gathered, grid, obj_file, scene_of, shape
 
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.contact.friction import CoulombFriction
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.contact.friction import CoulombFriction
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from mpi4py import MPI
 from numba import typeof
 from physics import CLOTH, Simulation, grid
 
+from lyra_petsc.contact.barrier import NO_PAIRS, ContactBarrier
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.terms.bending.midedge import NO_FRICTION
-from lyra_petsc.terms.contact.barrier import NO_PAIRS, ContactBarrier
 from lyra_petsc.terms.remembered import Remembered, unwritable
 
 

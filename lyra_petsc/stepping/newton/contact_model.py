@@ -18,9 +18,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.contact.one_sided import Springs
 from lyra_petsc.terms.term import Elastic
 
 MAX_SOLVES = 20

@@ -8,9 +8,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.friction import CoulombFriction
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.contact.barrier import ContactBarrier
-from lyra_petsc.terms.contact.friction import CoulombFriction
 
 
 class ContactMonitor:

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from lyra_petsc.contact.crossings import self_crossings
+from lyra_petsc.contact.overlaps import find_overlaps
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle, resample_polyline
@@ -29,8 +31,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     scale,
 )
 from lyra_petsc.experiments.verification.verification_case import FLOOR, grid
-from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.mesh.overlaps import find_overlaps
 from lyra_petsc.parallel import on_root
 
 MAX_NEWTON = 12

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.drape import (
     CLOTH,
@@ -41,7 +42,6 @@ from lyra_petsc.experiments.verification.verification_case import (
 )
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 from lyra_petsc.terms.term import Elastic
 
 G = 9.81

@@ -18,6 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact import contact_pairs, surface_shares
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
+from lyra_petsc.contact.obstacle_search import ObstacleSearch
+from lyra_petsc.contact.one_sided import Springs
+from lyra_petsc.contact.sheet_search import SheetSearch
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
@@ -28,12 +34,6 @@ from lyra_petsc.mesh.symmetry import symmetry_walls
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
-from lyra_petsc.terms.contact import contact_pairs, surface_shares
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.contact.obstacle_points import ObstaclePositions, Obstacles
-from lyra_petsc.terms.contact.obstacle_search import ObstacleSearch
-from lyra_petsc.terms.contact.one_sided import Springs
-from lyra_petsc.terms.contact.sheet_search import SheetSearch
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Contacts, Elastic, Offsets, Pair, StepInterval, UpcomingStep

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 
+from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
+from lyra_petsc.contact.overlaps import behind_planes, inside_ball, outside_ball
 from lyra_petsc.errors import SolverError
-from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.overlaps import behind_planes, inside_ball, outside_ball
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact.barrier import ContactBarrier
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

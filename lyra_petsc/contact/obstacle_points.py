@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact import surface_shares
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.terms.contact import surface_shares
 from lyra_petsc.terms.term import StepInterval
 
 SHARP_ANGLE = 0.5

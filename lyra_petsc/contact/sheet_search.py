@@ -9,13 +9,13 @@ import math
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
+from lyra_petsc.contact.distance_bounds import DistanceBounds
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import inlined, kernel, leaf
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.near import near_pairs_by_tree
 from lyra_petsc.mesh.topology import edge_table
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
-from lyra_petsc.terms.contact.distance_bounds import DistanceBounds
 
 EXTRA_RADIUS = 0.7
 """Additional search radius for neighbouring patches over the radius: their simplices are not searched again

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from lyra_petsc.mesh.overlaps import Overlaps, behind_planes, inside_ball, inside_box, outside_ball
+from lyra_petsc.contact.overlaps import Overlaps, behind_planes, inside_ball, inside_box, outside_ball
 from lyra_petsc.mesh.topology import unique_edges
 
 pytestmark = pytest.mark.quick

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from lyra_petsc.mesh.crossings import (
+from lyra_petsc.contact.crossings import (
     UNDECIDED,
     have_common_vertex,
     mutual_crossings,

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.contact import contact_pairs
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vector3 import scaled
 from lyra_petsc.kernels.vectors import add_outers
-from lyra_petsc.terms.contact import contact_pairs
 from lyra_petsc.terms.term import Offsets
 
 TANGENT_BELOW = 0.5

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.contact import contact_pairs, surface_shares
-from lyra_petsc.terms.contact.contact_pairs import (
+from lyra_petsc.contact import contact_pairs, surface_shares
+from lyra_petsc.contact.contact_pairs import (
     CCD_TOLERANCE,
     EDGE_EDGE,
     VERTEX_INSIDE,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.contact import friction_pairs
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.terms.contact.friction_pairs import BETA, COLUMNS, NORMAL, ROTATION, SLIP, START
+from lyra_petsc.contact import friction_pairs
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.contact.friction_pairs import BETA, COLUMNS, NORMAL, ROTATION, SLIP, START
 
 Array = NDArray[np.float64]
 

@@ -32,12 +32,12 @@ import math
 
 import numpy as np
 
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vector3 import combined, cross, dot, minus, point
 from lyra_petsc.kernels.vectors import add_outers
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 
 SLIP, SLID, BETA, NORMAL, START, CONTACT, FORCE, FACTOR, STIFFNESS = 6, 9, 10, 14, 17, 20, 23, 24, 25
 ROTATION, COLUMNS = 26, 35

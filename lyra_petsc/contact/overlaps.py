@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.symmetry import Wall, symmetry_walls

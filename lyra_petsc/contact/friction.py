@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact import friction_pairs
+from lyra_petsc.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
+from lyra_petsc.contact.contact_pairs import EDGE_EDGE
+from lyra_petsc.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
-from lyra_petsc.terms.contact import friction_pairs
-from lyra_petsc.terms.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
-from lyra_petsc.terms.contact.contact_pairs import EDGE_EDGE
-from lyra_petsc.terms.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Contacts, Elastic, EndFriction, Offsets, StartingFriction, UpcomingStep
 
