@@ -439,8 +439,13 @@ class Stepper:
         self._linear_failed = False
         if not self._iterates:
             self.linear.reuse.end_solve(self.ksp.getIterationNumber())
-        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.accepted:
-            self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
+        ended, names = self.snes.getConvergedReason(), PETSc.SNES.ConvergedReason
+        if self._iterates and (ended > 0 or ended == names.DIVERGED_LINE_SEARCH):
+            if not self._newton.convergence.accepts_last_iterate():
+                self.snes.setConvergedReason(names.DIVERGED_LINE_SEARCH)
+            elif ended < 0:
+                self.snes.setConvergedReason(names.CONVERGED_FNORM_ABS)
+                self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
             self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)

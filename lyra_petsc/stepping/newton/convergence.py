@@ -95,14 +95,18 @@ class Convergence:
         self._balanced = self._ended = self._met_tolerances = False
         self._after_correction = np.inf
 
-    @property
-    def accepted(self) -> bool:
-        """Whether this test ended the solve, or in dynamics the forces are in balance.
+    def accepts_last_iterate(self) -> bool:
+        """Whether the solve is good where this test or a line search ended it; collective.
 
-        After a failed line search PETSc reports convergence if the step is short, whatever the residual. In
-        statics balanced forces are not enough, because small forces may cause large displacements.
+        In dynamics it is where forces are in balance, or where their round-off hides a smaller energy. After a
+        failed line search PETSc reports convergence if the step is short, whatever the residual. In statics
+        balanced forces are not enough, because small forces may cause large displacements.
         """
-        return self._ended or (self._system.integrator.dynamic and self.balanced)
+        if self._ended or not self._system.integrator.dynamic:
+            return self._ended
+        self._raise_floor()
+        self.at_roundoff = self.force_tolerance() < self.norm <= self._floor
+        return self.balanced
 
     @property
     def balanced(self) -> bool:
@@ -130,8 +134,8 @@ class Convergence:
             spent = linear_iterations - self._iterations_before
             self.mean_iterations += RECENT * (spent - self.mean_iterations)
         slow = iteration > 0 and residual > STALLED * before
-        if slow and self._system.discretisation.has_near_elements:
-            self._floor = max(self._minimum_floor, contact_roundoff(self._system))
+        if slow:
+            self._raise_floor()
         self._stalled = self._stalled + 1 if slow and residual <= self._floor else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
@@ -163,6 +167,11 @@ class Convergence:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
+
+    def _raise_floor(self) -> None:
+        """Let the floor include the round-off of contact forces at the positions last evaluated; collective."""
+        if self._system.discretisation.has_near_elements:
+            self._floor = max(self._minimum_floor, contact_roundoff(self._system))
 
     def _needs_finer_solve(self, tolerance: float) -> bool:
         """Whether a solve that meets the tolerances needs one more iteration because parts may collide.
