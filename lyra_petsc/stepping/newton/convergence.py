@@ -98,8 +98,8 @@ class Convergence:
     def accepts_last_iterate(self) -> bool:
         """Whether the solve is good where this test or a line search ended it; collective.
 
-        In dynamics it is where forces are in balance, or where their round-off hides a smaller energy. After a
-        failed line search PETSc reports convergence if the step is short, whatever the residual. In statics
+        In dynamics it is where forces are in balance, or where their round-off hides a smaller energy. After
+        a failed line search PETSc reports convergence if the step is short, whatever the residual. In statics
         balanced forces are not enough, because small forces may cause large displacements.
         """
         if self._ended or not self._system.integrator.dynamic:
@@ -169,7 +169,7 @@ class Convergence:
         return None
 
     def _raise_floor(self) -> None:
-        """Let the floor include the round-off of contact forces at the positions last evaluated; collective."""
+        """Include the round-off of contact forces at the positions last evaluated in the floor; collective."""
         if self._system.discretisation.has_near_elements:
             self._floor = max(self._minimum_floor, contact_roundoff(self._system))
 
