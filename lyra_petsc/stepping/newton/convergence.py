@@ -169,7 +169,7 @@ class Convergence:
         return None
 
     def _raise_floor(self) -> None:
-        """Include the round-off of contact forces at the positions last evaluated in the floor; collective."""
+        """Include the round-off of contact at the positions last evaluated in the floor; collective."""
         if self._system.discretisation.has_near_elements:
             self._floor = max(self._minimum_floor, contact_roundoff(self._system))
 
