@@ -26,10 +26,7 @@ from lyra_petsc.stepping import term_states
 from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
 from lyra_petsc.stepping.energy_guard import EnergyGuard
-from lyra_petsc.stepping.failure.failure_advice import FailedStep, advice, contact_advice, failure_kind
-from lyra_petsc.stepping.failure.failure_diagnosis import diagnose
-from lyra_petsc.stepping.failure.failure_report import FailedAttempt, Failure
-from lyra_petsc.stepping.failure.near_pairs import nearest_obstacle, worst_pair
+from lyra_petsc.stepping.failure.failure_report import FailedAttempt, Failure, explain_failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.integrators.integrator import Integrator
 from lyra_petsc.stepping.local_error import LocalError
@@ -556,7 +553,17 @@ class SteppedScene:
                 return
         in_vain = self._equilibrium is not None and self._equilibrium.in_vain
         if in_vain or self.stepper.stopped_by or not self.control.halve_after_failure():
-            self.failure = self._explain_failure(attempt, end)
+            assert attempt.failed_solve is not None
+            self.failure = explain_failure(
+                self.problem,
+                self.scene,
+                self.stepper,
+                attempt.failed_solve,
+                self._failed_attempts,
+                step=self.step_number + 1,
+                time=self.time,
+                iterations_key=self._iterations_key,
+            )
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
         why = attempt.message or "no solution was found"
         solve = attempt.failed_solve
@@ -585,47 +592,6 @@ class SteppedScene:
             return note
         planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
         return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
-
-    def _explain_failure(self, attempt: Attempt, end: float) -> Failure:
-        """Report on the last failed attempt at a step; collective."""
-        problem, scene, solve = self.problem, self.scene, attempt.failed_solve
-        assert solve is not None
-        system, whole, stepper = problem.system, problem.whole, self.stepper
-        diagnosis = diagnose(
-            problem.points, problem.membrane, system.held, solve, system.x, system.mass, problem.tags
-        )
-        near = worst_pair(system)
-        between_sheets = near is not None and not near.obstacle
-        on_contact = [contact_advice(near, scene)] if near is not None and near.blocks else []
-        step_data = FailedStep(
-            dt=end - self.time,
-            nominal=self.control.step,
-            spacing=whole.spacing,
-            floor=self.roundoff,
-            max_iterations=stepper.snes.getTolerances()[3],
-            iterations_key=self._iterations_key,
-            linear_iterations=stepper.ksp.getTolerances()[3],
-            preconditioner=stepper.ksp.getPC().getType(),
-            ranks=self.comm.size,
-        )
-        return Failure(
-            step=self.step_number + 1,
-            time=self.time,
-            dt=step_data.dt,
-            static=not system.integrator.dynamic,
-            kind=failure_kind(diagnosis, solve),
-            attempts=self._failed_attempts,
-            diagnosis=diagnosis,
-            advice=[
-                *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
-                # contact forces grow without bounds where parts would cross, so other advice would mislead
-                *(on_contact or advice(diagnosis, solve, scene, step_data)),
-            ],
-            sources=whole.sources,
-            failed_solve=solve,
-            near=near,
-            obstacle=nearest_obstacle(system) if between_sheets else None,
-        )
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint besides positions and velocities; collective.

@@ -27,10 +27,7 @@ def test_a_failed_run_ends_with_a_message_and_keeps_the_last_state(tmp_path: Pat
     lines = left.err.splitlines()
     details = lines[lines.index(line) + 1 :]
     assert details[0].startswith("  residual [N] by iteration (linear iterations): ")
-    assert [words.split()[0] for words in details if words.startswith(("  vertex", "  triangle"))] == [
-        "vertex",
-        "triangle",
-    ]
+    assert sum(words.startswith("  vertex") for words in details) == 1
     assert "  look at out/failure.xdmf (ParaView) and out/failure.txt" in details
     summary = read_json(tmp_path / "out/summary.json")
     assert summary["outcome"] == line.removeprefix("lyra-petsc: ")
@@ -39,7 +36,6 @@ def test_a_failed_run_ends_with_a_message_and_keeps_the_last_state(tmp_path: Pat
     assert failure["attempts"][-1]["dt"] == pytest.approx(0.04 / 2**12)
     assert failure["step"] == summary["steps"] + 1
     assert f"worst at vertex {failure['vertex']['number']} around" in line
-    assert f"and triangle {failure['triangle']['number']};" in line
     text = (tmp_path / "out/failure.txt").read_text()
     assert text.startswith(summary["outcome"] + "\n")
     assert text.count("Newton and") == len(failure["attempts"])

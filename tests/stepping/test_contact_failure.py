@@ -49,8 +49,7 @@ def test_the_obstacle_that_blocks_a_sheet_is_named(comm: MPI.Comm) -> None:
     assert 0.0 < failure.near.gap < 1e-3
     assert f"{failure.near.text} {failure.near.gap:.3g} m apart" in text
     assert f"and the obstacle '{failure.near.obstacle}', around (" in text
-    assert "try more space for the sheet, which is squeezed: change obstacles.plate.motion" in text
-    assert len(failure.advice) == 1  # no number is absurd where there is no room
+    assert "try more space for the sheet: other or slower motions of obstacles and handles" in text
     assert failure.content()["near"]["obstacle"] == failure.near.obstacle
     assert simulation.energy_balance.columns()["smallest_gap"] > 0.0
     simulation.destroy()

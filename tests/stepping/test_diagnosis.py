@@ -74,39 +74,34 @@ def pushed(vertex: int, value: float) -> Spoil:
     return spoil
 
 
-def test_the_vertex_and_triangle_with_the_largest_residual_are_named(comm: MPI.Comm) -> None:
+def test_the_vertex_with_the_largest_residual_is_named(comm: MPI.Comm) -> None:
     with failing(comm, {}, pushed(17, 1e6)) as (simulation, error, failure):
         assert error.collective
-        vertex, triangle = failure.diagnosis.vertex, failure.diagnosis.triangle
+        vertex = failure.diagnosis.vertex
         assert vertex.number == 17
         mesh = simulation.problem.mesh
-        stored = comm.bcast((mesh.positions, mesh.triangles) if mesh is not None else None)
-        assert vertex.before == pytest.approx(stored[0][17])
-        # all triangles around it are as bad: the smallest number is named
-        around = np.flatnonzero((stored[1] == 17).any(axis=1))
-        assert len(around) > 1
-        assert triangle.number == around.min()
-        assert list(triangle.vertices) == stored[1][triangle.number].tolist()
-        assert f"vertex 17 around ({stored[0][17][0]:.4g}, {stored[0][17][1]:.4g}, 0) m" in str(error)
-        assert f"triangle {triangle.number};" in str(error)
+        place = comm.bcast(mesh.positions[17] if mesh is not None else None)
+        assert vertex.before == pytest.approx(place)
+        assert f"worst at vertex 17 around ({place[0]:.4g}, {place[1]:.4g}, 0) m, mostly " in str(error)
+        assert 1 < len(failure.advice) <= 3
         assert comm.allgather(str(error)) == [str(error)] * comm.size
         assert comm.allgather(error.details) == [error.details] * comm.size
 
 
 def test_an_overflow_on_one_rank_is_detected_on_all(comm: MPI.Comm) -> None:
     with failing(comm, {}, pushed(23, np.nan)) as (_, error, failure):
-        assert failure.kind == "overflow"
+        assert failure.diagnosis.kind == "overflow"
         assert failure.diagnosis.not_finite == 1
         assert failure.diagnosis.vertex.number == 23
         assert "overflow" in str(error)
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-def test_an_overflow_names_the_key_of_its_cause(comm: MPI.Comm) -> None:
+def test_an_overflow_names_the_force_of_its_cause(comm: MPI.Comm) -> None:
     with failing(comm, {"gravity": [0, 0, -1e200]}) as (_, error, failure):
-        assert failure.kind == "overflow"
+        assert failure.diagnosis.kind == "overflow"
         assert failure.diagnosis.overflowing == ["loads"]
-        assert "or has the wrong unit: in gravity and loads" in str(error)
+        assert "or has the wrong unit (overflow in: loads)" in str(error)
 
 
 def test_the_worst_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
@@ -114,16 +109,14 @@ def test_the_worst_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     with failing(MPI.COMM_SELF, scene) as (_, _, alone):
         pass
     with failing(comm, scene) as (simulation, error, together):
-        for one, other in ((alone.diagnosis.vertex, together.diagnosis.vertex),
-                           (alone.diagnosis.triangle, together.diagnosis.triangle)):  # fmt: skip
-            assert one.number == other.number
+        assert alone.diagnosis.vertex.number == together.diagnosis.vertex.number
         residual = gathered(simulation.problem.points, together.failed_solve.residual)
         residual[[0, 5]] = 0.0
         sizes = np.linalg.norm(residual, axis=1)
         assert together.diagnosis.vertex.number == sizes.argmax()
         assert together.diagnosis.norm == pytest.approx(np.linalg.norm(residual))
         assert together.diagnosis.norm == pytest.approx(alone.diagnosis.norm, rel=1e-5)
-        assert together.kind == "nonlinear trouble"
+        assert together.diagnosis.kind == "nonlinear trouble"
         norms = [each.residual for each in together.failed_solve.iterations]
         assert len(norms) == 4
         assert norms[-1] == pytest.approx(together.diagnosis.norm)
@@ -142,28 +135,15 @@ def test_earlier_attempts_are_reported(comm: MPI.Comm) -> None:
         assert "-ts_adapt_dt_min below 0.005" in " ".join(error.details)
 
 
-def test_a_handle_that_jumps_is_named(comm: MPI.Comm) -> None:
-    scene = {
-        "handles": [{"nodes": [0]}, {"nodes": [5, 29], "motion": "jump"}],
-        "motions": {"jump": [{"time": 0.0}, {"time": 1e-3, "translate": [3.0, 0, 0]}]},
-        "solver": {"max_iterations": 2},
-    }
-    with failing(comm, scene) as (_, error, failure):
-        assert failure.diagnosis.handle == 1
-        assert failure.diagnosis.jump == pytest.approx(3.0)
-        message = " ".join([str(error), *error.details])
-        assert "try more time for motions.jump (handles[1] moves 3 m in this step" in message
-
-
 def test_a_linear_failure_is_distinguished(comm: MPI.Comm) -> None:
     scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}, "material": STIFF}
     iterative = ONE_ATTEMPT | {"pc_type": "jacobi", "ksp_max_it": "2"}
     with failing(comm, scene, petsc=iterative) as (_, error, failure):
-        assert failure.kind == "linear trouble"
+        assert failure.diagnosis.kind == "linear trouble"
         assert "the linear solve failed: too many linear iterations (linear trouble)" in str(error)
-        assert "try -ksp_max_it above 2" in str(error)
+        assert "try a direct solver: -pc_type lu" in str(error)
         assert "in 2 iterations" in error.details[0]
-        assert "a direct solver" in " ".join(error.details)
+        assert "or try -ksp_max_it above 2" in error.details
 
 
 def test_a_velocity_that_is_not_finite_stops_the_run_with_a_message(comm: MPI.Comm) -> None:
@@ -172,7 +152,7 @@ def test_a_velocity_that_is_not_finite_stops_the_run_with_a_message(comm: MPI.Co
 
     scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}}
     with failing(comm, scene, lost) as (_, error, failure):
-        assert failure.kind == "overflow"
+        assert failure.diagnosis.kind == "overflow"
         assert "overflow" in str(error)
 
 
@@ -182,7 +162,7 @@ def test_a_failed_load_step(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> 
         assert "(load factor 0) did not converge even with an increment of" in str(error)
         assert "no equilibrium within 2 proximal steps" in str(error)
         assert len(failure.failed_solve.iterations) == 3  # before the first proximal step and after each
-        assert failure.failed_solve.time == pytest.approx(failure.dt)
+        assert failure.failed_solve.time == pytest.approx(failure.attempts[-1].dt)
         force = failure.failed_solve.residual
         assert np.sqrt(comm.allreduce(float(np.vdot(force, force)))) == pytest.approx(failure.diagnosis.norm)
         # the state is the one before the load step, the iterate another
@@ -209,14 +189,11 @@ def test_vertices_are_named_by_the_numbers_of_their_files(comm: MPI.Comm, shared
     left = {"file": str(shared_tmp / "two.msh")}
     with failing(comm, {"mesh": left, "handles": [{"nodes": [0]}]}, pushed(3, 1e6)) as (_, error, failure):
         assert failure.diagnosis.vertex.tag == 31
-        assert "vertex 3 (node 31 of two.msh) around (1, 1, 0) m and triangle 1;" in str(error)
+        assert "vertex 3 (node 31 of two.msh) around (1, 1, 0) m," in str(error)
     right = {"name": "right", **grid(1.0, 1.0, 2, 2), "transform": {"translate": [4, 0, 0]}}
     mesh = [left, right]
     with failing(comm, {"mesh": mesh, "handles": [{"nodes": [0, 4]}]}, pushed(12, 1e6)) as (_, error, _):
         assert "vertex 12 (vertex 8 of right) around (5, 1, 0) m" in str(error)
-        assert "triangle 8 (triangle 6 of right)" in str(error) or "triangle 9 (triangle 7 of right)" in str(
-            error
-        )
     with failing(comm, {"mesh": mesh, "handles": [{"nodes": [0, 4]}]}, pushed(2, 1e6)) as (_, error, _):
         assert "vertex 2 (node 30 of two.msh) around (0, 1, 0) m" in str(error)
 

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.mesh.mesh import Source
-from lyra_petsc.stepping.failure.failure_diagnosis import Diagnosis
-from lyra_petsc.stepping.failure.near_pairs import NearPair
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.failure.failure_diagnosis import SNES, Diagnosis, diagnose
+from lyra_petsc.stepping.failure.near_pairs import NearPair, nearest_obstacle, worst_pair
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
-from lyra_petsc.stepping.stepper import Attempt
+from lyra_petsc.stepping.problem import Problem
+from lyra_petsc.stepping.stepper import Attempt, Stepper
 
 MAX_SHOWN = 8
 """Largest number of iterations, or of attempts, that the few lines show without abridging them."""
@@ -59,15 +61,14 @@ class Failure:
     ----------
     step : int
         Number of the step, from 1.
-    time, dt : float
-        Start and length [s] of the last attempt; load factors in a static analysis.
+    time : float
+        Start [s] of the step; the load factor in a static analysis.
     static : bool
-    kind : str
-        ``overflow``, ``linear trouble`` or ``nonlinear trouble``.
     attempts : list of FailedAttempt
         All attempts at this step, in order.
     diagnosis : Diagnosis
     advice : list of str
+        General remedies, the most promising first.
     sources : list of Source
         Sources of the mesh.
     failed_solve : FailedSolve
@@ -80,9 +81,7 @@ class Failure:
 
     step: int
     time: float
-    dt: float
     static: bool
-    kind: str
     attempts: list[FailedAttempt]
     diagnosis: Diagnosis
     advice: list[str]
@@ -92,134 +91,186 @@ class Failure:
     obstacle: NearPair | None = None
 
     @property
-    def start(self) -> str:
-        """Text for the time or load factor at the start of the step."""
-        return f"load factor {self.time:g}" if self.static else f"t = {self.time:g} s"
-
-    @property
     def sentence(self) -> str:
         """One line: what failed, where, and the first advice."""
-        last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
-        near = f": {_pair_text(self.near)}" if self.near is not None and self.near.blocks else ""
-        what = f"{self.attempts[-1].words}{near}"
+        start = f"load factor {self.time:g}" if self.static else f"t = {self.time:g} s"
+        last = self.attempts[-1]
+        cause = last.words
+        if near := self.near is not None and self.near.blocks:
+            cause += f": {_pair_text(self.near)}"
         if self.failed_solve.iterations or not near:
-            what += (
-                f" ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
-                f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
-                f"and {self._triangle()}"
+            vertex = self.diagnosis.vertex
+            cause += (
+                f" ({self.diagnosis.kind}); last residual {self.diagnosis.norm:.3g} N, worst at "
+                f"{self._vertex()} around {_point(vertex.before, 4)} m, mostly {vertex.largest_force}"
             )
         return (
-            f"step {self.step} ({self.start}) did not converge even with {last}: {what}; "
-            f"the state at {self.start} is kept; try {self.advice[0]}"
+            f"step {self.step} ({start}) did not converge even with {self._length(last)}: {cause}; "
+            f"the state at {start} is kept; try {self.advice[0]}"
         )
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Short lines with the iterations, the worst vertex and triangle, and further advice."""
-        history = ", ".join(_shortened([_iteration_text(each) for each in self.failed_solve.iterations]))
-        found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
-        found += [line for line in (self._linear(), self._earlier()) if line]
-        found += self._worst_elements()
-        return (*found, *(f"or try {change}" for change in self.advice[1:4]))
+        """Short lines with the iterations, the worst vertex, the nearest pair, and further advice."""
+        iterations = [_iteration_text(each) for each in self.failed_solve.iterations]
+        earlier = [
+            f"{one.dt:.3g}: {one.residual:.3g} ({one.newton_iterations})" for one in self.attempts[:-1]
+        ]
+        length = "increment" if self.static else "Δt [s]"
+        norms = self._linear_residuals
+        linear = [f"{norm:.3g}" for norm in norms[:: max(1, len(norms) - 1)]]
+        titled = (
+            ("residual [N] by iteration (linear iterations)", ", ".join(_shortened(iterations))),
+            (f"residual [N] of the last linear solve in {len(norms) - 1} iterations", " → ".join(linear)),
+            (f"attempts before, {length}: residual [N] (Newton iterations)", ", ".join(_shortened(earlier))),
+        )
+        history = [f"{title}: {text}" for title, text in titled if text]
+        return (*history, *self._places(), *(f"or try {change}" for change in self.advice[1:]))
 
     @property
     def text(self) -> str:
         """The whole report, for a file."""
         rows = [self.sentence, "", "Attempts at this step:"]
-        rows += [f"  {self._attempt(each)}: {each.words}" for each in self.attempts]
+        rows += [
+            f"  {self._length(each)} ({each.solver}): {each.newton_iterations} Newton and "
+            f"{each.linear_iterations} linear iterations, residual {each.residual:.3g} N: {each.words}"
+            for each in self.attempts
+        ]
         rows += ["", "The last attempt, Newton iteration by iteration:"]
         rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}    fraction"]
         for number, each in enumerate(self.failed_solve.iterations):
             part = "" if each.taken is None else f"{each.taken:.3g}"
             linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
             rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
-        rows += ["", "Where (vertices and triangles are counted from 0, in file order):"]
-        rows += [f"  {line}" for line in self._worst_elements()]
+        rows += ["", "Where (vertices are counted from 0, in file order):"]
+        rows += [f"  {line}" for line in self._places()]
         rows += ["", "What to try:", *(f"  {change}" for change in self.advice)]
-        if self._linear():
+        if self._linear_residuals:
             rows += ["", "The last linear solve, residual norm by iteration:"]
-            norms = self.failed_solve.linear_residuals
-            rows += [f"  {number:4d}  {norm:12.5e}" for number, norm in enumerate(norms)]
+            rows += [f"  {number:4d}  {norm:12.5e}" for number, norm in enumerate(self._linear_residuals)]
         return "\n".join(rows) + "\n"
 
     def content(self) -> dict[str, Any]:
         """Entries of summary.json."""
+        pairs = {"near": self.near, "obstacle": self.obstacle}
         return {
             "step": self.step,
             "load_factor" if self.static else "time": self.time,
-            "kind": self.kind,
             "attempts": [asdict(each) for each in self.attempts],
             "iterations": [asdict(each) for each in self.failed_solve.iterations],
             **asdict(self.diagnosis),
-            **({} if self.near is None else {"near": asdict(self.near)}),
-            **({} if self.obstacle is None else {"obstacle": asdict(self.obstacle)}),
+            **{name: asdict(pair) for name, pair in pairs.items() if pair is not None},
             "advice": self.advice,
         }
 
-    # -- pieces ----------------------------------------------------------------------------------------
+    def _length(self, attempt: FailedAttempt) -> str:
+        return f"an increment of {attempt.dt:.3g}" if self.static else f"Δt = {attempt.dt:.3g} s"
 
-    def _attempt(self, attempt: FailedAttempt) -> str:
-        length = f"increment {attempt.dt:.3g}" if self.static else f"Δt {attempt.dt:.3g} s"
-        return (
-            f"{length} ({attempt.solver}): {attempt.newton_iterations} Newton and "
-            f"{attempt.linear_iterations} linear iterations, residual {attempt.residual:.3g} N"
-        )
-
-    def _earlier(self) -> str:
-        """A line on the attempts before the last one; empty if there was only one."""
-        each = [
-            f"{attempt.dt:.3g}: {attempt.residual:.3g} ({attempt.newton_iterations})"
-            for attempt in self.attempts[:-1]
-        ]
-        step = "increment" if self.static else "Δt [s]"
-        shown = ", ".join(_shortened(each))
-        return f"attempts before, {step}: residual [N] (Newton iterations): {shown}" if each else ""
-
-    def _linear(self) -> str:
-        """A line on the last linear solve; empty unless it is the cause."""
+    @property
+    def _linear_residuals(self) -> list[float]:
+        """Residuals of the last linear solve; empty unless it is the cause."""
         norms = self.failed_solve.linear_residuals
-        if self.kind != "linear trouble" or len(norms) < 2:
-            return ""
-        return f"last linear solve: residual {norms[0]:.3g} → {norms[-1]:.3g} in {len(norms) - 1} iterations"
+        return norms.tolist() if self.diagnosis.kind == "linear trouble" and len(norms) > 1 else []
 
-    def _worst_elements(self) -> list[str]:
-        """Lines on the worst vertex and triangle, and on the nearest pair."""
-        vertex, triangle = self.diagnosis.vertex, self.diagnosis.triangle
+    def _places(self) -> list[str]:
+        """Lines on the nearest pair and the worst vertex."""
+        vertex, many = self.diagnosis.vertex, self.diagnosis.not_finite
         forces = ", ".join(f"{name} {size:.3g}" for name, size in vertex.forces.items())
-        size = math.hypot(*vertex.residual)
-        many = self.diagnosis.not_finite
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),
             *([f"nearest or colliding: {_pair_text(self.near)}"] if self.near is not None else []),
             *([f"nearest obstacle: {_pair_text(self.obstacle)}"] if self.obstacle is not None else []),
             f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
-            f"residual {size:.3g} N of forces [N] {forces}",
-            f"{self._triangle()} of vertices {', '.join(map(str, triangle.vertices))} around "
-            f"{_point(triangle.centre)} m: stretched to {triangle.stretches[0]:.3g} and "
-            f"{triangle.stretches[1]:.3g}, aspect ratio at rest {triangle.aspect:.3g}",
+            f"residual {math.hypot(*vertex.residual):.3g} N of forces [N] {forces}",
         ]
 
     def _vertex(self) -> str:
-        vertex = self.diagnosis.vertex
-        label, number = self._within(vertex.number, [each.n_vertices for each in self.sources])
-        labels = [f"node {vertex.tag}"] if vertex.tag else []
-        labels += [f"vertex {number}"] if len(self.sources) > 1 and not vertex.tag else []
-        more = f" ({labels[0]} of {label})" if labels else ""
-        return f"vertex {vertex.number}{more}"
+        """The worst vertex, by its number in the mesh and in its file."""
+        number, tag = self.diagnosis.vertex.number, self.diagnosis.vertex.tag
+        ends = np.cumsum([source.n_vertices for source in self.sources])
+        source = self.sources[int(np.searchsorted(ends, number, side="right"))]
+        first = int(ends[self.sources.index(source)]) - source.n_vertices
+        if tag:
+            return f"vertex {number} (node {tag} of {source.label})"
+        return f"vertex {number}" + (
+            f" (vertex {number - first} of {source.label})" if len(self.sources) > 1 else ""
+        )
 
-    def _triangle(self) -> str:
-        whole = self.diagnosis.triangle.number
-        label, number = self._within(whole, [each.n_triangles for each in self.sources])
-        return f"triangle {whole}" + (f" (triangle {number} of {label})" if len(self.sources) > 1 else "")
 
-    def _within(self, number: int, counts: Sequence[int]) -> tuple[str, int]:
-        """The mesh source of a vertex or triangle, and its number in this source.
+def explain_failure(
+    problem: Problem,
+    scene: Scene,
+    stepper: Stepper,
+    solve: FailedSolve,
+    attempts: list[FailedAttempt],
+    *,
+    step: int,
+    time: float,
+    iterations_key: str,
+) -> Failure:
+    """Report on the last failed attempt at a step; collective.
 
-        ``counts`` are the numbers of vertices or triangles of the sources.
-        """
-        ends = np.cumsum(counts)
-        which = int(np.searchsorted(ends, number, side="right"))
-        return self.sources[which].label, number - int(ends[which] - counts[which])
+    Parameters
+    ----------
+    problem : Problem
+        In the state before the step.
+    scene : Scene
+    stepper : Stepper
+    solve : FailedSolve
+        Of the last attempt.
+    attempts : list of FailedAttempt
+        All attempts at this step.
+    step : int
+        Number of the step, from 1.
+    time : float
+        Start [s] of the step; the load factor in a static analysis.
+    iterations_key : str
+        Key or option that limits Newton's iterations.
+    """
+    system = problem.system
+    diagnosis = diagnose(problem.points, solve, system.x, problem.tags)
+    near = worst_pair(system)
+    static, kind = not system.integrator.dynamic, diagnosis.kind
+    shorter = (
+        "a smaller time.step (first increment of the load), or a damped motion instead"
+        if static
+        else f"a smaller time.step, or -ts_adapt_dt_min below {attempts[-1].dt:.3g}"
+    )
+    advice = [f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []
+    if near is not None and near.blocks:
+        # contact forces grow without bounds where parts would cross, so other advice would mislead
+        advice += [
+            "more space for the sheet: other or slower motions of obstacles and handles",
+            "smaller loads or initial velocities, or a larger contact.gap",
+            f"{shorter}; time.integrator: beuler is the most robust at impacts",
+        ]
+    elif kind == "overflow":
+        parts = f" (overflow in: {', '.join(diagnosis.overflowing)})" if diagnosis.overflowing else ""
+        advice += [f"smaller numbers where one is absurd, or has the wrong unit{parts}"]
+        advice += ["another mesh.transform.scale, if the mesh is not in metres", shorter]
+    elif static and not scene.handles:
+        advice += ["handles (nothing holds the sheet)"]
+    elif kind == "linear trouble":
+        package = " -pc_factor_mat_solver_type mumps" if problem.points.comm.size > 1 else ""
+        advice += [f"a direct solver: -pc_type lu{package}, with -pc_factor_shift_type positive_definite"]
+        advice += [f"-ksp_max_it above {stepper.ksp.getTolerances()[3]}", "solver.hessian: regularised"]
+    else:
+        if solve.snes_reason == SNES.DIVERGED_MAX_IT:
+            advice += [f"{iterations_key} above {stepper.snes.getTolerances()[3]}"]
+        advice += [shorter, "more material.damping, gentler motions and loads, or a finer mesh"]
+        advice += ["a larger solver.force_tolerance, if the residual is small compared with the forces"]
+    return Failure(
+        step=step,
+        time=time,
+        static=static,
+        attempts=attempts,
+        diagnosis=diagnosis,
+        advice=advice[:3],
+        sources=problem.whole.sources,
+        failed_solve=solve,
+        near=near,
+        obstacle=nearest_obstacle(system) if near is not None and not near.obstacle else None,
+    )
 
 
 def _pair_text(near: NearPair) -> str:

@@ -57,8 +57,6 @@ class FailedSolve:
         The parts [N] whose sum is the residual.
     prescribed : (n_owned, 3) bool
         Unknowns that handles prescribe.
-    goal : (n_owned, 3)
-        Prescribed positions [m] at the end of the step, elsewhere the positions before the step.
     snes_reason, ksp_reason : int
     linear_residuals : (n,)
         Residual norms of the last linear solve [N], where KSP kept them.
@@ -72,14 +70,13 @@ class FailedSolve:
     residual: Array
     forces: dict[str, Array]
     prescribed: NDArray[np.bool_]
-    goal: Array
     snes_reason: int
     ksp_reason: int
     linear_residuals: Array
 
     def of_vertices(self, n: int) -> FailedSolve:
         """The same without the rows of edges, for n owned vertices."""
-        rows = ("velocity", "position", "residual", "prescribed", "goal")
+        rows = ("velocity", "position", "residual", "prescribed")
         forces = {name: part[:n] for name, part in self.forces.items()}
         return replace(self, forces=forces, **{name: getattr(self, name)[:n] for name in rows})
 
@@ -136,11 +133,8 @@ class Trace:
         residual = np.empty((n, 3))
         system.residual(velocity, stage.sigma * (velocity - system.history), residual)
         position = (system.x[:n] if stage.x is None else stage.x) + stage.c * velocity
-        goal = system.x[:n].copy()
-        if system.held:
-            if system.integrator.handles_at_stage:
-                system.prescribed.targets(system.t0, system.t1, system.t0 + stage.offset, position)
-            system.prescribed.targets(system.t0, system.t1, system.t1, goal)
+        if system.held and system.integrator.handles_at_stage:
+            system.prescribed.targets(system.t0, system.t1, system.t0 + stage.offset, position)
         square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
         return FailedSolve(
             tuple(self._iterations),
@@ -151,7 +145,6 @@ class Trace:
             residual,
             dict(system.forces_at_stage()),
             system.prescribed.mask[:n].copy(),
-            goal,
             int(self._snes.getConvergedReason()),
             int(self._ksp.getConvergedReason()),
             np.array(self._ksp.getConvergenceHistory()),

@@ -506,9 +506,6 @@ class Equilibrium:
         system, n = self._system, self._system.points.n_owned
         system.begin_step(before, factor)
         force = system.out_of_balance()
-        goal = x.copy()
-        if system.held:
-            system.prescribed.targets(before, factor, factor, goal)
         return FailedSolve(
             iterations=tuple(progress.history),
             norm=self._norm(force),
@@ -518,7 +515,6 @@ class Equilibrium:
             residual=-force,
             forces={"loads": -system.applied.force, "internal": system.applied.force - force},
             prescribed=system.prescribed.mask[:n].copy(),
-            goal=goal,
             snes_reason=0,
             ksp_reason=0,
             linear_residuals=np.empty(0),
