@@ -27,8 +27,7 @@ def load(
     changes : mapping of ``key.path`` to value, optional
         As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
     trust_mesh : bool
-        Give gmsh this scene's scripts (.geo) whatever they say; else those that do more than describe a mesh
-        are refused.
+        Let this scene's scripts (.geo) read any file, and run where there is no seccomp.
 
     Returns
     -------

@@ -79,7 +79,7 @@ class Simulation:
     comm : MPI.Comm, optional
         Default COMM_WORLD.
     trust_mesh : bool
-        Give gmsh this scene's scripts (.geo) whatever they say.
+        Let this scene's scripts (.geo) read any file, and run where there is no seccomp.
 
     Attributes
     ----------

@@ -118,7 +118,7 @@ settings = click.option(
 trust_mesh = click.option(
     "--trust-mesh",
     is_flag=True,
-    help="Pass mesh scripts (.geo) to gmsh unchecked, if you trust them.",
+    help="Let mesh scripts (.geo) read any file, and run without seccomp, if you trust them.",
 )
 results = click.argument("run", type=click.Path(path_type=Path))
 out = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")

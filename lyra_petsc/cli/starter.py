@@ -49,7 +49,7 @@ def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_
     file : Path or None
         A mesh file; None for a grid.
     trust_mesh : bool
-        Give gmsh the script whatever it says.
+        Let the script read any file, and run where there is no seccomp.
 
     Raises
     ------

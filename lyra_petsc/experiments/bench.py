@@ -173,7 +173,7 @@ class Bench:
     direct : bool
         Default to a direct linear solver and tight tolerances; otherwise scenes run as a user's do.
     trust_mesh : bool
-        Pass the scenes' scripts to gmsh unchecked.
+        ``--trust-mesh``.
 
     Attributes
     ----------

@@ -324,7 +324,7 @@ def build_mesh(
     file : optional
         The scene file, for messages about keys.
     trust_scripts : bool
-        Give scripts to gmsh unchecked.
+        As ``trusted`` of `library_file.read_by_library`.
     report : callable, optional
         Called with a line of progress at intervals while gmsh works.
 
@@ -379,11 +379,9 @@ def _read(source: MeshSource, trust_scripts: bool, report: Callable[[str], None]
         from lyra_petsc.mesh.obj_file import read_obj
 
         return read_obj(source.file)
-    from lyra_petsc.mesh.library_file import mesh_geo, read_library_file
+    from lyra_petsc.mesh.library_file import read_by_library
 
-    if suffix != ".geo":
-        return read_library_file(source.file, report)
-    return mesh_geo(
+    return read_by_library(
         source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, report=report
     )
 

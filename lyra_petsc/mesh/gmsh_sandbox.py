@@ -1,11 +1,11 @@
 """Sandbox of the process in which gmsh and other libraries read meshes: seccomp (by libseccomp) and Landlock
 of the Linux kernel, through ctypes.
 
-The process enters the sandbox once the library is loaded, and cannot leave it. It can then start
-no program and no process, open no socket, and create, change or remove no file; it can write to files that
-are open. With Landlock it can read only the files it needs. Users rely on the list of allowed statements
-(`geo_script`); the sandbox is a second layer against gaps in this list. Where the kernel permits neither, or
-without libseccomp (part of systemd and of Debian's apt), the respective layer is missing.
+The process enters the sandbox once the library is loaded, and cannot leave it. An attempt to start a program
+or a process then ends it (SIGSYS). It can open no socket, and create, change or remove no file; it can write
+to files that are open. With Landlock it can read only the files it needs. A mesh script is a program, and
+this is all that confines it. Where the kernel permits neither, or without libseccomp (part of systemd and of
+Debian's apt), the respective layer is missing.
 
 Sources: seccomp_init(3), seccomp_rule_add(3), landlock(7).
 """
@@ -37,16 +37,18 @@ _DIFFERS, _MASKED = 1, 7
 
 _REFUSED_CALLS = """
     accept accept4 acct add_key adjtimex bind bpf chmod chown chroot clock_adjtime clock_settime connect
-    creat delete_module execve execveat fallocate fanotify_init fchmod fchmodat fchown fchownat
-    finit_module fork fremovexattr fsetxattr ftruncate futimesat init_module io_setup io_submit ioperm
+    creat delete_module fallocate fanotify_init fchmod fchmodat fchown fchownat
+    finit_module fremovexattr fsetxattr ftruncate futimesat init_module io_setup io_submit ioperm
     iopl kcmp kexec_file_load kexec_load keyctl lchown link linkat listen lremovexattr lsetxattr
     memfd_create mkdir mkdirat mknod mknodat modify_ldt mount mq_open msgget name_to_handle_at
     open_by_handle_at perf_event_open personality pivot_root process_vm_readv process_vm_writev ptrace
     quotactl reboot removexattr rename renameat renameat2 request_key rmdir rt_sigqueueinfo
     rt_tgsigqueueinfo seccomp semget setdomainname sethostname setns settimeofday setxattr shmat shmget
     socket socketpair swapoff swapon symlink symlinkat syslog tkill truncate umount2 unlink unlinkat
-    unshare userfaultfd utime utimensat utimes vfork
+    unshare userfaultfd utime utimensat utimes
 """
+
+_STARTING_CALLS = ("execve", "execveat", "fork", "vfork")
 
 # calls that an older libseccomp does not know; since Linux 5.0 new calls have one number on all machines
 _NEW_CALLS = {
@@ -86,13 +88,13 @@ class _Beneath(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def enter_sandbox(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
+def enter_sandbox(readable: Iterable[str | os.PathLike[str]]) -> list[str]:
     """Drop all rights that gmsh does not need, for all threads of this process, irrevocably.
 
     Parameters
     ----------
-    readable : iterable of path, or None
-        Files and folders that can be read, where the kernel has Landlock; None: all.
+    readable : iterable of path
+        Files and folders that can be read, where the kernel has Landlock.
 
     Returns
     -------
@@ -104,21 +106,22 @@ def enter_sandbox(readable: Iterable[str | os.PathLike[str]] | None) -> list[str
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_NO_NEW_PRIVS, *map(ctypes.c_ulong, (1, 0, 0, 0))) != 0:
         return []
-    layers = ["seccomp"] if _load_seccomp() else []
-    return layers + (["Landlock"] if _load_landlock(libc, ["/"] if readable is None else readable) else [])
+    loaded = {"seccomp": _load_seccomp(), "Landlock": _load_landlock(libc, readable)}
+    return [layer for layer, is_loaded in loaded.items() if is_loaded]
 
 
 def describe_sandbox(layers: Sequence[str], *, trusted: bool = False) -> str:
-    """Text for the user on how gmsh is sandboxed."""
-    first = "scripts are not checked" if trusted else "scripts are checked against a list of statements"
-    second = f"{' and '.join(layers)} in gmsh's process" if layers else "the kernel permits no sandbox"
-    return f"{first}; {second}"
+    """Text for the user on what confines mesh scripts (.geo)."""
+    if "seccomp" not in layers:
+        return "none, as there is no seccomp" + ("" if trusted else ": scripts (.geo) need --trust-mesh")
+    reads = "any file" if trusted or "Landlock" not in layers else "their folder"
+    return f"{' and '.join(layers)}: scripts start no programs, write no files, and read {reads}"
 
 
 @cache
 def supported_layers() -> list[str]:
     """Layers of the sandbox that this system supports, determined in a child process."""
-    code = "import json, lyra_petsc.mesh.gmsh_sandbox as s; print(json.dumps(s.enter_sandbox(None)))"
+    code = "import json, lyra_petsc.mesh.gmsh_sandbox as s; print(json.dumps(s.enter_sandbox(['/'])))"
     try:
         done = subprocess.run(
             python_command(code),
@@ -160,7 +163,8 @@ def _load_seccomp() -> bool:
         library.seccomp_attr_set(rules, _ALL_THREADS, 1) == 0,
         *(answer(_REFUSE, name) for name in (*_REFUSED_CALLS.split(), *_NEW_CALLS)),
         *(answer(_UNKNOWN, name) for name in _UNKNOWN_CALLS),
-        answer(_REFUSE, "clone", 0, _MASKED, CLONE_THREAD, 0),  # threads remain allowed
+        *(answer(_KILL, name) for name in _STARTING_CALLS),
+        answer(_KILL, "clone", 0, _MASKED, CLONE_THREAD, 0),  # threads remain allowed
         # the kernel uses the lower 32 bits of this argument
         *(answer(_REFUSE, "ioctl", 1, _MASKED, 2**32 - 1, request) for request in (TIOCSTI, TIOCLINUX)),
         *(answer(_REFUSE, name, 0, _DIFFERS, os.getpid()) for name in ("kill", "tgkill")),  # abort needs them

@@ -1,5 +1,5 @@
-"""Meshes by libraries in a child process: gmsh meshes scripts (.geo), which `geo_script` checks before;
-meshio, VTK and gmsh read formats of other programs.
+"""Meshes by libraries in a guarded child process (`library_process`): gmsh meshes scripts (.geo); meshio, VTK
+and gmsh read formats of other programs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import numpy as np
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
-from lyra_petsc.mesh.geo_script import check_script
 from lyra_petsc.mesh.library_formats import LIBRARIES, usual_spelling
 from lyra_petsc.mesh.mesh import Sheet
 from lyra_petsc.mesh.msh_file import ElementBlock, MshError, NoTrianglesError, assemble_sheet, element_type
@@ -31,8 +30,8 @@ from lyra_petsc.startup import module_command
 # beyond this ratio of the mean edge to the requested size a note says that the script sets its own sizes
 _SIZE_RATIO = 1.6
 
-SCRIPT_SECONDS = 60
-"""Limit on the CPU time until gmsh begins to mesh, for scripts that loop for ever."""
+READ_SECONDS = 60
+"""Limit on the CPU time of reading a file, for scripts that loop for ever."""
 
 READ_RATE = 100_000
 """Bytes of other formats for each of which the time to read them may be a second longer."""
@@ -48,14 +47,14 @@ MAX_INTERVAL = 60.0
 ALGORITHMS = {"mesh-adapt": 1, "automatic": 2, "delaunay": 5, "frontal-delaunay": 6}
 """Names of gmsh's algorithms for triangles, and their numbers in gmsh (``Mesh.Algorithm``)."""
 
-_WALL_TIME_RATIO = 4.0
-"""Limit on the wall time, over that on the CPU time: the machine may have other work to do."""
+WALL_TIME_RATIO = 10.0
+"""Limits on the wall time, over those on the CPU time: the machine may have other work to do."""
 
 # variables by which an MPI in gmsh's process would take itself for one of our ranks
 _MPI_VARIABLES = ("OMPI_", "PMIX_", "PMI_", "HYDRA_", "MPI_", "SLURM_")
 
 
-def mesh_geo(
+def read_by_library(
     path: Path,
     size: float | None = None,
     *,
@@ -63,45 +62,62 @@ def mesh_geo(
     trusted: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> Sheet:
-    """Mesh a .geo script in two dimensions.
+    """Mesh a .geo script in two dimensions, or read a file by the library that knows its format.
+
+    Files of other formats keep the order of vertices and triangles in which the library returns them; what
+    `msh_file.read_msh` drops or splits with a note is dropped or split here, too. Groups are those of the
+    file, if the library reads them.
 
     Parameters
     ----------
     path : Path
     size : float, optional
-        Element size in the units of the script, which replaces all sizes in the script. Fixed divisions
+        Element size in the units of a script, which replaces all sizes in the script. Fixed divisions
         (transfinite curves) stay, with a note. Without ``size``, a mesh that the script itself generates is
         used unchanged.
     algorithm : str, optional
         One of `ALGORITHMS`, which replaces that of the script.
     trusted : bool
-        Give the script to gmsh unchecked.
+        Let a script read any file, not only those in its folder, and run it where there is no seccomp.
     report : callable, optional
-        Called with a line of progress at intervals while gmsh works.
+        Called with a line of progress at intervals while the library works.
 
     Raises
     ------
     InputError
-        If gmsh is missing, cannot read or mesh the script, or makes no triangles; if the script contains
-        what is not allowed (`check_script`), or needs more time or memory than there is.
+        If the library is missing, cannot read or mesh the file, drops elements, or needs more time or memory
+        than there is; if a script tries to start a program; if there are no triangles.
     """
-    files: list[Path] = []
-    settings = {"size": size, "algorithm": None if algorithm is None else ALGORITHMS[algorithm]}
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
-        if trusted:
-            read_bytes(path)  # raises if it cannot be read
-            _run_library(path, path.absolute(), None, settings, Path(folder), meshed, report)
-        else:
-            checked = check_script(path)
-            files = checked.files
-            copies = Path(folder) / "script"
-            copies.mkdir()
-            _run_library(path, checked.write(copies), copies, settings, Path(folder), meshed, report)
-        # vertices in no triangle are construction points of the script, whose tags no file of the user's has
-        sheet = _read_mesh(path, meshed, note_loose=False)
-        sheet.tags = None
-    if len(files) > 1:
-        sheet.notes.append(f"the script includes {', '.join(file.name for file in files[1:])}")
+    data = read_bytes(path)
+    suffix, memory = path.suffix.lower(), available_memory()
+    script = path.resolve() if suffix == ".geo" else None
+    with tempfile.TemporaryDirectory() as name, tempfile.TemporaryFile() as meshed:
+        folder = Path(name)
+        # a copy, as libraries also read files beside it; its ending in the spelling that they know
+        file = folder / f"mesh{suffix}"
+        readable = [folder]
+        if script is None:
+            file.write_bytes(usual_spelling(suffix, data))
+        else:  # included, as gmsh drops a last line without newline from any other file
+            file.write_bytes(b'Include "%b";\n' % os.fsencode(script))
+            readable.append(Path("/") if trusted else script.parent)
+        job = {
+            "file": str(file),
+            "script": None if script is None else str(script),
+            "readable": list(map(str, readable)),
+            "guarded": script is not None and not trusted,
+            "size": size,
+            "algorithm": None if algorithm is None else ALGORITHMS[algorithm],
+            "read_seconds": READ_SECONDS + (len(data) // READ_RATE if script is None else 0),
+            "mesh_seconds": MESH_SECONDS,
+            "wall_ratio": WALL_TIME_RATIO,
+            "memory": memory,
+            "max_triangles": 2 * memory // BYTES_PER_VERTEX,
+        }
+        _run_library(path, job, folder, meshed, report)
+        # vertices in no triangle are construction points of a script, whose tags no file of the user's has
+        sheet = _read_mesh(path, meshed, note_loose=script is None)
+    sheet.tags = None
     if size is not None:
         corners = sheet.points[sheet.triangles]
         mean = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
@@ -113,66 +129,18 @@ def mesh_geo(
     return sheet
 
 
-def read_library_file(path: Path, report: Callable[[str], None] | None = None) -> Sheet:
-    """Read a file by the library that knows its format (`library_formats.LIBRARIES`).
-
-    Vertices and triangles are in the order in which the library returns them. What `msh_file.read_msh` drops
-    or splits with a note this does, too. Groups are those of the file, if the library reads them. ``report``
-    as for `mesh_geo`.
-
-    Raises
-    ------
-    InputError
-        If the library is missing, cannot read the file or drops elements, or the file holds no triangles.
-    """
-    data = read_bytes(path)
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
-        # a copy, as libraries also read files beside it; its ending in the spelling that they know
-        inside = Path(folder) / "file"
-        inside.mkdir()
-        suffix = path.suffix.lower()
-        copy = inside / f"mesh{suffix}"
-        copy.write_bytes(usual_spelling(suffix, data))
-        settings = {
-            "size": None,
-            "algorithm": None,
-            "script_seconds": SCRIPT_SECONDS + len(data) // READ_RATE,
-        }
-        _run_library(path, copy, inside, settings, Path(folder), meshed, report)
-        sheet = _read_mesh(path, meshed, note_loose=True)
-    sheet.tags = None
-    return sheet
-
-
 def _run_library(
-    path: Path,
-    script: Path,
-    readable: Path | None,
-    settings: dict[str, Any],
-    folder: Path,
-    meshed: BinaryIO,
-    report: Callable[[str], None] | None,
+    path: Path, job: dict[str, Any], folder: Path, meshed: BinaryIO, report: Callable[[str], None] | None
 ) -> None:
-    """Mesh the script or read the file in a child process, which writes the mesh to ``meshed``.
+    """Do the job (`library_process.main`) in a child process, which writes the mesh to ``meshed``.
 
-    ``path`` names the file in messages, ``script`` is the one that the library reads, and ``readable`` the
-    folder that it may read, None for all.
+    ``path`` names the file in messages; the process works in ``folder``.
 
     Raises
     ------
     InputError
-        As `mesh_geo`.
+        As `read_by_library`.
     """
-    memory = available_memory()
-    job = {
-        "script": str(script),
-        "folder": None if readable is None else str(readable),
-        "script_seconds": SCRIPT_SECONDS,
-        **settings,
-        "mesh_seconds": MESH_SECONDS,
-        "memory": memory,
-        "max_triangles": 2 * memory // BYTES_PER_VERTEX,
-    }
     job_file = folder / "job.json"
     job_file.write_text(json.dumps(job))
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_MPI_VARIABLES)}
@@ -207,9 +175,8 @@ def _wait(
     path: Path, process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[str], None] | None
 ) -> bytes:
     """Wait for the library's process, reporting progress; returns what the process wrote to stderr."""
-    began, library = time.monotonic(), LIBRARIES.get(path.suffix.lower())
-    interval = FIRST_REPORT
-    while time.monotonic() - began < _WALL_TIME_RATIO * (SCRIPT_SECONDS + MESH_SECONDS):
+    began, interval = time.monotonic(), FIRST_REPORT
+    while True:
         try:
             return process.communicate(timeout=interval)[1]
         except subprocess.TimeoutExpired:
@@ -221,8 +188,8 @@ def _wait(
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
         if report is not None:
-            report(f"{path.name}: {library or 'gmsh'} {doing}, {time.monotonic() - began:.0f} s so far")
-    return b""
+            library = LIBRARIES[path.suffix.lower()]
+            report(f"{path.name}: {library} {doing}, {time.monotonic() - began:.0f} s so far")
 
 
 def _read_outcome(file: BinaryIO) -> dict[str, Any]:
@@ -262,21 +229,22 @@ def _read_mesh(path: Path, file: BinaryIO, *, note_loose: bool) -> Sheet:
 
 def _failure(path: Path, stage: str, code: int, errors: bytes, job: dict[str, Any]) -> str:
     """Message on why the library did not finish."""
-    library = LIBRARIES.get(path.suffix.lower())
-    doing = "meshing" if stage == "mesh" else "reading the file" if library else "reading the script"
-    large, slow = "is a mesh size too small, or a loop too long?", "does it loop for ever?"
-    if library:
-        large = slow = "is the file damaged?"
-    elif stage == "mesh":
-        slow = "are its mesh sizes too small?"
-    library = library or "gmsh"
+    library, is_script = LIBRARIES[path.suffix.lower()], job["script"] is not None
+    doing = "meshing" if stage == "mesh" else "reading the script" if is_script else "reading the file"
+    if code == -signal.SIGSYS:
+        return f"the {'script' if is_script else 'library'} tried to start a program"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
-        return f"{library} needs more than the {job['memory'] / 2**30:.3g} GiB there are, {doing}: {large}"
-    if code in (-signal.SIGXCPU, -signal.SIGKILL):
-        seconds = job["mesh_seconds" if stage == "mesh" else "script_seconds"]
-        return f"{library} did not finish {doing} in {seconds} s of CPU time; {slow}"
+        hint = "is a mesh size too small, or a loop too long?" if is_script else "is the file damaged?"
+        return f"{library} needs more than the {job['memory'] / 2**30:.3g} GiB there are, {doing}: {hint}"
+    if code in (-signal.SIGXCPU, -signal.SIGKILL, -signal.SIGALRM):
+        seconds = job["mesh_seconds" if stage == "mesh" else "read_seconds"]
+        limit = f"{seconds} s of CPU time"
+        if code == -signal.SIGALRM:
+            limit = f"{job['wall_ratio'] * seconds:g} s"
+        hint = "are its mesh sizes too small?" if stage == "mesh" else "does it loop for ever?"
+        return f"{library} did not finish {doing} in {limit}; {hint if is_script else 'is the file damaged?'}"
     if code < 0:
-        hint = "; is it damaged?" if doing == "reading the file" else ""
+        hint = "" if is_script else "; is it damaged?"
         return f"{library} broke down ({signal.Signals(-code).name}) {doing}{hint}"
     last = one_line(errors.decode("utf-8", errors="replace")[-200:])
     return f"{library} ended early ({code}) {doing}{': ' + last if last else ''}"

@@ -24,7 +24,7 @@ from lyra_petsc.mesh.readers import first_few, split_polygon
 LIBRARIES = {
     **dict.fromkeys((".stl", ".ply", ".off", ".inp", ".bdf"), "meshio"),
     ".vtk": "vtk",
-    ".unv": "gmsh",
+    **dict.fromkeys((".unv", ".geo"), "gmsh"),
 }
 """The library that reads each format: meshio does not read surfaces of .vtk, nor gmsh their version 5."""
 

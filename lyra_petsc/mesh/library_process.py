@@ -1,10 +1,11 @@
 """Child process in which a library reads one mesh file, or gmsh meshes one script: ``python -m … JOB OUTCOME
 MESH``.
 
-A script may loop for ever, ask for more triangles than fit into memory, or end the process it runs in; a
-damaged file may do so to the library that reads it. In a child process this does not end the simulation;
-`library_file` starts it and reads its results. Before it reads the file it enters a sandbox (`gmsh_sandbox`),
-in which it can open no file for writing: the results go to files that `library_file` has opened.
+A script may loop for ever, ask for more triangles than fit into memory, start programs, or end the process
+it runs in; a damaged file may do so to the library that reads it. In a child process this does not end the
+simulation; `library_file` starts it and reads its results. Before it reads the file it enters a sandbox
+(`gmsh_sandbox`), in which it can open no file for writing: the results go to files that `library_file` has
+opened.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import ctypes
 import json
 import math
 import os
-import re
 import resource
 import signal
 import sys
@@ -38,7 +38,11 @@ from lyra_petsc.mesh.library_formats import (
 )
 
 _EQUILATERAL = math.sqrt(3) / 4
-_UNOPENED = re.compile(r"(?:line \d+: )?Unable to open file '(.*)'")
+_UNGUARDED = (
+    "mesh scripts are programs, and this system has no seccomp to confine them: give --trust-mesh "
+    "(Python: trust_mesh=True) if you trust it, or a .msh"
+)
+_FENCE = " (is it there, in the folder of the script? scripts write no files)"
 _MIN_FILL = 0.25
 """Fraction of its bounding box that a surface fills at least, for estimates of the number of triangles."""
 
@@ -55,8 +59,9 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
     Parameters
     ----------
     job : dict
-        ``script`` (or mesh file), ``folder`` (may be read; null: all may), ``size`` (or null), ``algorithm``
-        (or null), ``script_seconds``, ``mesh_seconds`` (limits on CPU time), ``memory`` [B] and
+        ``file``, ``script`` (which the file includes; else null), ``readable`` (paths), ``guarded`` (whether
+        the sandbox is required), ``size``, ``algorithm`` (or null), ``read_seconds``, ``mesh_seconds``
+        (limits on CPU time), ``wall_ratio`` (of the limits on wall time to these), ``memory`` [B],
         ``max_triangles``.
     outcome : int
         Descriptor of a file to which a line of JSON is written for each stage.
@@ -76,23 +81,24 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
             # may be in other environments; libraries import parts of numpy when they return meshes
             os.path.dirname(library.__file__ or ""),
             os.path.dirname(os.path.dirname(np.__file__)),
-            job["folder"],
+            *job["readable"],
         ]
-        report(sandbox=enter_sandbox(None if job["folder"] is None else readable))
+        if "seccomp" not in enter_sandbox(readable) and job["guarded"]:
+            raise Refused(_UNGUARDED)
 
     _set_limits(job["memory"])
-    report(stage="script")
-    _allow_seconds(job["script_seconds"])
+    report(stage="read")
+    _allow_seconds(job["read_seconds"], job["wall_ratio"])
     try:
-        suffix = Path(job["script"]).suffix
-        if LIBRARIES.get(suffix, "gmsh") == "gmsh":
-            with _session(suffix) as gmsh:
+        file = Path(job["file"])
+        if LIBRARIES[file.suffix] == "gmsh":
+            with _session(file.suffix) as gmsh:
                 enter(gmsh)
                 found = _read_by_gmsh(gmsh, job, report)
         else:
-            found = read_format(Path(job["script"]), enter)
-        with open(mesh, "wb", closefd=False) as file:
-            _write_mesh(found, file)
+            found = read_format(file, enter)
+        with open(mesh, "wb", closefd=False) as output:
+            _write_mesh(found, output)
     except Refused as error:
         report(refused=str(error))
     except MemoryError:
@@ -104,20 +110,24 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
 
 def _read_by_gmsh(gmsh: ModuleType, job: dict[str, Any], report: Callable[..., None]) -> FileMesh:
     """Mesh a script, or read a file of another format."""
-    script = Path(job["script"])
-    announced = count_announced(script.suffix, script.read_bytes()) if script.suffix in LIBRARIES else None
-    _set_size(gmsh, job["size"])
-    with _raise_refused(gmsh, job["script"]):
-        gmsh.merge(job["script"])
-    if announced is not None:
+    file, script = Path(job["file"]), job["script"]
+    if script is None:
+        announced = count_announced(file.suffix, file.read_bytes())
+        with _raise_refused(gmsh, str(file)):
+            gmsh.merge(str(file))
         found, n_elements = _gmsh_mesh(gmsh), sum(len(tags) for tags in gmsh.model.mesh.getElements()[1])
         refuse_losses("gmsh", announced, len(found.points), n_elements)
         # elements without a group have the number 0
         grouped = [block._replace(groups=block.groups[block.groups[:, 1] != 0]) for block in found.elements]
         order = np.argsort(found.tags)  # gmsh sorts them by entity
         return found._replace(tags=found.tags[order], points=found.points[order], elements=grouped)
+    _set_size(gmsh, job["size"])
+    with _raise_refused(gmsh, script):
+        gmsh.merge(str(file))
+        if os.path.exists(f"{script}.opt"):  # gmsh reads it with a file, but not with one that is included
+            gmsh.merge(f"{script}.opt")
     report(stage="mesh")
-    _allow_seconds(job["mesh_seconds"])
+    _allow_seconds(job["mesh_seconds"], job["wall_ratio"])
     _generate_mesh(gmsh, job, lambda count: report(triangles=round(count)))
     return _gmsh_mesh(gmsh)
 
@@ -130,10 +140,11 @@ def _set_limits(memory: int) -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
-def _allow_seconds(seconds: float) -> None:
-    """Let the kernel end this process (SIGXCPU) after that much more CPU time."""
+def _allow_seconds(seconds: float, wall_ratio: float) -> None:
+    """Let the kernel end this process after that much more CPU time (SIGXCPU), or wall time (SIGALRM)."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     _limit(resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds))
+    signal.alarm(math.ceil(wall_ratio * seconds))
 
 
 def _limit(kind: int, value: int) -> None:
@@ -286,7 +297,7 @@ def _extent(box: tuple[float, ...]) -> tuple[float, float, float]:
 
 @contextmanager
 def _raise_refused(gmsh: ModuleType, script: str) -> Iterator[None]:
-    """Raise `Refused` for errors that gmsh raises or only logs, except where it may not save a file."""
+    """Raise `Refused` for errors that gmsh raises or only logs."""
     raised = []
     try:
         yield
@@ -298,18 +309,10 @@ def _raise_refused(gmsh: ModuleType, script: str) -> Iterator[None]:
         logged = [line.split(":", 1)[1] for line in gmsh.logger.get() if line.startswith("Error")]
     except UnicodeDecodeError:  # an error message that quotes the script
         logged = ["the script has an error, in text that is not UTF-8"]
-    folder = os.path.dirname(script)  # holds copies, whose paths mean nothing to the user
     for text in logged + raised:
-        message = " ".join(text.split()).replace(f"'{script}', ", "").replace(f"{folder}/", "")
-        unopened = _UNOPENED.fullmatch(message)
-        if unopened is None or not _saves(script, unopened[1]):
-            raise Refused(f"gmsh: {message.removesuffix(' ()')}")
-
-
-def _saves(script: str, name: str) -> bool:
-    """Whether the script writes a file of this name, of which none is needed here."""
-    writes = rb'(?:\b(?:Save|Print)\s+|>\s*)"' + re.escape(name.encode()) + b'"'
-    return re.search(writes, Path(script).read_bytes()) is not None
+        message = " ".join(text.split()).replace(f"'{script}', ", "").removesuffix(" ()")
+        hint = _FENCE if "Unable to open file" in message else ""
+        raise Refused(f"gmsh: {message.replace(os.path.dirname(script) + '/', '')}{hint}")
 
 
 if __name__ == "__main__":

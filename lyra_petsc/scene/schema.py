@@ -1472,7 +1472,7 @@ class Scene(Block):
 
     @property
     def trusts_meshes(self) -> bool:
-        """Whether gmsh gets the scripts of this scene unchecked; set by the caller, not by the file."""
+        """Whether mesh scripts may read any file and run without seccomp, as the caller says."""
         return self._trusts_meshes
 
     @property

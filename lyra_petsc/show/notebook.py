@@ -233,7 +233,7 @@ def run(
     resume : bool
         Continue from the newest checkpoint.
     trust_mesh : bool
-        Pass this scene's gmsh scripts (.geo) to gmsh without checking their commands.
+        Let this scene's scripts (.geo) read any file, and run where there is no seccomp.
     on_step : callable, optional
         Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
     comm : MPI.Comm, optional

@@ -210,10 +210,10 @@ def _run(case: Case) -> int:
     from petsc4py import PETSc
 
     from lyra_petsc.cli.app import run_command_line
-    from lyra_petsc.mesh import library_file as geo
+    from lyra_petsc.mesh import library_file
 
     os.environ["LYRA_TRACEBACK"] = "1"
-    geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 2, 3
+    library_file.READ_SECONDS, library_file.MESH_SECONDS = 2, 3
     PETSc.Options().setValue("ts_max_steps", STEPS)
     code = run_command_line(["lyra-petsc", *case.arguments])
     if code == 0 and case.verb == "run":

@@ -160,7 +160,6 @@ OPENS = {
     "output/file_operations.py": "opens",
     "scene/json_schema.py": "the user's cache",
     "mesh/library_file.py": "a temporary folder",
-    "mesh/geo_script.py": "a temporary folder",
     "mesh/library_process.py": "an open file",
     "experiments/bench.py": "a temporary folder",
     "show/export.py": "a folder that it has just made",

@@ -58,7 +58,7 @@ class Setting:
     size : float
         Diagonal of the bounding box of the rest shape [m].
     trust_mesh : bool
-        Pass the scripts of the scene to gmsh unchecked.
+        ``--trust-mesh``.
     """
 
     base: Content

@@ -52,7 +52,7 @@ class Job:
     fingerprint : str
         Digest of everything that the result depends on.
     trust_mesh : bool
-        Pass the scripts of the scene to gmsh unchecked.
+        ``--trust-mesh``.
     """
 
     scene: str
