@@ -27,7 +27,7 @@ ENERGIES = ("membrane_energy", "bending_energy", "potential_energy")
 """Columns of history.csv to which several terms add their energies; columns of single terms follow these."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Budget:
     """Energies [J] at a state, and cumulative works [J] up to it.
 
@@ -56,26 +56,43 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Works:
-    """Works and heat of a step, by the forces at its stage.
+class StepAccount:
+    """Energies, works and heat [J] of a step, by the forces at its stage; the same on every rank.
 
     Attributes
     ----------
-    external, heat : float
-        Work [J] of handles, springs and loads without a potential, and heat of all dampers.
-    target_energy : float
-        Increase [J] of the energy of this rank's terms with moving targets.
-    damping : (m,)
-        Force [N] of material damping at the prescribed unknowns.
-    damping_heat : float
-        Heat [J] of material damping on this rank.
+    before, after : Budget
+        At both ends of the step.
+    moving_before, moving : float
+        Energies of the terms with moving targets at both ends.
+    external, obstacle_work : float
+        Work of handles, springs and loads without a potential; the part of it by moving obstacles.
+    heat, damping_heat, fabric_heat : float
+        Heat of all dampers; of material damping, and of friction within the fabric.
+    inertia : float
+        ½ ‖Δv‖²_M of a step of backward Euler, with the velocities that solve it.
     """
 
+    before: Budget
+    after: Budget
+    moving_before: float
+    moving: float
     external: float
+    obstacle_work: float
     heat: float
-    target_energy: float
-    damping: Array
     damping_heat: float
+    fabric_heat: float
+    inertia: float
+
+    @property
+    def change(self) -> float:
+        """Change of all energies."""
+        return self.after.total - self.before.total
+
+    @property
+    def bracket(self) -> float:
+        """The bracket of backward Euler's identity: what works, heat and ½ ‖Δv‖²_M leave of the change."""
+        return self.change + self.heat - self.external + self.inertia
 
 
 def _work_of(force: Array, x_before: Array, x: Array) -> float:
@@ -85,28 +102,29 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
 
 
 class EnergyBalance:
-    """Accumulates the budget over the steps; collective.
+    """The ledger: the budget of the present state, and the account of each step; collective.
 
     Attributes
     ----------
     budget : Budget
-    works : Works
-        Works of the last step.
+    account : StepAccount
+        The last one computed.
+    damping : (m,)
+        Force [N] of material damping at the prescribed unknowns in that step.
     """
 
-    works: Works
+    account: StepAccount
 
     def __init__(self, system: StageEquations) -> None:
         self._system = system
         named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
         self._columns = [name for name in named if name not in (*ENERGIES, "")]
-        self.budget = Budget()
-        self._at, self._reactions = system.prescribed.indices, np.zeros(len(system.prescribed.indices))
-        self._target_energy = 0.0
-        self._pull: Array | None = None
-        self._targets: list[tuple[Array, Array]] = []
+        self._at = system.prescribed.indices
+        self._reactions = self.damping = np.zeros(len(self._at))
+        self._ends: tuple[Array, list[tuple[Array, Array]]] | None = None
         if not system.integrator.dynamic:
-            self._pull, self._targets = self._external_forces(system.forces_now())[0], self._moving_targets()
+            self._ends = self._external_forces(system.forces_now())[0], self._moving_targets()
+        self.budget = Budget()
         self.measure()
 
     @property
@@ -116,65 +134,86 @@ class EnergyBalance:
         np.put(out, self._at, self._reactions)
         return out
 
-    def measure(self) -> Budget:
+    def measure(self) -> None:
         """Write the energies of the present state into the budget."""
+        self.budget, self._moving_energy, _ = self._measured(self.budget)
+
+    def _measured(self, works: Budget, *local: float) -> tuple[Budget, float, list[float]]:
+        """Energies of the present state with the ``works`` so far, the energy of the terms with moving
+        targets, and the sums of ``local`` over ranks.
+        """
         system = self._system
-        n = system.points.n_owned
-        columns = [*ENERGIES, *self._columns]
-        local = np.zeros(len(columns) + 1)
-        local[-1] = kinetic_energy(system.mass, system.v[:n])
-        self._target_energy = 0.0
+        n, names = system.points.n_owned, [*ENERGIES, *self._columns]
+        energies, moving = dict.fromkeys(names, 0.0), 0.0
         for term in system.active.elastic:
-            entry = term.registration
-            if entry.energy:
+            if name := term.registration.energy:
                 frozen = system.active.frozen[term]
                 energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
-                local[columns.index(entry.energy)] += energy
-                self._target_energy += energy if term.moving and not term.pushes else 0.0
+                energies[name] += energy
+                moving += energy if term.moving and not term.pushes else 0.0
         for load in system.active.loads:
-            if load.registration.energy:
-                local[columns.index(load.registration.energy)] += load.potential(system.x)
-        budget, sums = self.budget, [float(value) for value in system.points.global_sum(*local)]
-        budget.membrane, budget.bending, budget.potential = sums[:3]
-        budget.more, budget.kinetic = dict(zip(self._columns, sums[3:-1], strict=True)), sums[-1]
+            if name := load.registration.energy:
+                energies[name] += load.potential(system.x)
+        kinetic = kinetic_energy(system.mass, system.v[:n])
+        sums = system.points.global_sum(*energies.values(), kinetic, moving, *local).tolist()
+        count = len(names)
+        membrane, bending, potential, *more = sums[:count]
         system.directors.forget()  # the next step has other frames
-        return budget
+        budget = replace(
+            works,
+            kinetic=sums[count],
+            membrane=membrane,
+            bending=bending,
+            potential=potential,
+            more=dict(zip(self._columns, more, strict=True)),
+        )
+        return budget, sums[count + 1], sums[count + 2 :]
 
-    def snapshot(self) -> tuple[Budget, float]:
-        """Copy of the state, for `revert`."""
-        return replace(self.budget, more=dict(self.budget.more)), self._target_energy
+    def enter(self, account: StepAccount) -> None:
+        """Take the account of a step that is accepted into the books."""
+        self.budget, self._moving_energy = account.after, account.moving
 
-    def revert(self, snapshot: tuple[Budget, float]) -> None:
-        """Return to a `snapshot`, as the step is repeated."""
-        self.budget, self._target_energy = snapshot
+    def record(self, x_before: Array) -> None:
+        """`enter` the account of the step just taken from x_before (n_owned, 3)."""
+        self.enter(self.account_of(x_before))
 
-    def record(self, x_before: Array) -> Budget:
-        """Add the works of the step just taken from x_before (n_owned, 3) by the forces at its stage."""
+    def account_of(self, x_before: Array) -> StepAccount:
+        """The account of the step just taken from x_before (n_owned, 3)."""
         system = self._system
         system.directors.move_frames_to_end()
-        external, damping, damped = self._external_forces(system.forces_at_stage())
-        # a handle does work on the sheet through targets that move with it
-        if self._pull is None:
-            by_targets = system.moving_energy_before - self._target_energy
-        else:  # the stage of a load step is at its end: take the mean of the forces at both ends
-            external, self._pull = 0.5 * (external + self._pull), external
-            before, self._targets = self._targets, self._moving_targets()
-            by_targets = sum(
+        external, self.damping, damped = self._external_forces(system.forces_at_stage())
+        by_obstacles = system.obstacle_work()
+        by_targets = system.moving_energy_before + by_obstacles
+        if self._ends is not None:  # the stage of a load step is at its end: take the mean of both ends
+            pull, targets = self._ends
+            self._ends = external, self._moving_targets()
+            external = 0.5 * (external + pull)
+            by_targets = by_obstacles + sum(
                 0.5 * float(np.vdot(pull + pull0, at - at0))
-                for (at0, pull0), (at, pull) in zip(before, self._targets, strict=True)
+                for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
             )
-        by_targets += system.obstacle_work() + system.move_targets_to_end()
-        local = np.array([_work_of(external, x_before, system.x) + by_targets, damped])
-        local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
-        local[1] += system.contact_impulses.heat if system.contact_impulses else 0.0
+        by_targets += system.move_targets_to_end()
+        work = _work_of(external, x_before, system.x) + by_targets
         del external  # to save memory
-        work, heat = system.points.global_sum(*local)
-        self.budget.external_work += float(work)
-        self.budget.dissipation += float(heat)
-        moving = self._target_energy
-        self.measure()
-        self.works = Works(float(work), float(heat), self._target_energy - moving, damping, damped)
-        return self.budget
+        fabric = sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
+        impacts = system.contact_impulses.heat if system.contact_impulses else 0.0
+        inertia = kinetic_energy(system.mass, system.stage_velocity - system.history)
+        before, moving_before = self.budget, self._moving_energy
+        local = work, damped, fabric, impacts, by_obstacles, inertia
+        energies, moving, sums = self._measured(before, *local)
+        work, damped, fabric, impacts, by_obstacles, inertia = sums
+        if self._ends is None:  # a handle does work on the sheet through targets that move with it
+            work -= moving_before
+        heat = damped + fabric + impacts
+        after = replace(
+            energies,
+            external_work=before.external_work + work,
+            dissipation=before.dissipation + heat,
+        )
+        self.account = StepAccount(
+            before, after, moving_before, moving, work, by_obstacles, heat, damped, fabric, inertia
+        )
+        return self.account
 
     def _moving_targets(self) -> list[tuple[Array, Array]]:
         """Positions of the targets that move with handles, and the forces on them, by term."""
@@ -209,13 +248,13 @@ class EnergyBalance:
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""
-        return ({} if self._pull is None else {"pull": self._pull}), asdict(self.budget)
+        return ({} if self._ends is None else {"pull": self._ends[0]}), asdict(self.budget)
 
     def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
         """Restore works from a checkpoint; energies are measured at the present state."""
         self.budget = Budget(**{**budget, "more": {}})
-        if self._pull is not None:
-            self._pull, self._targets = arrays["pull"], self._moving_targets()
+        if self._ends is not None:
+            self._ends = arrays["pull"], self._moving_targets()
         self.measure()
 
     @property

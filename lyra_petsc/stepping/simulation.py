@@ -439,12 +439,10 @@ class SteppedScene:
             return True
         system = self.problem.system
         with self.phases("balance"):
-            snapshot = self.energy_balance.snapshot()
-            after = self.energy_balance.record(x_before[: system.points.n_owned])
-            balance = self.guard.balance(x_before, v_before, snapshot[0], after, self.energy_balance.works)
-            accepted = self.guard.accept(balance)
-            if not accepted:
-                self.energy_balance.revert(snapshot)
+            account = self.energy_balance.account_of(x_before[: system.points.n_owned])
+            accepted = self.guard.accept(x_before, v_before, self.energy_balance)
+            if accepted:
+                self.energy_balance.enter(account)
             return accepted
 
     def _switch_at_crossing(self, attempt: Attempt, dt: float) -> bool:

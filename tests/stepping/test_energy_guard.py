@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from physics import CLOTH, finished, grid, scene_of, shape
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.energy_guard import Balance, GuardState, _append_gain
+from lyra_petsc.stepping.energy_gain import Gain
+from lyra_petsc.stepping.energy_guard import GuardState, _append_gain
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
@@ -180,8 +181,8 @@ def test_a_step_without_gain_is_accepted_after_steps_with_gains() -> None:
     stood = []
     for gain in (-1e-6, 1e-6):
         one.guard.gains = GuardState(start=0.0, scale=1.0, total=0.2, recent=[0.2])
-        step = Balance(gain, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1e-12)
-        stood.append(one.guard.accept(step))
+        step = Gain(gain, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1e-12)
+        stood.append(one.guard.judge(step))
     one.destroy()
     assert stood == [True, False]
 

@@ -17,16 +17,15 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, failure_message
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch
 from lyra_petsc.experiments.results import Line, View
-from lyra_petsc.experiments.stress.step_balance import (
+from lyra_petsc.experiments.stress.step_balance import BalanceRecorder
+from lyra_petsc.experiments.stress.stress_scenes import NotApplicable, Scope, Setting, StressCase, base_scene
+from lyra_petsc.experiments.stress.verdicts import (
     SMALL_DISSIPATION,
-    BalanceRecorder,
     RunRecord,
-    StageBalanceRecorder,
     judge_physics,
     judge_speed,
     ratio,
 )
-from lyra_petsc.experiments.stress.stress_scenes import NotApplicable, Scope, Setting, StressCase, base_scene
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
 from lyra_petsc.show.report.plots import Series, over_time, surface
@@ -192,13 +191,12 @@ def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: floa
     if case.shape is not None:
         shape = case.shape(trial.x, simulation.problem.whole.spacing)
         trial.set_state(x=shape)
-    record.start_energy = _energy(trial)
+    record.start_energy = simulation.budget.total
     if case.observe is not None:
         record.observed.append(case.observe(trial))
     recorder = None
     if record.integrator != "semi-implicit":  # it satisfies no such balance
-        kind = BalanceRecorder if record.integrator == "beuler" else StageBalanceRecorder
-        recorder = kind(simulation)
+        recorder = BalanceRecorder(simulation)
     try:
         while not simulation.finished:
             if comm.bcast(_own_seconds() > deadline, root=0):
@@ -210,7 +208,7 @@ def _run_steps(trial: Trial, case: StressCase, record: RunRecord, deadline: floa
             report = trial.step()
             record.cpu_seconds.append(comm.allreduce(time.process_time() - cpu_seconds, op=MPI.MAX))
             record.reports.append(report)
-            record.energies.append(_energy(trial))
+            record.energies.append(simulation.budget.total)
             if recorder is not None:
                 record.balances.append(recorder.balance(report))
                 recorder.record_state()
@@ -231,12 +229,6 @@ def _root_positions(trial: Trial) -> Array | None:
     """Positions (V, 3) [m] on rank 0, None elsewhere."""
     x = trial.x
     return x if trial.simulation.comm.rank == 0 else None
-
-
-def _energy(trial: Trial) -> float:
-    """Kinetic + potential energy [J]."""
-    budget = trial.simulation.budget
-    return budget.kinetic + budget.membrane + budget.bending + budget.potential
 
 
 def launched(launcher: Launcher, case: StressCase, arguments: Sequence[str], watch: Watch) -> StressOutcome:
@@ -299,7 +291,7 @@ def csv_row(outcome: StressOutcome) -> dict[str, Any]:
         "residual_over_promised": max((ratio(b.residual, b.promised) for b in balances), default=nan),
         "energy_defect": abs(worst.defect) if worst else nan,
         "energy_tolerance": worst.tolerance if worst else nan,
-        "energy_turned_over": worst.energy_exchanged if worst else nan,
+        "energy_turned_over": worst.turned_over if worst else nan,
         "verdict": outcome.verdict,
         "numerical_dissipation": record.dissipation,
         "momentum_defect_over_tolerance": max(map(max, momenta), default=nan),
@@ -457,7 +449,9 @@ def _figures(report: Report, outcome: StressOutcome) -> None:
         times = [0.0, *record.times]
         curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
         if record.balances and record.integrator == "beuler":
-            work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
+            work = itertools.accumulate(
+                (one.account.external for one in record.balances), initial=record.start_energy
+            )
             curves.append(Series("energy at the start + work done", times, list(work)))
         caption, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
         report.figure(over_time(curves, name=name, caption=caption, y_label="energy [J]"))

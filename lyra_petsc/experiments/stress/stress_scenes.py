@@ -28,7 +28,7 @@ from lyra_petsc.scene.schema import Material, Scene
 from lyra_petsc.scene.text import parse_yaml
 
 if TYPE_CHECKING:
-    from lyra_petsc.experiments.stress.step_balance import RunRecord
+    from lyra_petsc.experiments.stress.verdicts import RunRecord
 
 Content = dict[str, Any]
 

@@ -12,7 +12,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.experiments.stress.cases import selected
-from lyra_petsc.experiments.stress.step_balance import RunRecord, force_work
+from lyra_petsc.experiments.stress.step_balance import force_work
 from lyra_petsc.experiments.stress.stress_runner import StressOutcome, run_case
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
@@ -24,6 +24,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     set_wind,
     use_directors,
 )
+from lyra_petsc.experiments.stress.verdicts import RunRecord
 from lyra_petsc.terms.bending.hinge import Bending
 from lyra_petsc.terms.membrane import Membrane
 
@@ -67,15 +68,8 @@ def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
     outcome = run(comm, **changes)
     assert len(outcome.record.balances) == 4
     assert outcome.failures == {}
-    assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
+    assert all(balance.turned_over > 1e3 * balance.tolerance for balance in outcome.record.balances)
     assert not any(balance.jumped for balance in outcome.record.balances)
-
-
-@pytest.mark.parallel(2)
-def test_the_balance_agrees_with_the_ledger(comm: MPI.Comm) -> None:
-    record = run(comm, **handled(0.02)).record
-    found = np.cumsum([balance.change for balance in record.balances])
-    np.testing.assert_allclose(found, np.subtract(record.energies, record.start_energy), rtol=1e-9)
 
 
 def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
@@ -219,7 +213,7 @@ def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: st
     assert outcome.failures == {}
     assert {"equations", "resolved", "energy", "momentum"} < set(outcome.verdicts)
     assert "no gain" not in outcome.verdicts
-    assert all(balance.energy_exchanged > 1e3 * balance.tolerance for balance in outcome.record.balances)
+    assert all(balance.turned_over > 1e3 * balance.tolerance for balance in outcome.record.balances)
 
 
 @pytest.mark.parallel(2)

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from lyra_petsc.experiments.stress.step_balance import RunRecord, StepBalance, judge_physics, judge_speed
+from lyra_petsc.experiments.stress.step_balance import StepBalance
 from lyra_petsc.experiments.stress.stress_runner import StressOutcome
 from lyra_petsc.experiments.stress.stress_scenes import StressCase, base_scene
+from lyra_petsc.experiments.stress.verdicts import RunRecord, judge_physics, judge_speed
+from lyra_petsc.stepping.energy_balance import Budget, StepAccount
 from lyra_petsc.stepping.simulation import StepReport
 
+ACCOUNT = StepAccount(
+    Budget(), Budget(kinetic=-0.5), moving_before=0.0, moving=0.0, external=0.1, obstacle_work=0.0,
+    heat=0.1, damping_heat=0.1, fabric_heat=0.0, inertia=0.3,
+)  # fmt: skip
+"""Its bracket is −0.2 J."""
+
 GOOD = StepBalance(
-    change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
+    account=ACCOUNT, turned_over=1.2, defect=1e-10,
     tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, displacement=1e-3, momentum=1e-8,
     momentum_tolerance=1e-7, angular=1e-8, angular_tolerance=1e-7,
 )  # fmt: skip
@@ -56,15 +65,15 @@ def test_a_good_record_passes() -> None:
         ({"residual": math.nan}, "equations"),
         ({"driving": 0.9e-5}, "resolved"),
         ({"driving": math.nan}, "resolved"),
-        ({"change": 0.1 + 1.1e-9}, "no gain"),
-        ({"viscous": -1e-6}, "no gain"),
+        ({"account": replace(ACCOUNT, after=Budget(kinetic=0.1 + 1.1e-9), inertia=-0.3)}, "no gain"),
+        ({"account": replace(ACCOUNT, damping_heat=-1e-6)}, "no gain"),
         ({"momentum": 1.1e-7}, "momentum"),
         ({"angular": 1.1e-7}, "momentum"),
         ({"angular": math.nan}, "momentum"),
     ],
 )
-def test_each_violated_balance_fails_its_verdict(change: dict[str, float], name: str) -> None:
-    broken = failures(record(replace(GOOD, **change)))  # type: ignore[arg-type]
+def test_each_violated_balance_fails_its_verdict(change: dict[str, Any], name: str) -> None:
+    broken = failures(record(replace(GOOD, **change)))
     assert name in broken
     assert set(broken) <= {name, "no gain", "resolved" if name == "equations" else name}
     if name != "no gain":
@@ -79,7 +88,7 @@ def test_large_residuals_at_round_off_are_allowed_if_they_move_nothing(left: flo
 
 
 def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
-    buckling = replace(GOOD, bracket=0.7, change=0.4)
+    buckling = replace(GOOD, account=replace(ACCOUNT, after=Budget(kinetic=0.4)))
     assert failures(record(buckling)) == {}
     assert "buckling" in judge_physics(record(buckling))["no gain"].message
 

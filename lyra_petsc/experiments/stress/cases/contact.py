@@ -19,7 +19,6 @@ from lyra_petsc.contact.overlaps import find_overlaps
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle, resample_polyline
-from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
@@ -30,6 +29,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     family,
     scale,
 )
+from lyra_petsc.experiments.stress.verdicts import RunRecord
 from lyra_petsc.experiments.verification.verification_case import FLOOR, grid
 from lyra_petsc.parallel import on_root
 

@@ -28,7 +28,6 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
@@ -40,6 +39,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     family,
     scale,
 )
+from lyra_petsc.experiments.stress.verdicts import RunRecord
 from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
 from lyra_petsc.experiments.verification.verification_case import grid, isotropic, scene
 from lyra_petsc.parallel import on_root

@@ -17,7 +17,6 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.stress.step_balance import RunRecord
 from lyra_petsc.experiments.stress.stress_scenes import (
     CELLS,
     FULL,
@@ -41,6 +40,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     set_wind,
     use_directors,
 )
+from lyra_petsc.experiments.stress.verdicts import RunRecord
 from lyra_petsc.experiments.verification.verification_case import grid
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 

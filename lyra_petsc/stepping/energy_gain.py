@@ -1,0 +1,262 @@
+"""The energy that an integrator creates or destroys in a step.
+
+The gain of a step is ::
+
+    G = Δ(T + U + V) + D − W
+
+with the kinetic energy T of the free coordinates, all elastic energies U (springs and clamps too), the
+potential V of gravity, the heat D of material damping and the work W of handles, loads and wind.
+
+W is computed by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure
+with the geometry there, times the displacement. (With the integrator's own forces, at its stage, a run that
+blows up balances, too.) The work of a moving target is the change of stored energy by its motion, averaged
+over both ends, which for springs is the same rule. If the velocity of the integrator's stage is not Δx/Δt, D
+is the heat of uniform motion between the ends, with the geometry at its middle. It is the smallest heat that
+any motion makes; after a start from rest, the heat at the stage is several times as large. G is compared with
+the scale ::
+
+    S = largest value so far of T + U + |V − V₀| + Σ|W| + ΣD
+
+whose T includes the coordinates that handles drive: if these start gently, little else moves at first. T, V
+and W are those of an observer who moves with the scene's initial velocity: a sheet whose surroundings drift
+along with it is judged as one at rest. (Another observer finds another G, as the trapezoidal rule does not
+give the change of momentum.) G < 0 is numerical dissipation, which is allowed and summed up.
+
+Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
+
+    Δ(T + U + V) + D − W = −½ ‖Δv‖²_M + bracket        bracket = U(x_{n+1}) − U(x_n) − ∇U(x_{n+1})·Δx
+
+so that it gains energy only where U is not convex. Its steps are judged by the smaller of the two gains: if
+air brakes a sheet within a step, the force at its start times the displacement exceeds the work by far.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.energy_balance import EnergyBalance
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.state import resized
+from lyra_petsc.terms.registry import Role
+from lyra_petsc.terms.term import Elastic, UpcomingStep
+
+ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
+"""Relative round-off of a sum of energies."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Gain of a step and what it consists of [J], the same on every rank.
+
+    Attributes
+    ----------
+    gain : float
+        G.
+    work, heat : float
+        W, D.
+    potential_before, potential : float
+        V at both ends of the step.
+    stored_before, stored : float
+        T + U at both ends, with the coordinates that handles drive.
+    inertia, bracket : float
+        ½ ‖Δv‖²_M, and this plus the change of energy that the work of the stage's forces does not explain.
+    noise : float
+        Round-off of the gain.
+    """
+
+    gain: float
+    work: float
+    heat: float
+    potential_before: float
+    potential: float
+    stored_before: float
+    stored: float
+    inertia: float
+    bracket: float
+    noise: float
+
+
+class EndForces:
+    """Works by the mean of the forces at both ends of a step, for an observer with the initial velocity;
+    collective.
+
+    Parameters
+    ----------
+    system : StageEquations
+    drift : (3,)
+        The initial velocity [m/s].
+    """
+
+    def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
+        self._system = system
+        elastic = system.active.elastic
+        self._targets = [t for t in elastic if t.moving or t.registration.role is Role.CONSTRAINT]
+        self._plain = [term for term in elastic if term not in self._targets]
+        self._weights = [load for load in system.active.loads if load.registration.energy]
+        self._forces = [load for load in system.active.loads if not load.registration.energy]
+        self._drift = np.array(drift)
+        self._stiffness: float | None = None
+        # gradients of ``_plain`` at the end of the last accepted step, and of the present one
+        self._pull: Array | None = None
+        self._end_pull: Array | None = None
+
+    def keep_end(self) -> None:
+        """The present step is accepted: the next starts where it ends."""
+        self._pull = self._end_pull
+
+    def gain(self, x0: Array, v0: Array, ledger: EnergyBalance) -> Gain:
+        """Gain of the step just taken from x0, v0 (n_local, 3), whose account the ledger has."""
+        system, layout = self._system, self._system.points
+        if system.discretisation.stencils_change:  # ghosts may have changed in the step
+            x0, v0 = (resized(values, layout.n_owned, layout.n_local) for values in (x0, v0))
+            for values in (x0, v0):
+                layout.update_ghosts(values)
+        x1, v1, n = system.x, system.v, layout.n_owned
+        moved = x1[:n] - x0[:n]
+        moved[: layout.n_vertices] -= system.dt * self._drift
+        account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
+        if uniform := self._moves_otherwise:
+            # at the middle, the displacements of a rotation cause no strain
+            force = system.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / system.dt)
+            damping = force.take(system.prescribed.indices)
+            uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
+        work = self._load_work(x0, v0, x1, v1, moved) + self._handle_work(x0, x1, moved, damping)
+        by_targets, rise, springs0, springs1 = self._target_works(x0, x1)
+        # rounded positions at both ends of a step differ in energy, and in velocity
+        largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
+        stiff = (self._stiffness_sum + float(system.mass.sum()) / system.dt**2) * largest**2
+        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, system.t0)
+        local = *energies, self._potential(x1, system.t1), work + by_targets, rise, springs0, springs1
+        sums = layout.global_sum(*local, stiff, uniform_heat).tolist()
+        free0, all0, free1, all1, potential0, potential1, work, rise, springs0, springs1, stiff, warm = sums
+        before, after = account.before, account.after
+        rise += (after.elastic - account.moving) - (before.elastic - account.moving_before)
+        more = warm - account.damping_heat if uniform else 0.0
+        heat = account.heat + more
+        energy0, energy1 = all0 + before.elastic + springs0, all1 + after.elastic + springs1
+        sizes = energy0 + energy1 + before.kinetic + after.kinetic + abs(work) + abs(heat)
+        sizes += abs(before.potential) + abs(after.potential)
+        return Gain(
+            gain=free1 - free0 + rise + potential1 - potential0 + heat - work,
+            work=work,
+            heat=heat,
+            potential_before=potential0,
+            potential=potential1,
+            stored_before=energy0,
+            stored=energy1,
+            inertia=account.inertia,
+            bracket=account.bracket + more,
+            noise=ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy1) * stiff) + ROUND_OFF * stiff),
+        )
+
+    def _kinetic(self, v: Array) -> tuple[float, float]:
+        """Kinetic energy [J] of this rank's free coordinates, and of all, at velocities v (n_local, 3)."""
+        system = self._system
+        at, square = system.prescribed.indices, np.square(v[: len(system.mass)] - self._drift)
+        driven, whole = np.vdot(system.mass.take(at // 3), square.take(at)), np.sum(system.mass @ square)
+        return 0.5 * float(whole - driven), 0.5 * float(whole)
+
+    def _potential(self, x: Array, time: float) -> float:
+        """V [J] of this rank at positions x (n_local, 3) and a time [s]."""
+        x = x - time * self._drift if self._drift.any() else x
+        return sum(load.potential(x) for load in self._weights)
+
+    @property
+    def _moves_otherwise(self) -> bool:
+        """Whether velocities other than those of uniform motion between the ends damp the material."""
+        integrator = self._system.integrator
+        return self._system.damping.active and integrator.order > 1 and not integrator.moves_uniformly
+
+    def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
+        """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
+        system = self._system
+        step = UpcomingStep(system.t0, system.t1, at, x, system.reference.at)
+        return {term: term.freeze(step) for term in terms}
+
+    def _target_works(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
+        """Work [J] of the motion of targets and obstacles relative to the observer, change of the energies of
+        this rank's terms with targets, and energy of springs at both ends.
+        """
+        system, rise, springs = self._system, 0.0, [0.0, 0.0]
+        work = system.contact_impulses.work if system.contact_impulses else 0.0
+        for term in system.active.pushing:
+            for x, time in ((x0, system.t0), (x1, system.t1)):
+                work += 0.5 * term.work(x, time, system.t0, system.t1)
+        turning = [t for t in self._targets if t.n_elements and t not in system.active.pushing]
+        first = self._frozen(turning, system.t0, x0)
+        last = self._frozen(turning, system.t1, x1)
+        for term in turning:
+            frozen = first[term], last[term]
+            before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
+            rise += after - before
+            work += term.work_of_targets((x0, x1), frozen)
+            if not term.registration.energy:
+                springs = [springs[0] + before, springs[1] + after]
+        if self._drift.any():
+            work += system.dt * float(self._force_of_targets(x0, x1) @ self._drift)
+        return work, rise, springs[0], springs[1]
+
+    def _force_of_targets(self, x0: Array, x1: Array) -> Array:
+        """Force (3,) [N] of the sheet on targets and obstacles in the step from x0 to x1 (n_local, 3)."""
+        system, force = self._system, np.zeros_like(x1)
+        near = [term for term in self._plain if term.detects_collisions]
+        both = [term for term in (*self._targets, *near) if not term.slips]
+        for x, time in ((x0, system.t0), (x1, system.t1)):
+            for term, frozen in self._frozen(both, time, x).items():
+                term.add_gradient(x, frozen, force)
+        force *= 0.5
+        for term in system.active.changing:
+            if term.slips:  # by the force at the stage, which the impulses complete
+                term.add_gradient(system.stage_positions, system.active.frozen[term], force)
+        total: Array = force[: system.points.n_vertices].sum(axis=0)
+        return total + (system.contact_impulses.loads[:, :3].sum(axis=0) if system.contact_impulses else 0.0)
+
+    def _load_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
+        """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
+        system = self._system
+        if not (self._forces or system.active.viscous):
+            return 0.0
+        t0, t1 = system.t0, system.t1
+        force, wind = np.zeros_like(x1), np.zeros_like(x1)
+        for load in self._forces:
+            for x in (x0, x1) if load.is_follower else (x1, x1):
+                load.add_force(x, t0, t1, force)
+        for x, v in ((x0, v0), (x1, v1)):
+            for term in system.active.viscous:
+                term.add_gradient(v, term.freeze(UpcomingStep(t0, t1, t0, x, system.reference.at)), wind)
+        free = np.where(system.prescribed.free, moved, 0.0)
+        return 0.5 * float(np.vdot((force - wind)[: len(free)], free))
+
+    def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
+        """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
+        system, at = self._system, self._system.prescribed.indices
+        start, self._end_pull, displacement = self._pull, None, moved.take(at)
+        if not displacement.any():
+            return 0.0
+        if start is None:
+            start = system.gradient_of(self._plain, x0)
+        self._end_pull = system.gradient_of(self._plain, x1)
+        force = 0.5 * (start + self._end_pull).take(at)
+        targets, weight = np.zeros_like(x1), np.zeros_like(x1)
+        for time, x in ((system.t0, x0), (system.t1, x1)):
+            for term, frozen in self._frozen(self._targets, time, x).items():
+                term.add_gradient(x, frozen, targets)
+        for load in self._weights:
+            load.add_force(x1, system.t0, system.t1, weight)
+        force += 0.5 * targets.ravel()[at] - weight.ravel()[at] + damping
+        if system.contact_impulses:
+            force += system.contact_impulses.handle_force
+        return float(np.vdot(force, displacement))
+
+    @property
+    def _stiffness_sum(self) -> float:
+        """Sum [N/m] of the stiffnesses of this rank's elements."""
+        if self._stiffness is None:
+            self._stiffness = sum(float(each.sum()) for each in self._system.objective.stiffnesses.values())
+        return self._stiffness
