@@ -5,8 +5,8 @@
 with e = (E_uu, E_vv, 2 E_uv), the library's stiffness C at rest, the strains n_k · e of fibres at 0°, 22.5°,
 45°, 67.5° and 90° to the warp (on both sides) and of the area, and a_k ≥ 0. The second derivative of h is
 min(s/s₁, 1) for stretched fibres, 0 for others, so that W is convex in E, with a continuous second
-derivative. s₁ is the strain of the strained rows, the largest one measured. ``scripts/fit_membranes.py``
-computed the a_k by non-negative least squares from the stresses of the tables, see `fit_errors`.
+derivative. s₁ is the strain of the strained rows, the largest one measured. The a_k
+were computed by non-negative least squares from the stresses of the tables, see `fit_errors`.
 
 Sources: tables of Wang, O'Brien & Ramamoorthi, ACM TOG 30(4):71 (2011), read as by ARCSim (whose stresses do
 not derive from an energy); energies of fibres for wovens Clyde, Teran & Tamstorf, SCA 2017.
