@@ -12,15 +12,15 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.protocols import LimitsStep, Place, Stateful, TermState
 from lyra_petsc.terms.registry import Registration, Role
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic
 
 DISTANCE, STIFFNESS = 0.08, 4.0e3
 """d [m] and k [N/m²]."""
 
 
-class Repulsion(Elastic):
+class Repulsion(Stateful, LimitsStep):
     """Springs between vertices nearer than `DISTANCE`, and a count of the steps in which each is repelled."""
 
     skin = 0.02
@@ -69,15 +69,21 @@ class Repulsion(Elastic):
         longest = float(np.linalg.norm(dx, axis=1).max(initial=0.0))
         return 0.5 * DISTANCE / max(longest, 0.5 * DISTANCE)
 
+    def acts(self, x: Array, frozen: None) -> bool:
+        return bool((self._pairs(x)[2] > 0.0).any())
+
     def accept(self, x: Array, frozen: None) -> None:
         near = self.stencil[self._pairs(x)[2] > 0.0].ravel()
         self._touched[np.unique(near[near < len(self._touched)])] += 1.0
 
-    def state(self) -> dict[str, Array]:
-        return {"touched": self._touched}
+    def initialise(self, x: Array) -> None:
+        self._touched[:] = 0.0
 
-    def restore(self, state: Mapping[str, Array]) -> None:
-        self._touched = state["touched"].copy()
+    def state(self) -> dict[str, TermState]:
+        return {"touched": TermState(Place.VERTEX, self._touched)}
+
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        self._touched = values["touched"].copy()
 
     def history(self, x: Array, frozen: None) -> dict[str, float]:
         nearest = self._pairs(x)[1].min(initial=np.inf)
@@ -99,7 +105,5 @@ REPULSION = Registration(
     "repulsion_energy",
     {"pairs": "sum", "nearest": "min"},
     neighbours=True,
-    limits_step=True,
-    state=("touched",),
     module_name=__name__,
 )

@@ -34,9 +34,10 @@ from lyra_petsc.mesh.symmetry import symmetry_walls
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
+from lyra_petsc.terms.protocols import LimitsStep
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Contacts, Elastic, Offsets, Pair, StepInterval, UpcomingStep
+from lyra_petsc.terms.term import Contacts, Offsets, Pair, StepInterval, UpcomingStep
 
 KEPT_FRACTION = 0.2
 """Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
@@ -159,7 +160,7 @@ _EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EM
 NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
 
 
-class ContactBarrier(Elastic):
+class ContactBarrier(LimitsStep):
     """The barrier energy of all near pairs.
 
     Parameters
@@ -367,6 +368,9 @@ class ContactBarrier(Elastic):
             return
         active, on_obstacles = self.active_pairs(x, frozen.stage).forces, np.zeros_like(frozen.stage)
         contact_pairs.add_gradient(x, frozen.stage, *self._pair_data, active, out, on_obstacles)
+
+    def acts(self, x: Array, frozen: ObstaclePositions) -> bool:
+        return bool(self.active_elements(x, frozen).any())
 
     def active_elements(self, x: Array, frozen: ObstaclePositions) -> NDArray[np.bool_]:
         out = np.zeros(self.n_elements, dtype=np.bool_)

@@ -27,8 +27,9 @@ from lyra_petsc.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIF
 from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
+from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Contacts, Elastic, EndFriction, Offsets, StartingFriction, UpcomingStep
+from lyra_petsc.terms.term import Contacts, EndFriction, Offsets, StartingFriction, UpcomingStep
 
 MAX_ELASTIC_SLIP = 0.01
 """Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
@@ -117,7 +118,7 @@ def _order(key: Ints) -> Ints:
     return sort_rows(np.arange(len(key)), key, np.empty((len(key), 0)), 0)
 
 
-class CoulombFriction(Elastic):
+class CoulombFriction(Stateful):
     """Friction of all pairs in contact during a step.
 
     Parameters
@@ -244,12 +245,6 @@ class CoulombFriction(Elastic):
 
     def initialise_pairs(self, x: Array, frozen: ObstacleMotion) -> None:
         self._update_pairs(x, frozen.end_points, self._pairs)
-
-    def element_state(self) -> tuple[Ints, Array]:
-        """Vertices of counted pairs; their kind, obstacle and its points, elastic slip [m], and whether they
-        slid.
-        """
-        return self._pairs.key[:, :4], self._pairs.data[:, : SLID + 1]
 
     @property
     def obstacle_places(self) -> Mapping[str, tuple[int, int]]:
@@ -569,11 +564,19 @@ class CoulombFriction(Elastic):
     def obstacle_forces(self, x: Array, frozen: ObstacleMotion, count: int) -> Array:
         return self._obstacle_loads[:count]
 
-    def state(self) -> dict[str, Array]:
-        return {"friction_work": np.outer(self._work, [1.0, 0.0, 0.0])}
+    def initialise(self, x: Array) -> None:
+        """No pairs are in contact before the first step."""
 
-    def restore(self, state: Mapping[str, Array]) -> None:
-        self._work = state["friction_work"][:, 0].copy()
+    def state(self) -> dict[str, TermState]:
+        """Pairs have their kind, obstacle and its points, elastic slip [m], and whether they slid."""
+        pairs = self._pairs.data[:, : SLID + 1]
+        return {
+            "friction_work": TermState(Place.VERTEX, np.outer(self._work, [1.0, 0.0, 0.0])),
+            "pairs": TermState(Place.ELEMENT, pairs, self._pairs.key[:, :4]),
+        }
+
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        self._work = values["friction_work"][:, 0].copy()
 
     def history(self, x: Array, frozen: ObstacleMotion) -> Mapping[str, float]:
         return {"friction_work": float(self._work.sum())}

@@ -161,7 +161,7 @@ class Recorder:
         system.state.set(arrays["position"], arrays["velocity"])
         terms = simulation.problem.terms
         elements = {
-            name: self._changing_elements(terms[name].registration.element_vertices, rows)
+            name: self._changing_elements(terms[name].stencil.shape[1], rows)
             for name, rows in checkpoint.elements.items()
         }
         simulation.resume(arrays, scalars, checkpoint.edges, elements)
@@ -170,7 +170,7 @@ class Recorder:
         """The arrays of the scene's terms in checkpoints."""
         system, terms = self._simulation.problem.system, self._simulation.problem.terms
         widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(system).items()}
-        elements = {name: (terms[name].registration.element_vertices, n) for name, n in widths.items()}
+        elements = {name: (terms[name].stencil.shape[1], n) for name, n in widths.items()}
         vertices, edges = term_states.vertex_arrays(system), term_states.edge_arrays(system)
         return TermArrays(vertices.keys(), edges.keys(), elements)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
+from lyra_petsc.terms.protocols import HasDirectors, LimitsStep, SharesFrozen, Stateful
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
@@ -30,14 +31,16 @@ class ActiveTerms:
         Terms that add to the energy of the sheet, and springs by which handles pull.
     moving, pushing : list of Elastic
         Terms of ``sheet`` with moving targets; of these the ones whose targets do work by forces (obstacles).
-    limiting : list of Elastic
-        Terms that limit the length of Newton's steps.
+    limiting : list of LimitsStep
+        Terms that limit the length of steps.
+    stateful : list of Stateful
+        Terms with a state.
     changing : list of Elastic
         Terms whose stencils change (pairs that are near).
     separating : list of Elastic
         Terms of ``changing`` that keep parts from passing through each other (contact).
-    with_edges : list of Elastic
-        Terms with unknowns of edges.
+    with_edges : list of HasDirectors
+        Terms with directors.
     coarse : dict of Elastic → Elastic
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
     frozen : dict of Term
@@ -54,10 +57,11 @@ class ActiveTerms:
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.moving = [term for term in self.sheet if term.moving]
         self.pushing = [term for term in self.moving if term.pushes]
-        self.limiting = [term for term in self.elastic if term.registration.limits_step]
+        self.limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
+        self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
         self.changing = [term for term in self.elastic if term.registration.neighbours]
         self.separating = [term for term in self.changing if term.detects_collisions]
-        self.with_edges = [term for term in self.elastic if term.registration.edge_state]
+        self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
@@ -69,7 +73,9 @@ class ActiveTerms:
     def refreeze(self, changed: Mapping[Any, Any]) -> None:
         """Replace the frozen data of terms, and of the terms that share it as their partners."""
         partners: dict[Term, Any] = {
-            term: changed[term.partner] for term in self.elastic if term.partner and term.partner in changed
+            term: changed[term.partner]
+            for term in self.elastic
+            if isinstance(term, SharesFrozen) and term.partner in changed
         }
         self.frozen = {**self.frozen, **changed, **partners}
 

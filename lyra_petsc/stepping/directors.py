@@ -12,7 +12,8 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.terms.term import LARGEST_ROTATION, Term
+from lyra_petsc.terms.protocols import LARGEST_ROTATION
+from lyra_petsc.terms.term import Term
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.stage_equations import StageEquations

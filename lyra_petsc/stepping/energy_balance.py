@@ -16,7 +16,7 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
-from lyra_petsc.terms.term import HandleTerm
+from lyra_petsc.terms.protocols import MovingTargets, PullsHandles
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
@@ -150,7 +150,7 @@ class EnergyBalance:
                 frozen = system.active.frozen[term]
                 energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
                 energies[name] += energy
-                moving += energy if term.moving and not term.pushes else 0.0
+                moving += energy if isinstance(term, MovingTargets) else 0.0
         for load in system.active.loads:
             if name := load.registration.energy:
                 energies[name] += load.potential(system.x)
@@ -218,7 +218,9 @@ class EnergyBalance:
     def _moving_targets(self) -> list[tuple[Array, Array]]:
         """Positions of the targets that move with handles, and the forces on them, by term."""
         active, x = self._system.active, self._system.x
-        return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
+        return [
+            term.targets(x, active.frozen[term]) for term in active.moving if isinstance(term, MovingTargets)
+        ]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
         """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
@@ -283,7 +285,7 @@ class EnergyBalance:
         for number, forces, _ in system.held.shares(system.t0, system.t1, self.reaction):
             local[number] = forces.sum(axis=0)
         for term in system.active.elastic:
-            if isinstance(term, HandleTerm):
+            if isinstance(term, PullsHandles):
                 local += term.handle_forces(system.x, system.active.frozen[term], count)
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)

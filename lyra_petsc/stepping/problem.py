@@ -45,6 +45,7 @@ from lyra_petsc.terms.handles.prescribed_handles import (
     select_exact,
 )
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.protocols import HasDirectors
 from lyra_petsc.terms.registry import Role, make_term, needed_terms, registration_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term
@@ -221,7 +222,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     for entry in map(registration_of, names):
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
-        if entry.edge_state and any(handle.holds_slope for handle in scene.handles):
+        if issubclass(entry.kind, HasDirectors) and any(handle.holds_slope for handle in scene.handles):
             from lyra_petsc.terms.bending import midedge_clamp  # only scenes with clamps need it
 
             clamps = midedge_clamp.elements(rest)
@@ -439,7 +440,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
     system.stage_positions[:] = system.x
-    for term in system.active.elastic:
+    for term in system.active.stateful:
         term.initialise(system.x)
     system.hold_targets(0.0)
     refuse_contact(system, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)

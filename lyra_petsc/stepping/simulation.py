@@ -44,6 +44,7 @@ from lyra_petsc.stepping.step_control import (
 )
 from lyra_petsc.stepping.stepper import WOULD_CROSS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
+from lyra_petsc.terms.protocols import Dissipates
 
 SMALLEST_FRACTION = 2.0**-12
 """Smallest Δt of a retry over the nominal Δt (``-ts_adapt_dt_min`` overrides it)."""
@@ -202,8 +203,8 @@ class SteppedScene:
         self.stepper.start(0.0, 0)
         if self.problem.points.n_edges_global and not self.stepper.balance_edge_moments(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
-        for term in system.active.elastic:
-            if term.registration.element_vertices:  # friction has no contacts from an earlier step
+        for term in system.active.stateful:
+            if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
                 term.initialise(system.x)
         self.notes += nothing_acts(scene, system, event_times(scene), self.control.end, floor)
         self._equilibrium: Equilibrium | None = None
@@ -349,10 +350,8 @@ class SteppedScene:
                 f"{when}: {self.stepper.stopped_by} stopped Newton's method at a residual of "
                 f"{attempt.residual:.2g} N, short of solver.force_tolerance",
             )
-        for term in system.active.elastic:
-            entry = term.registration
-            if entry.state or entry.edge_state or entry.element_vertices:
-                term.accept(system.x, system.active.frozen[term])
+        for term in system.active.stateful:
+            term.accept(system.x, system.active.frozen[term])
         system.set_references(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
@@ -641,7 +640,7 @@ class SteppedScene:
         """
         system = self.problem.system
         system.state.update_ghosts()
-        term_states.restore_fixed(system, edges, elements)
+        term_states.restore_fixed(system, arrays, edges, elements)
         self.time, self.step_number = scalars["time"], scalars["step"]
         # loads and handles that only the changed scene starts earlier start now; the others have started
         system.set_references(self.time)
@@ -657,7 +656,7 @@ class SteppedScene:
             self.guard.restore(scalars["energy"], same=scalars["scheme"] == self.scene.time.scheme)
         if self.local_error is not None:
             self.local_error.restore(arrays, scalars["integrator"])
-        term_states.restore_changing(system, arrays, elements, scalars["obstacles"])
+        term_states.restore_changing(system, elements, scalars["obstacles"])
         self.stepper.restore(arrays, scalars, self.time, self.step_number)
         self.totals |= scalars["totals"]
         self.stability = self.stability and scalars["stability"]

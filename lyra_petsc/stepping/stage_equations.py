@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +42,15 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.start_acceleration import StartAcceleration
 from lyra_petsc.stepping.state import State, resized
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
+from lyra_petsc.terms.protocols import FollowsHandles
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import ContactImpulses
 
+
+Energy = TypeVar("Energy", bound=Elastic)
 
 FOLLOWED = 0.1
 """Change of the normal forces in a step over their sum above which the step is solved again with friction by
@@ -130,7 +133,8 @@ class StageEquations:
         self.active = active = ActiveTerms(terms)
         self.usual, self.in_contact = integrator, integrator.for_contact() if active.changing else integrator
         self.held = held
-        rows = np.concatenate([held.reference_rows, *(term.reference_rows for term in terms)])
+        following = [term.reference_rows for term in terms if isinstance(term, FollowsHandles)]
+        rows = np.concatenate([held.reference_rows, *following])
         self.reference = ReferencePositions(self.points, rows, starts)
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
@@ -554,7 +558,7 @@ class StageEquations:
         self._squares.append(squared_norm_without(part.reshape(-1), self.prescribed.not_counted))
         return name, part
 
-    def present(self, terms: Sequence[Elastic]) -> list[Elastic]:
+    def present(self, terms: Sequence[Energy]) -> list[Energy]:
         """Those of ``terms`` that have elements on any rank: all while something is near."""
         near = self.discretisation.has_near_elements
         return [term for term in terms if near or not term.registration.neighbours]

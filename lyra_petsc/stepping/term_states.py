@@ -1,69 +1,80 @@
 """State of the terms in a checkpoint, independent of the number of ranks; collective.
 
-Entries of vertices and of edges have the key ``term.entry``. Entries of elements are identified by the
-numbers of the vertices in the mesh.
+Entries of vertices and of edges have the key ``term.entry``. Entries of elements have the term's name, and
+each element is identified by the numbers of its vertices in the mesh.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.term import Elastic
+
+
+def _entries(system: StageEquations, place: Place) -> Iterator[tuple[Stateful, str, TermState]]:
+    """The entries of all terms at a place, with term and name."""
+    for term in system.active.stateful:
+        for name, entry in term.state().items():
+            if entry.place is place:
+                yield term, name, entry
 
 
 def vertex_arrays(system: StageEquations) -> dict[str, Array]:
     """The terms' arrays (n_vertices, 3) of the owned vertices, by key."""
-    return {
-        f"{term.name}.{name}": values
-        for term in system.active.elastic
-        for name, values in term.state().items()
-    }
+    return {f"{term.name}.{name}": entry.values for term, name, entry in _entries(system, Place.VERTEX)}
 
 
 def edge_arrays(system: StageEquations) -> dict[str, Array]:
     """The terms' arrays (n_edges,) of the owned edges with an unknown, by key."""
     layout, found = system.points, {}
-    for term in system.active.elastic:
-        for name, values in term.edge_state().items():
-            rows = np.zeros(3 * layout.n_local)
-            rows[term.edge_indices] = values
-            found[f"{term.name}.{name}"] = rows[layout.edge_indices]
+    for term, name, entry in _entries(system, Place.EDGE):
+        rows = np.zeros(3 * layout.n_local)
+        rows[_edge_indices(term)] = entry.values
+        found[f"{term.name}.{name}"] = rows[layout.edge_indices]
     return found
 
 
 def element_arrays(system: StageEquations) -> dict[str, Array]:
     """Rows (E, n + m) of owned elements, by term: n mesh numbers of vertices, then m values."""
     layout, found = system.points, {}
-    for term in system.active.elastic:
-        if term.registration.element_vertices:
-            if term.registration.neighbours:
-                vertices, values = term.element_state()
-            else:
-                vertices = layout.global_number[term.stencil[: term.n_owned]]
-                values = term.element_values()[: term.n_owned]
-            numbers = layout.mesh_vertex_of_local()[layout.local(vertices.ravel())].reshape(vertices.shape)
-            found[term.name] = np.concatenate([numbers, values], axis=1)
+    for term, _, entry in _entries(system, Place.ELEMENT):
+        vertices, values = entry.vertices, entry.values
+        if vertices is None:
+            vertices, values = layout.global_number[term.stencil[: term.n_owned]], values[: term.n_owned]
+        numbers = layout.mesh_vertex_of_local()[layout.local(vertices.ravel())].reshape(vertices.shape)
+        found[term.name] = np.concatenate([numbers, values], axis=1)
     return found
 
 
 def restore_fixed(
-    system: StageEquations, edges: Mapping[str, Array], elements: Mapping[str, tuple[Ints, Array]]
+    system: StageEquations,
+    arrays: Mapping[str, Array],
+    edges: Mapping[str, Array],
+    elements: Mapping[str, tuple[Ints, Array]],
 ) -> None:
-    """Restore the state of edges, and of elements with fixed stencils.
+    """Restore the state of vertices, of edges, and of elements with fixed stencils.
 
-    ``elements`` has for each term the global numbers (E, n) of vertices and the values (E, m) of elements,
-    each on any rank.
+    A term that a checkpoint knows nothing of keeps its state. ``elements`` has for each term the global
+    numbers (E, n) of vertices and the values (E, m) of elements, each on any rank.
     """
-    for term in system.active.elastic:
-        if term.registration.edge_state:
-            _restore_edges(system, term, edges)
-        if term.name in elements and not term.registration.neighbours:
-            vertices, values = _send_to_owners(system, *elements[term.name])
-            _restore_values(term, system.points.global_number[term.stencil], vertices, values)
+    for term in system.active.stateful:
+        found = {}
+        for name, entry in term.state().items():
+            key = f"{term.name}.{name}"
+            if entry.place is Place.VERTEX and key in arrays:
+                found[name] = arrays[key]
+            elif entry.place is Place.EDGE and key in edges:
+                found[name] = _of_local_edges(system, term, edges[key])
+            elif entry.place is Place.ELEMENT and entry.vertices is None and term.name in elements:
+                rows = _send_to_owners(system, *elements[term.name])
+                found[name] = _in_order(system.points.global_number[term.stencil], *rows, entry.values)
+        if found:
+            term.restore(found, system.x)
 
 
 def obstacle_places(system: StageEquations) -> dict[str, tuple[int, int]]:
@@ -73,20 +84,16 @@ def obstacle_places(system: StageEquations) -> dict[str, tuple[int, int]]:
 
 def restore_changing(
     system: StageEquations,
-    arrays: Mapping[str, Array],
     elements: Mapping[str, tuple[Ints, Array]],
     places: Mapping[str, tuple[int, int]],
 ) -> None:
-    """Restore the state of vertices, and of elements with changing stencils (pairs that are near).
+    """Restore the state of elements with changing stencils (pairs that are near).
 
     ``places`` are the `obstacle_places` of the checkpoint.
     """
     layout = system.points
-    for term in system.active.elastic:
-        names = term.registration.state
-        if names and all(f"{term.name}.{name}" in arrays for name in names):
-            term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
-        if term.name in elements and term.registration.neighbours:
+    for term in system.active.changing:
+        if term.name in elements:
             own = range(layout.start, layout.start + layout.n_owned)
             term.restore_elements(*_send_to_owners(system, *elements[term.name]), own, places)
             term.initialise_pairs(system.x, system.active.frozen[term])
@@ -102,25 +109,28 @@ def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tu
     return vertices, values
 
 
-def _restore_edges(system: StageEquations, term: Elastic, edges: Mapping[str, Array]) -> None:
-    """Restore a term's state of edges, ghosts included."""
-    layout, state = system.points, {}
-    for name in term.registration.edge_state:
-        rows = np.zeros((layout.n_local, 3))
-        rows.ravel()[layout.edge_indices] = edges[f"{term.name}.{name}"]
-        layout.update_ghosts(rows)
-        state[name] = rows.ravel()[term.edge_indices]
-    term.restore_edges(state, system.x)
+def _edge_indices(term: Elastic) -> Ints:
+    """Indices (n,) of the unknowns of a term's edges in flattened arrays over local rows."""
+    return np.empty(0, dtype=np.int64) if term.edges is None else np.unique(term.edges).astype(np.int64)
 
 
-def _restore_values(term: Elastic, own: Ints, vertices: Ints, values: Array) -> None:
-    """Restore the values of a term's elements.
+def _of_local_edges(system: StageEquations, term: Elastic, owned: Array) -> Array:
+    """Values of a term's edges, ghosts included, from those of the owned edges."""
+    layout = system.points
+    rows = np.zeros((layout.n_local, 3))
+    rows.ravel()[layout.edge_indices] = owned
+    layout.update_ghosts(rows)
+    return rows.ravel()[_edge_indices(term)]
 
-    ``own`` (E, n) are the vertices of its elements, ``vertices`` (k, n) and ``values`` (k, m) those of the
-    checkpoint, in another order. Elements that are not in the checkpoint keep their values.
+
+def _in_order(own: Ints, vertices: Ints, values: Array, present: Array) -> Array:
+    """Values (k, m) of a checkpoint's elements in the order of a term's.
+
+    ``own`` (E, n) are the vertices of the term's elements, ``vertices`` (k, n) those of the checkpoint.
+    Elements that are not in the checkpoint keep their ``present`` values (E, m).
     """
     row_of = {tuple(key): row for row, key in enumerate(vertices.tolist())}
     rows = np.array([row_of.get(tuple(key), -1) for key in own.tolist()], dtype=np.int64)
-    restored = term.element_values().copy()
+    restored = present.copy()
     restored[rows >= 0] = values[rows[rows >= 0]]
-    term.restore_values(restored)
+    return restored

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,16 +57,8 @@ class Registration:
         Whether stiffness-proportional damping acts through the term.
     bends : bool
         Whether the term resists bending; without such a term sheets wrinkle as finely as their mesh.
-    moving : bool
-        Whether the energy depends on the positions of moving handles, which thereby do work on the sheet.
     neighbours : bool
         Whether stencils change as points come near each other.
-    limits_step : bool
-        Whether the term limits the length of Newton's steps and of their first guess.
-    state, edge_state : tuple of str
-        Names of the arrays on vertices, and on edges with an unknown, that a checkpoint holds for the term.
-    element_vertices : int
-        Number of vertices of each element of a term whose elements have a state in checkpoints, else 0.
     coarse : str
         Name of the term that replaces this one on coarse levels of multigrid, which have no edge unknowns.
         This term's module then has ``coarse_elements(rest)``, the elements of that term.
@@ -81,18 +73,19 @@ class Registration:
     columns: Mapping[str, str] = field(default_factory=dict)
     damped: bool = False
     bends: bool = False
-    moving: bool = False
     neighbours: bool = False
-    limits_step: bool = False
-    state: tuple[str, ...] = ()
-    edge_state: tuple[str, ...] = ()
-    element_vertices: int = 0
     coarse: str = ""
     module_name: str = ""
 
     def module(self) -> ModuleType:
         """Import and return the term's module."""
         return import_module(self.module_name or f".{self.name}", __package__)
+
+    @property
+    def kind(self) -> type[Term]:
+        """Class of the term, which its module's ``make`` declares to return."""
+        returned: type[Term] = get_type_hints(self.module().make)["return"]
+        return returned
 
 
 def _bends_by(model: str) -> Need:
@@ -131,7 +124,6 @@ REGISTRY: list[Registration] = [
         "bending_energy",
         damped=True,
         bends=True,
-        edge_state=("frame",),
         coarse="bending",
         module_name=".bending.midedge",
     ),
@@ -140,7 +132,6 @@ REGISTRY: list[Registration] = [
         _has_bending_friction,
         Role.ELASTIC,
         "bending_energy",
-        element_vertices=3,
         coarse="bending",
         module_name=".bending.midedge_friction",
     ),
@@ -149,7 +140,6 @@ REGISTRY: list[Registration] = [
         lambda scene, shells: any(shell.friction_force > 0.0 for shell in shells),
         Role.ELASTIC,
         "membrane_energy",
-        element_vertices=3,
     ),
     Registration(
         "contact",
@@ -158,7 +148,6 @@ REGISTRY: list[Registration] = [
         "contact_energy",
         {"contacts": "sum", "smallest_gap": "min", "friction_work": "sum"},
         neighbours=True,
-        limits_step=True,
         module_name="lyra_petsc.contact.barrier",
     ),
     Registration(
@@ -167,8 +156,6 @@ REGISTRY: list[Registration] = [
         Role.CONSTRAINT,
         columns={"friction_work": "sum"},
         neighbours=True,
-        state=("friction_work",),
-        element_vertices=4,
         module_name="lyra_petsc.contact.friction",
     ),
     Registration(
@@ -178,7 +165,6 @@ REGISTRY: list[Registration] = [
         "bending_energy",
         damped=True,
         bends=True,
-        moving=True,
         module_name=".bending.hinge_clamp",
     ),
     Registration(

@@ -6,6 +6,7 @@ For each triangle of rest area A with the shear strain γ = 2 E_uv of ``membrane
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,14 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.coulomb import FrictionLimits
+from lyra_petsc.terms.protocols import Dissipates, Place, TermState
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic
 
 YIELD_SHEAR = 0.002
 """γ_y: change of shear at which friction reaches its limit."""
 
 
-class ShearFriction(Elastic):
+class ShearFriction(Dissipates):
     """Shear friction of all triangles.
 
     Parameters
@@ -88,11 +89,11 @@ class ShearFriction(Elastic):
         slid = self._friction.slid(self._shear(x)[0] - self.sheared)
         return float(np.sum((self._friction.limit * np.abs(slid))[: self.n_owned]))
 
-    def element_values(self) -> Array:
-        return self.sheared[:, None]
+    def state(self) -> dict[str, TermState]:
+        return {"sheared": TermState(Place.ELEMENT, self.sheared[:, None])}
 
-    def restore_values(self, values: Array) -> None:
-        self.sheared = values[:, 0].copy()
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        self.sheared = values["sheared"][:, 0].copy()
 
 
 def elements(rest: RestShape) -> Elements:

@@ -32,9 +32,6 @@ Offsets = NDArray[np.int32] | NDArray[np.int64]
 CHUNK_VALUES = 32_768
 """Scalars of element Hessians computed before they are added to the matrix, few enough to stay in cache."""
 
-LARGEST_ROTATION = 1.0
-"""Largest angle [rad] by which a Newton iteration may rotate a director relative to its triangles."""
-
 
 class OffDiagonal(NamedTuple):
     """Pairs of rows (E, 2) for which only the off-diagonal block of the two rows is assembled."""
@@ -153,11 +150,6 @@ class Term(ABC):
         if self.edges is None:
             return {self.name: self.stencil}
         return {f"{self.name} vertices": self.stencil, self.name: MixedStencil(self.stencil, self.edges)}
-
-    @property
-    def reference_rows(self) -> Ints:
-        """Local rows (n,) for which ``freeze`` calls `UpcomingStep.reference`."""
-        return np.empty(0, dtype=np.int64)
 
     def freeze(self, step: UpcomingStep) -> Any:
         """Data that are constant during the step; passed to all methods in the step as ``frozen``."""
@@ -308,6 +300,11 @@ class Elastic(Term):
     surface: NDArray[np.int32] | None = None
     """Triangles (F, 3), in local rows, that ``neighbours`` searches; None: it searches points."""
 
+    @property
+    def moving(self) -> bool:
+        """Whether the energy depends on moving targets or obstacles, which thereby do work on the sheet."""
+        return False
+
     pushes: bool = False
     """Whether the work of moving obstacles is computed from forces (`work`) and not from the energy, which
     their motion alone may make infinite."""
@@ -322,11 +319,6 @@ class Elastic(Term):
     def detects_collisions(self) -> bool:
         """Whether the term keeps parts from passing through each other, however long a step is."""
         return bool(np.isfinite(self.approach_limit))
-
-    @property
-    def moving(self) -> bool:
-        """Whether the energy depends on moving targets or obstacles, which thereby do work on the sheet."""
-        return self.registration.moving
 
     def connect(self, terms: Iterable[Term]) -> None:
         """Look up the other terms of the scene that this one needs; called before all other methods."""
@@ -387,9 +379,6 @@ class Elastic(Term):
     slips: bool = False
     """Whether it is friction of contacts, whose force changes too abruptly for one linear solve per step."""
 
-    partner: Elastic | None = None
-    """The term whose ``frozen`` data this one is given as well, as it depends on them (friction)."""
-
     # -- terms whose stencils change ---------------------------------------------------------------
 
     def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
@@ -413,13 +402,6 @@ class Elastic(Term):
     def active_elements(self, x: Array, frozen: Any) -> NDArray[np.bool_]:
         """Which elements (E,) have a non-zero Hessian at positions x (n_local, 3)."""
         return np.ones(self.n_elements, dtype=np.bool_)
-
-    def largest_step(self, x: Array, dx: Array, frozen: Any) -> float:
-        """Largest fraction, up to 1, of Newton's increment dx (n_local, 3) [m] of x that may be applied.
-
-        The first guess is an increment of positions where all free vertices stay.
-        """
-        return 1.0
 
     def springs(self, x: Array, approach: float, frozen: Any) -> Any:
         """One-sided springs for the pairs that are in contact at x (n_local, 3), or may be after points have
@@ -485,12 +467,6 @@ class Elastic(Term):
         """
         return None
 
-    def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
-        """Target positions [m] of this rank's owned elements, and the energy's gradient by them [N], (n, 3)
-        each; of a ``moving`` term whose work follows from its energy.
-        """
-        raise NotImplementedError
-
     def work(self, x: Array, at: float, start: float, end: float) -> float:
         """Work [J] of moving obstacles on this rank's elements between the times ``start`` and ``end`` [s].
 
@@ -516,14 +492,6 @@ class Elastic(Term):
         those of the obstacles.
         """
         return dx
-
-    def initialise(self, x: Array) -> None:
-        """Initialise the state of the term at positions x (n_local, 3), at the start of a run."""
-
-    # -- state and history -------------------------------------------------------------------------
-
-    def accept(self, x: Array, frozen: Any) -> None:
-        """Update the state of the term after an accepted step to positions x (n_local, 3)."""
 
     def work_of_targets(self, ends: tuple[Array, Array], frozen: tuple[Any, Any]) -> float:
         """Work [J] of the targets' motion in a step: the change of energy at fixed positions, averaged over
@@ -561,33 +529,6 @@ class Elastic(Term):
     def heat(self, x: Array, frozen: Any) -> float:
         """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
         return 0.0
-
-    def element_values(self) -> Array:
-        """State (E, m) of elements with a fixed stencil, for checkpoints."""
-        raise NotImplementedError
-
-    def restore_values(self, values: Array) -> None:
-        """Restore the state (E, m) that ``element_values`` returned."""
-        raise NotImplementedError
-
-    def state(self) -> dict[str, Array]:
-        """State of the owned vertices, (n_vertices, 3), for checkpoints, by the names in the registration."""
-        return {}
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Restore the state that ``state`` returned."""
-
-    @property
-    def edge_indices(self) -> Ints:
-        """Indices (n,) of the unknowns of this term's edges in flattened arrays over local rows."""
-        return np.empty(0, dtype=np.int64)
-
-    def edge_state(self) -> dict[str, Array]:
-        """State of the edges, one number each (n,), for checkpoints, by the names in the registration."""
-        return {}
-
-    def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
-        """Restore the state of the edges at positions x (n_local, 3)."""
 
     def initialise_pairs(self, x: Array, frozen: Any) -> None:
         """Store the pairs in contact at positions x (n_local, 3), where a run begins or is resumed."""
@@ -639,12 +580,6 @@ class Elastic(Term):
         """Set the friction (m, 2) [N] of the pairs of `starting_friction`; of a term that `slips`."""
         raise NotImplementedError
 
-    def element_state(self) -> tuple[Ints, Array]:
-        """State of changing elements that this rank counts, for checkpoints: the global numbers of their
-        vertices (E, n) and their values (E, m).
-        """
-        raise NotImplementedError
-
     @property
     def obstacle_places(self) -> Mapping[str, tuple[int, int]]:
         """Number of each obstacle in ``element_state``, and of its first point, by name."""
@@ -658,50 +593,9 @@ class Elastic(Term):
         ``places`` were the ``obstacle_places``.
         """
 
-    def largest_rotation(self, increment: Array) -> float:
-        """Largest angle [rad] by which an increment (n_owned, 3) [m] rotates directors of owned edges."""
-        return 0.0
-
-    def clear_cache(self) -> None:
-        """Free everything that can be computed again from positions."""
-
-    def edge_stiffness(self, weight: Array | None = None) -> Array:
-        """Stiffness [N/m] of the edges' unknowns at rest, (n,), of elements times ``weight`` (E,)."""
-        return np.empty(0)
-
-    def updated_frames(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:
-        """New frozen frames for positions x, where edges have turned far from theirs; None if none has.
-
-        Edges with prescribed unknowns, ``held`` (n_local, 3), keep theirs. Energy and unknowns stay the same.
-        """
-        return None
-
-    def frames_at_end(self, x: Array, frozen: Any) -> Any:
-        """Frozen frames for positions x at the end of a step; ``accept`` then takes them unchanged."""
-        return frozen
-
-    def edge_increments(
-        self, x: Array, increment: Array, frozen: Any, displacement: Array | None = None
-    ) -> tuple[Ints, Array]:
-        """Corrected increments (n,) [m] of edge unknowns, and the indices (n,) of the latter.
-
-        They keep directors in line with their triangles where an increment (n_local, 3) [m] from positions x
-        rotates edges far, and equal its own to first order. Returned for edges that rotate by more than
-        `LARGEST_ROTATION`; for all if the vertices move by ``displacement`` (n_local, 3) [m] instead.
-        """
-        return np.empty(0, dtype=np.int64), np.empty(0)
-
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
         """This rank's part of each additional column of history.csv that the registration names."""
         return {}
-
-
-class HandleTerm(Elastic):
-    """An elastic energy by which handles pull the sheet."""
-
-    @abstractmethod
-    def handle_forces(self, x: Array, frozen: Any, count: int) -> Array:
-        """Force [N] of each of the scene's ``count`` handles on this rank's elements, (count, 3)."""
 
 
 class Viscous(Term):

@@ -557,15 +557,18 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
     unbroken = gathered(simulation.problem.points, simulation.problem.system.x)
     term = simulation.problem.terms["friction"]
     assert isinstance(term, CoulombFriction)
-    vertices, pairs = term.element_state()
+    stored = term.state()["pairs"]
+    vertices, pairs = stored.vertices, stored.values
+    assert vertices is not None
     between = (pairs[:, 0] == EDGE_EDGE) & (pairs[:, 1] < 0)
     renamed, turned = vertices.copy(), pairs.copy()
     renamed[between] = vertices[between][:, [3, 2, 1, 0]]
     turned[between, 6:9] *= -1.0
     layout = simulation.problem.points
     term.restore_elements(renamed, turned, range(layout.start, layout.start + layout.n_owned), {})
-    for again, before in zip(term.element_state(), (vertices, pairs), strict=True):
-        np.testing.assert_array_equal(again, before)
+    again = term.state()["pairs"]
+    np.testing.assert_array_equal(again.vertices, vertices)
+    np.testing.assert_array_equal(again.values, pairs)
     slips = comm.allgather(np.linalg.norm(pairs[:, 6:9], axis=1).max(initial=0.0))
     kinds = set().union(*comm.allgather({(int(kind), obstacle < 0) for kind, obstacle in pairs[:, :2]}))
     simulation.destroy()
@@ -617,7 +620,7 @@ def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, share
     recorder.resume(shared_tmp / "run")
     term = resumed.problem.terms["friction"]
     assert isinstance(term, CoulombFriction)
-    assert EDGE_EDGE in set().union(*comm.allgather(set(term.element_state()[1][:, 0].tolist())))
+    assert EDGE_EDGE in set().union(*comm.allgather(set(term.state()["pairs"].values[:, 0].tolist())))
     while not resumed.finished:
         recorder.record(resumed.step())
     after = shape(resumed)

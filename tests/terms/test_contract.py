@@ -25,8 +25,9 @@ from physics import Simulation, rotation
 from lyra_petsc.arrays import Array
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames
+from lyra_petsc.terms.protocols import PullsHandles
 from lyra_petsc.terms.registry import REGISTRY, Role
-from lyra_petsc.terms.term import Elastic, HandleTerm, Load, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 pytestmark = pytest.mark.quick
 
@@ -40,7 +41,7 @@ FIXED = [entry for entry in REGISTRY if not entry.neighbours]
 #: step of finite differences [m], small where the force of friction has a kink: in shear after 0.1°
 STEPS = {"shear_friction": 3e-6}
 
-KINDS = {Role.ELASTIC: Elastic, Role.CONSTRAINT: HandleTerm, Role.VISCOUS: Viscous, Role.LOAD: Load}
+KINDS = {Role.ELASTIC: Elastic, Role.CONSTRAINT: PullsHandles, Role.VISCOUS: Viscous, Role.LOAD: Load}
 
 
 def names_of(kind: type[Term]) -> list[str]:

@@ -123,9 +123,9 @@ def test_frames_survive_a_checkpoint(tmp_path: Path) -> None:
         x = simulation.system.x.copy()
         x[:n] = x[:n] @ rotation([1.0, 2.0, 0.5], 0.9).T
         term.accept(x, term.frames)
-        frames, state = term.frames, term.edge_state()
+        frames, state = term.frames, term.state()
         term.frames = type(frames)(np.zeros_like(frames.direction), np.zeros_like(frames.reference))
-        term.restore_edges(state, x)
+        term.restore({name: entry.values for name, entry in state.items()}, x)
         np.testing.assert_allclose(term.frames.reference, frames.reference, rtol=0.0, atol=1e-15)
 
 

@@ -51,9 +51,10 @@ from lyra_petsc.terms.bending.midedge_shape import (
     unit,
 )
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.protocols import LARGEST_ROTATION, HasDirectors, Place, TermState
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import LARGEST_ROTATION, Elastic, Offsets, Term, UpcomingStep
+from lyra_petsc.terms.term import Offsets, Term, UpcomingStep
 
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
@@ -92,7 +93,7 @@ class Edges(NamedTuple):
     of_triangles: NDArray[np.int32]
 
 
-class MidEdge(Elastic):
+class MidEdge(HasDirectors):
     """The bending energy of all triangles.
 
     Parameters
@@ -271,15 +272,15 @@ class MidEdge(Elastic):
         directions(x, self.of_edges.ends, direction)
         return direction
 
-    def edge_state(self) -> dict[str, Array]:
+    def state(self) -> dict[str, TermState]:
         direction, reference = self.frames
         base = some_perpendicular(direction)
         side = np.sum(np.cross(direction, base) * reference, axis=1)
-        return {"frame": np.arctan2(side, np.sum(base * reference, axis=1))}
+        return {"frame": TermState(Place.EDGE, np.arctan2(side, np.sum(base * reference, axis=1)))}
 
-    def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
         direction = self._edge_directions(x)
-        base, angle = some_perpendicular(direction), state["frame"][:, None]
+        base, angle = some_perpendicular(direction), values["frame"][:, None]
         self.frames = Frames(direction, np.cos(angle) * base + np.sin(angle) * np.cross(direction, base))
 
     @property

@@ -26,9 +26,10 @@ from lyra_petsc.terms.bending import hinge, midedge, midedge_energy
 from lyra_petsc.terms.bending.hinge import edge_in_material
 from lyra_petsc.terms.bending.midedge import NO_FRICTION, MidEdge
 from lyra_petsc.terms.bending.midedge_shape import Frames
+from lyra_petsc.terms.protocols import Dissipates, Place, SharesFrozen, TermState
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
+from lyra_petsc.terms.term import Offsets, Term, UpcomingStep
 
 YIELD_CURVATURE = 2.0
 """κ_y [1/m]: change of curvature at which friction reaches its limit."""
@@ -52,7 +53,7 @@ class Sliding(NamedTuple):
     tangent: Array
 
 
-class MidEdgeFriction(Elastic):
+class MidEdgeFriction(Dissipates, SharesFrozen):
     """Friction of all triangles; `connect` must be called next.
 
     Parameters
@@ -171,11 +172,11 @@ class MidEdgeFriction(Elastic):
         self._become(bent)
         return before - after
 
-    def element_values(self) -> Array:
-        return self.bent
+    def state(self) -> dict[str, TermState]:
+        return {"bent": TermState(Place.ELEMENT, self.bent)}
 
-    def restore_values(self, values: Array) -> None:
-        self._become(values.copy())
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        self._become(values["bent"].copy())
 
 
 def elements(rest: RestShape) -> Elements:

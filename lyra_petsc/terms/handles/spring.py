@@ -18,8 +18,9 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.handles.motion import Motion, Window, motion_of
+from lyra_petsc.terms.protocols import PullsHandles
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import HandleTerm, UpcomingStep
+from lyra_petsc.terms.term import UpcomingStep
 
 ORIGINAL_STIFFNESS = 1000.0
 """Stiffness [N/m] of the original Lyra, which exact handles have while they fade."""
@@ -40,7 +41,7 @@ class HandleSprings(NamedTuple):
     stiffness: Array
 
 
-class Spring(HandleTerm):
+class Spring(PullsHandles):
     """Springs of all soft or fading handles.
 
     Parameters

@@ -1,0 +1,170 @@
+"""What only some terms have, each a small interface beside `Elastic`; the program looks for it by class.
+
+``tests/terms/test_protocols.py`` checks every registered term that has one.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.terms.term import Elastic
+
+LARGEST_ROTATION = 1.0
+"""Largest angle [rad] by which a Newton iteration may rotate a director relative to its triangles."""
+
+
+class Place(Enum):
+    """Where numbers of a term's state belong to."""
+
+    VERTEX = "vertices"
+    EDGE = "edges"
+    ELEMENT = "elements"
+
+
+class TermState(NamedTuple):
+    """Numbers of a term's state.
+
+    Attributes
+    ----------
+    place : Place
+    values : (n, m) or (n,)
+        Of the owned vertices (n, 3), of the term's edges (n,) in the order of its unknowns, or of its
+        elements (n, m).
+    vertices : (n, k) or None
+        Global numbers of the elements' vertices, of those that this rank counts; None: the values are those
+        of the term's stencil.
+    """
+
+    place: Place
+    values: Array
+    vertices: Ints | None = None
+
+
+class Stateful(Elastic):
+    """An energy that depends on the steps before, by a state that checkpoints hold."""
+
+    @abstractmethod
+    def initialise(self, x: Array) -> None:
+        """Set the state at positions x (n_local, 3), at the start of a run."""
+
+    @abstractmethod
+    def accept(self, x: Array, frozen: Any) -> None:
+        """Update the state after an accepted step to positions x (n_local, 3)."""
+
+    @abstractmethod
+    def state(self) -> Mapping[str, TermState]:
+        """The state by name; at most one entry belongs to elements."""
+
+    @abstractmethod
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        """Restore entries of a `state` at positions x (n_local, 3)."""
+
+
+class Dissipates(Stateful):
+    """An energy of which a part becomes heat when a step is accepted: friction within the fabric."""
+
+    @abstractmethod
+    def heat(self, x: Array, frozen: Any) -> float:
+        """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
+
+
+class LimitsStep(Elastic):
+    """An energy that is infinite beyond a limit, which no step may pass.
+
+    Its forces change so abruptly near the limit that steps in which it acts take all of Newton's iterations,
+    by an integrator whose stage is the end of the step.
+    """
+
+    @abstractmethod
+    def largest_step(self, x: Array, dx: Array, frozen: Any) -> float:
+        """Largest fraction, up to 1, of the increment dx (n_local, 3) [m] of x that Newton's method, or its
+        first guess, may apply.
+        """
+
+    @abstractmethod
+    def acts(self, x: Array, frozen: Any) -> bool:
+        """Whether any element of this rank has an energy at positions x (n_local, 3)."""
+
+
+class FollowsHandles(Elastic):
+    """An energy of the distance from targets that move with handles."""
+
+    @property
+    @abstractmethod
+    def reference_rows(self) -> Ints:
+        """Local rows (n,) for which ``freeze`` calls `UpcomingStep.reference`."""
+
+
+class MovingTargets(FollowsHandles):
+    """An energy stored in the sheet on which targets do work as they move."""
+
+    @property
+    def moving(self) -> bool:
+        return True
+
+    @abstractmethod
+    def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
+        """Positions [m] of the targets of the owned elements, and the energy's gradient by them [N], (n, 3)
+        each.
+        """
+
+
+class PullsHandles(FollowsHandles):
+    """Springs between handles and the sheet."""
+
+    @abstractmethod
+    def handle_forces(self, x: Array, frozen: Any, count: int) -> Array:
+        """Force [N] of each of the scene's ``count`` handles on this rank's elements, (count, 3)."""
+
+
+class SharesFrozen(Elastic):
+    """An energy whose ``frozen`` data are those of another term, its ``partner``."""
+
+    partner: Elastic
+
+
+class HasDirectors(Stateful):
+    """An energy of directors: unit vectors normal to edges, whose angles in frozen frames are unknowns."""
+
+    @property
+    @abstractmethod
+    def edge_indices(self) -> Ints:
+        """Indices (n,) of the unknowns of this term's edges in flattened arrays over local rows."""
+
+    @abstractmethod
+    def edge_stiffness(self, weight: Array | None = None) -> Array:
+        """Stiffness [N/m] of the edges' unknowns at rest, (n,), of elements times ``weight`` (E,)."""
+
+    @abstractmethod
+    def largest_rotation(self, increment: Array) -> float:
+        """Largest angle [rad] by which an increment (n_owned, 3) [m] rotates directors of owned edges."""
+
+    @abstractmethod
+    def edge_increments(
+        self, x: Array, increment: Array, frozen: Any, displacement: Array | None = None
+    ) -> tuple[Ints, Array]:
+        """Corrected increments (n,) [m] of edge unknowns, and the indices (n,) of the latter.
+
+        They keep directors in line with their triangles where an increment (n_local, 3) [m] from positions x
+        rotates edges far, and equal its own to first order. Returned for edges that rotate by more than
+        `LARGEST_ROTATION`; for all if the vertices move by ``displacement`` (n_local, 3) [m] instead.
+        """
+
+    @abstractmethod
+    def updated_frames(self, x: Array, frozen: Any, held: Mask) -> Any:
+        """New frozen frames for positions x, where edges have turned far from theirs; None if none has.
+
+        Edges with prescribed unknowns, ``held`` (n_local, 3), keep theirs. Energy and unknowns stay the same.
+        """
+
+    @abstractmethod
+    def frames_at_end(self, x: Array, frozen: Any) -> Any:
+        """Frozen frames for positions x at the end of a step; ``accept`` then takes them unchanged."""
+
+    @abstractmethod
+    def clear_cache(self) -> None:
+        """Free everything that can be computed again from positions."""
