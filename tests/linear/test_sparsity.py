@@ -137,6 +137,7 @@ MEMBRANE_SCENE = {
     "membrane",
     "membrane_laws",
     "membrane_laws.stvk",
+    "protocols",
     "registry",
     "remembered",
     "rest",

@@ -223,12 +223,12 @@ def test_history_has_the_columns_and_a_run_resumes_on_other_ranks(comm: MPI.Comm
     recorder.write_checkpoint()
     recorder.flush()
     recorder.close()
-    touched = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
+    touched = gathered(simulation.problem.points, term_of(simulation).state()["touched"].values)
     assert touched.max() > 1.0
     while not simulation.finished:
         simulation.step()
     x = shape(simulation)
-    at_end = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
+    at_end = gathered(simulation.problem.points, term_of(simulation).state()["touched"].values)
     simulation.destroy()
     if comm.rank == 0:
         header, *rows = (folder / "history.csv").read_text().splitlines()

@@ -1,0 +1,392 @@
+"""The small interfaces of terms and the properties of their registrations.
+
+What each promises is checked for every registered term that has it; and the program must ask a term that does
+nothing for it without another answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from examples import example
+from mpi4py import MPI
+from oracle import differences, frozen_by, gradient
+from physics import CLOTH, finished, grid, scene_of, shape, stepped
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.scene.schema import INTEGRATORS, Scene
+from lyra_petsc.terms import registry
+from lyra_petsc.terms.bending import hinge
+from lyra_petsc.terms.bending.midedge import edge_numbers
+from lyra_petsc.terms.protocols import (
+    Dissipates,
+    HasDirectors,
+    LimitsStep,
+    MovingTargets,
+    Place,
+    PullsHandles,
+    SharesFrozen,
+    Stateful,
+    TermState,
+)
+from lyra_petsc.terms.registry import REGISTRY, Registration, Role
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, UpcomingStep
+
+IDENTITY = {"name", "needed", "role", "module_name"}
+
+FLAGS: dict[str, Any] = {
+    "energy": "idle_energy",
+    "columns": {"idle_number": "max"},
+    "damped": True,
+    "bends": True,
+    "neighbours": True,
+    "coarse": "bending",
+}
+"""A value of each property of a registration besides those by which a term is found."""
+
+SOLVER = {"pc_type": "lu", "ksp_rtol": 1e-12}
+MULTIGRID = {"pc_type": "mg", "pc_mg_levels": 2, "ksp_rtol": 1e-12}
+
+COLUMNS = {"energy": {"idle_energy": 0.0}, "columns": {"idle_number": 7.0}}
+"""Columns of history.csv that properties add, and their values."""
+
+
+def having(interface: type[Elastic]) -> Any:
+    """Parametrises a test with the registered terms that have an interface and fixed stencils."""
+    names = [entry.name for entry in REGISTRY if not entry.neighbours and issubclass(entry.kind, interface)]
+    return pytest.mark.parametrize("name", names)
+
+
+def bent(x: Array, size: float = 0.02, seed: int = 5) -> Array:
+    """Positions or unknowns x with a random disturbance [m]."""
+    return x + np.random.default_rng(seed).uniform(-size, size, x.shape)
+
+
+@having(Stateful)
+def test_a_restored_state_gives_the_same_forces(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation, example(name, tmp_path) as other:
+        term, again = simulation.problem.terms[name], other.problem.terms[name]
+        assert isinstance(term, Stateful)
+        assert isinstance(again, Stateful)
+        x, y = (bent(simulation.system.x, size, seed) for size, seed in ((0.1, 5), (0.01, 6)))
+        term.accept(x, frozen_by(term, simulation.system))
+        frozen = frozen_by(term, simulation.system, x)
+        state = term.state()
+        assert sum(entry.place is Place.ELEMENT for entry in state.values()) <= 1
+        assert not np.allclose(gradient(again, y, frozen_by(again, other.system)), gradient(term, y, frozen))
+        again.restore({name: entry.values.copy() for name, entry in state.items()}, x)
+        found = gradient(again, y, frozen_by(again, other.system, x))
+        expected = gradient(term, y, frozen)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+
+
+@having(Dissipates)
+def test_heat_is_what_a_step_takes_from_the_energy(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term = simulation.problem.terms[name]
+        assert isinstance(term, Dissipates)
+        frozen, x = frozen_by(term, simulation.system), bent(simulation.system.x, 0.1)
+        before, heat = term.energies(x, frozen).sum(), term.heat(x, frozen)
+        term.accept(x, frozen)
+        after = term.energies(x, frozen).sum()
+        assert heat > 0.0
+        assert before - after == pytest.approx(heat, rel=1e-9)
+
+
+@having(MovingTargets)
+def test_forces_on_targets_are_derivatives_of_the_energy(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        assert isinstance(term, MovingTargets)
+        frozen = frozen_by(term, simulation.system)
+        places, force = term.targets(x, frozen)
+        moved = next(name for name, values in frozen._asdict().items() if np.shares_memory(values, places))
+        numeric = differences(
+            lambda at: term.energies(x, frozen._replace(**{moved: at})).sum(), places.copy(), 1e-4
+        )
+        np.testing.assert_allclose(force, numeric, rtol=0.0, atol=1e-7 * np.abs(force).max())
+
+
+@having(PullsHandles)
+def test_springs_pull_handles_as_they_pull_the_sheet(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        assert isinstance(term, PullsHandles)
+        assert np.isin(term.reference_rows, np.arange(len(x))).all()
+        frozen = frozen_by(term, simulation.system)
+        forces = term.handle_forces(x, frozen, len(simulation.problem.scene.handles))
+        np.testing.assert_allclose(forces.sum(axis=0), -gradient(term, x, frozen).sum(axis=0), rtol=1e-12)
+
+
+@having(SharesFrozen)
+def test_shared_frozen_data_are_those_of_the_partner(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term = simulation.problem.terms[name]
+        assert isinstance(term, SharesFrozen)
+        assert frozen_by(term, simulation.system) is frozen_by(term.partner, simulation.system)
+
+
+@having(HasDirectors)
+def test_new_frames_change_neither_energy_nor_forces_on_edges(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        assert isinstance(term, HasDirectors)
+        frozen = frozen_by(term, simulation.system)
+        frames = term.frames_at_end(x, frozen)
+        np.testing.assert_allclose(term.energies(x, frames), term.energies(x, frozen), rtol=1e-9)
+        edges = gradient(term, x, frozen).ravel()[term.edge_indices]
+        again = gradient(term, x, frames).ravel()[term.edge_indices]
+        np.testing.assert_allclose(again, edges, rtol=0.0, atol=1e-9 * np.abs(edges).max())
+        assert (term.edge_stiffness() > 0.0).all()
+        indices, _ = term.edge_increments(x, 1e-3 * x, frozen)  # a small rotation is followed as it is
+        assert not len(indices)
+        assert term.largest_rotation(np.zeros_like(x)) == 0.0
+
+
+@having(LimitsStep)
+def test_no_step_passes_a_limit(name: str, tmp_path: Path) -> None:
+    with example(name, tmp_path) as simulation:
+        term, x = simulation.problem.terms[name], simulation.system.x
+        assert isinstance(term, LimitsStep)
+        frozen, dx = frozen_by(term, simulation.system), 3.0 * x
+        assert not term.acts(x, frozen)
+        assert np.isinf(term.energies(x + dx, frozen)).any()
+        fraction = term.largest_step(x, dx, frozen)
+        assert 0.0 < fraction < 1.0
+        near = x + fraction * dx
+        assert term.acts(near, frozen)
+        assert np.isfinite(term.energies(near, frozen)).all()
+        assert term.largest_step(x, 1e-6 * dx, frozen) == 1.0
+
+
+class Idle(Elastic):
+    """A term without energy and force, which notes what it is asked for."""
+
+    def __init__(self, elements: Elements, n_vertices: int) -> None:
+        super().__init__(elements)
+        self.calls: set[str] = set()
+
+    def energies(self, x: Array, frozen: Any) -> Array:
+        return np.zeros(self.n_owned)
+
+    def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
+        self.calls.add("add_gradient")
+
+    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
+        out[:] = 0.0
+
+    def force_scale(self, size: float) -> Array:
+        return np.zeros(self.n_elements)
+
+    def freeze(self, step: UpcomingStep) -> None:
+        self.calls.add("freeze")
+
+    def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
+        self.calls.add("history")
+        return {"idle_number": 7.0}
+
+    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+        self.calls.add("neighbours")
+        return np.empty((0, 2), dtype=np.int64), np.empty((0, 0), dtype=np.int64)
+
+
+class IdleTargets(Idle, MovingTargets):
+    """The same with targets that stay."""
+
+    @property
+    def reference_rows(self) -> Ints:
+        return np.empty(0, dtype=np.int64)
+
+    def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
+        self.calls.add("targets")
+        return np.zeros((self.n_owned, 3)), np.zeros((self.n_owned, 3))
+
+
+class IdleLimit(Idle, LimitsStep):
+    """The same with a limit that is never reached."""
+
+    def largest_step(self, x: Array, dx: Array, frozen: Any) -> float:
+        self.calls.add("largest_step")
+        return 1.0
+
+    def acts(self, x: Array, frozen: Any) -> bool:
+        self.calls.add("acts")
+        return False
+
+
+class IdleState(Idle, Stateful):
+    """The same with a state of vertices, edges and elements by which each can be told from the others."""
+
+    def __init__(self, elements: Elements, n_vertices: int) -> None:
+        super().__init__(elements, n_vertices)
+        assert self.edges is not None
+        self._edge_indices = np.unique(self.edges).astype(np.int64)
+        self.mark = (
+            np.zeros((n_vertices, 3)),
+            np.zeros(len(self._edge_indices)),
+            np.zeros((self.n_elements, 1)),
+        )
+
+    def initialise(self, x: Array) -> None:
+        self.mark = self.marks(x)
+
+    def accept(self, x: Array, frozen: Any) -> None:
+        self.calls.add("accept")
+        self.mark = self.marks(x)
+
+    def marks(self, x: Array) -> tuple[Array, Array, Array]:
+        of_elements = x[self.stencil].sum(axis=(1, 2))
+        return x[: len(self.mark[0])].copy(), x.ravel()[self._edge_indices].copy(), of_elements[:, None]
+
+    def state(self) -> dict[str, TermState]:
+        return {place.value: TermState(place, values) for place, values in zip(Place, self.mark, strict=True)}
+
+    def restore(self, values: Mapping[str, Array], x: Array) -> None:
+        self.calls.add("restore")
+        self.mark = values["vertices"].copy(), values["edges"].copy(), values["elements"].copy()
+
+
+INTERFACES: dict[str, tuple[type[Idle], set[str]]] = {
+    "MovingTargets": (IdleTargets, {"freeze"}),
+    "LimitsStep": (IdleLimit, set()),
+    "Stateful": (IdleState, {"accept"}),
+}
+"""A term with each interface, and the methods that the program must call with every integrator."""
+
+METHODS = {"columns": {"history"}, "neighbours": {"neighbours"}}
+"""The same for properties."""
+
+
+@dataclass(frozen=True)
+class IdleRegistration(Registration):
+    """The registration of `Idle` with one property or interface; it stands for a module, too."""
+
+    flag: str = field(kw_only=True)
+
+    @property
+    def kind(self) -> type[Idle]:
+        return INTERFACES[self.flag][0] if self.flag in INTERFACES else Idle
+
+    def module(self) -> Any:
+        return SimpleNamespace(
+            elements=self._elements,
+            make=self._make,
+            coarse_elements=self._coarse_elements,
+        )
+
+    def _make(self, elements: Elements | None, scene: Scene, mass: Array) -> Idle:
+        nothing = Elements(np.empty((0, 2), dtype=np.int32))
+        term = self.kind(nothing if elements is None else elements, len(mass))
+        if self.neighbours:
+            term.search_distance, term.skin = 0.01, 0.005
+        return term
+
+    def _elements(self, rest: RestShape) -> Elements | None:
+        if self.neighbours:
+            return None
+        triangles = rest.mesh.triangles.astype(np.int64)
+        damping = {"damping": np.full(len(triangles), 0.01)} if self.damped else {}
+        edges = edge_numbers(rest, rest.mesh.triangles)[0] if self.flag == "Stateful" else None
+        return Elements(triangles, damping, edges=edges)
+
+    @staticmethod
+    def _coarse_elements(rest: RestShape) -> Elements:
+        elements = hinge.elements(rest, "midedge")
+        return replace(elements, data={**elements.data, "k": 0.0 * elements.data["k"]})
+
+
+def idle(flag: str) -> Registration:
+    properties = {flag: FLAGS[flag]} if flag in FLAGS else {}
+    return IdleRegistration("idle", lambda scene, shells: True, Role.ELASTIC, flag=flag, **properties)
+
+
+def scene(scheme: str, *, contact: bool) -> dict[str, Any]:
+    """A sheet that is held at a corner and falls on a floor, or hangs on a side."""
+    static = scheme == "static"
+    time = (
+        {"analysis": "static", "step": 1.0} if static else {"end": 0.05, "step": 0.01, "integrator": scheme}
+    )
+    content: dict[str, Any] = {
+        "mesh": grid(0.3, 0.2, 3, 2, "alternating"),
+        "material": CLOTH | {"bending": 1e-3, "bending_model": "midedge", "damping": 0.005},
+        "gravity": [0.0, 1.0, -9.81],
+        "handles": [{"nodes": [0, 4, 8] if static else [0]}],
+        "time": time,
+    }
+    if contact:
+        floor = {"plane": {"point": [0.0, 0.0, -0.006], "normal": [0.0, 0.0, 1.0]}}
+        content |= {"contact": {"gap": 0.005, "friction": 0.3}, "obstacles": {"floor": floor}}
+    return content
+
+
+@cache
+def without_the_term(scheme: str, contact: bool) -> Array:
+    """Positions (V, 3) [m] at the end."""
+    with finished(MPI.COMM_SELF, scene(scheme, contact=contact), **SOLVER) as simulation:
+        return shape(simulation)
+
+
+@contextmanager
+def added(flag: str) -> Iterator[None]:
+    """Adds the term to every scene."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "REGISTRY", [*REGISTRY, idle(flag)])
+        yield
+
+
+def test_every_property_is_tested() -> None:
+    assert {each.name for each in fields(Registration)} == IDENTITY | FLAGS.keys()
+
+
+@pytest.mark.parametrize("contact", [False, True], ids=["free", "contact"])
+@pytest.mark.parametrize("flag", [*FLAGS, *INTERFACES])
+def test_a_term_that_does_nothing_changes_no_answer(flag: str, contact: bool) -> None:
+    """With any integrator and in statics; and the program asks the term for what the property promises."""
+    for scheme in (*INTEGRATORS, "static"):
+        expected = without_the_term(scheme, contact)
+        solver = MULTIGRID if flag == "coarse" and scheme != "static" else SOLVER
+        with added(flag), finished(MPI.COMM_SELF, scene(scheme, contact=contact), **solver) as simulation:
+            term = simulation.problem.terms["idle"]
+            np.testing.assert_allclose(shape(simulation), expected, rtol=0, atol=1e-10, err_msg=scheme)
+            assert isinstance(term, Idle)
+            columns = simulation.energy_balance.columns()
+            assert columns.items() >= COLUMNS.get(flag, {}).items()
+            asked = INTERFACES[flag][1] if flag in INTERFACES else METHODS.get(flag, set())
+            assert term.calls >= asked, scheme
+
+
+@pytest.mark.parallel
+def test_checkpoints_hold_the_state_of_a_term(comm: MPI.Comm, shared_tmp: Path) -> None:
+    checked, folder = scene_of(scene("bdf2", contact=True)), shared_tmp / "run"
+    if comm.rank == 0:
+        folder.mkdir()
+    comm.Barrier()
+    with added("Stateful"):
+        with stepped(comm, checked) as first:
+            recorder = Recorder(first)
+            recorder.begin(folder)
+            recorder.record(first.step())
+            recorder.write_checkpoint()
+            recorder.flush()
+            recorder.close()
+        with stepped(comm, checked) as again:
+            recorder = Recorder(again)
+            recorder.resume(folder)
+            recorder.close()
+            term = again.problem.terms["idle"]
+            assert isinstance(term, IdleState)
+            assert "restore" in term.calls
+            for found, expected in zip(term.mark, term.marks(again.problem.system.x), strict=True):
+                n = term.n_owned if found.ndim == 2 and found.shape[1] == 1 else len(found)
+                np.testing.assert_array_equal(found[:n], expected[:n])
