@@ -38,6 +38,7 @@ from lyra_petsc.stepping.state import resized
 from lyra_petsc.terms.bending.hinge import Bending
 from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.protocols import MovingTargets
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
@@ -317,7 +318,9 @@ class BalanceRecorder:
         sheet: Terms = {term: frozen[term] for term in self._sheet_terms}
         # clamps and obstacles store energy, but exert external forces as they are fixed in space
         inner = {
-            t: data for t, data in sheet.items() if not (t.registration.moving or t.registration.neighbours)
+            t: data
+            for t, data in sheet.items()
+            if not (isinstance(t, MovingTargets) or t.registration.neighbours)
         }
         parts = {
             "inertia": system.mass[:, None] * rate,
