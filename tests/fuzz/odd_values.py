@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import or_
+from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 from hypothesis import strategies as st
@@ -109,37 +109,29 @@ def magnitude() -> st.SearchStrategy[float]:
     return st.floats(-323.0, 308.0).map(lambda power: max(10.0**power, 5e-324))
 
 
-def rarely(odd: st.SearchStrategy[Any], else_: st.SearchStrategy[Any], one_in: int) -> st.SearchStrategy[Any]:
-    """``odd`` values with probability 1/``one_in``, else others."""
-    return st.integers(0, one_in - 1).flatmap(lambda which: odd if which == one_in - 1 else else_)
-
-
-def usual(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
-    """A number between bounds; with probability 1/``wild`` of any magnitude."""
-    return rarely(magnitude(), st.floats(low, high), wild)
-
-
-def signed(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
-    """As `usual`, of either sign or zero."""
-    return st.tuples(usual(low, high, wild=wild), st.sampled_from([1.0, -1.0, 0.0])).map(
-        lambda pair: pair[0] * pair[1]
-    )
-
-
-def vector(low: float = 0.0, high: float = 10.0, *, wild: int = 10) -> st.SearchStrategy[list[float]]:
-    """Three numbers."""
-    return st.lists(signed(low, high, wild=wild), min_size=3, max_size=3)
+HUGE = [10**5, 10**6, 10**9, 2**31 - 2, 2**31]
 
 
 @st.composite
-def sometimes(draw: Any, one_in: int, entries: dict[str, st.SearchStrategy[Any]]) -> dict[str, Any]:
-    """A block that has each entry with probability 1/``one_in``."""
-    return {key: draw(value) for key, value in entries.items() if draw(st.integers(0, one_in - 1)) == 0}
+def varied(draw: Any, value: Any) -> Any:
+    """A copy of plain values in which some numbers are changed: most a little, a few to any magnitude."""
+    out = deepcopy(value)
+    for path in draw(st.lists(st.sampled_from(paths_of(out)), max_size=8)):
+        inside = entry_at(out, path[:-1])
+        old, chance = inside[path[-1]], draw(st.integers(0, 9))
+        if isinstance(old, float):
+            odd = magnitude() if chance == 0 else st.sampled_from([0.0, -old])
+            inside[path[-1]] = draw(odd) if chance < 2 else old * draw(st.floats(0.5, 2.0))
+        elif isinstance(old, int) and not isinstance(old, bool):
+            inside[path[-1]] = draw(st.sampled_from(HUGE) if chance == 0 else st.integers(0, 4))
+    return out
 
 
-def joined(*blocks: st.SearchStrategy[dict[str, Any]]) -> st.SearchStrategy[dict[str, Any]]:
-    """A block with the entries of all ``blocks``."""
-    return st.tuples(*blocks).map(lambda parts: reduce(or_, parts))
+def entry_at(value: Any, path: Sequence[Any]) -> Any:
+    """The entry of ``value`` at one of its `paths_of`."""
+    for key in path:
+        value = value[key]
+    return value
 
 
 def emit(value: Any) -> str:

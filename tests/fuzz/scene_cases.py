@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +13,14 @@ from odd_values import (
     anything,
     document,
     emit,
-    joined,
+    entry_at,
     listed,
     magnitude,
     paths_of,
-    rarely,
     raw,
-    signed,
-    sometimes,
-    usual,
-    vector,
+    varied,
 )
+from ruamel.yaml import YAML
 from text_damage import damaged
 
 from lyra_petsc.scene import schema
@@ -53,237 +48,102 @@ f 2 3 5
 f 3 4 5
 f 4 1 5
 """
-HUGE = [10**5, 10**6, 10**9, 2**31 - 2, 2**31]
 
 Draw = Any
-Blocks = st.SearchStrategy[dict[str, Any]]
 
-block, one_of = st.fixed_dictionaries, st.sampled_from
-NOTHING: Blocks = st.just({})
+SCENES = """
+mesh:
+- grid: {width: 1.0, height: 0.8, nx: 3, ny: 2, pattern: criss-cross}
+  transform: {scale: [1.0, 1.0, 0.5], rotate: {axis: [0.0, 0.0, 1.0], degrees: 30.0}}
+  name: flag
+material:
+- density: 0.15
+  membrane: {c11: 800.0, c22: 800.0, c12: 160.0, c33: 240.0}
+  bending: [2.0e-5, 1.0e-5, 2.0e-5]
+  damping: 0.005
+  warp_degrees: 45.0
+  rest_curvature: [0.5, 0.0, 0.1]
+handles:
+- {nodes: [0, 3], motion: m, interpolation: hermite, from: 0.01, until: 0.05, fade: 0.02}
+- {group: right, axes: [x, z], stiffness: 100.0}
+- {group: corners, clamp: true}
+motions:
+  m: [{time: 0.0, velocity: [0.0, 1.0, 0.0]}, {time: 0.05, translate: [0.1, 0.0, 0.0], scale: 1.1}]
+wind: {velocity: [0.0, 3.0, 0.0], density: 1.2, drag: 0.1}
+loads:
+- {nodes: [4], force: [0.0, 0.0, 1.0], from: 0.0, until: 0.03}
+- {pressure: 5.0}
+- {traction: [0.0, 0.0, 1.0]}
+initial: {velocity: [0.0, 0.5, 0.0], angular_velocity: [0.0, 0.0, 1.0], noise: 0.001, seed: 1}
+output: {every: 0.01, fields: [velocity], checkpoint: {seconds: 10.0}, reactions: true}
+probes: {tip: {nodes: [5]}}
+---
+mesh: {grid: {width: 1.0, height: 1.0, nx: 3, ny: 3}, transform: {translate: [0.0, 0.0, 0.05]}}
+material: {cloth: gray-interlock, density_scale: 1.2, stretching_scale: 0.8, bending_scale: 1.1, thicken: 1.2}
+contact: {gap: 0.01, thickness: 0.001, friction: {static: 0.5, kinetic: 0.3}}
+motions: {m: [{time: 0.0}, {time: 0.1, rotate: {axis: [1.0, 0.0, 0.0], degrees: 20.0}}]}
+obstacles:
+  floor: {plane: {point: [0.0, 0.0, -0.1], normal: [0.0, 0.1, 1.0]}, friction: 0.2}
+  ball: {sphere: {center: [0.5, 0.5, -0.3], radius: 0.2}, motion: m}
+  rod: {capsule: {from: [-1.0, 0.5, -0.2], to: [2.0, 0.5, -0.2], radius: 0.1}}
+  room: {box: {min: [-5.0, -5.0, -5.0], max: [5.0, 5.0, 5.0]}, inside: true}
+  roof: {mesh: {file: sheet.obj, transform: {translate: [0.0, 0.0, 0.9]}}, motion: [{time: 0.0}, {time: 1.0}]}
+solver: {force_tolerance: 1.0e-6, step_tolerance: 1.0e-6, max_iterations: 30, hessian: adaptive}
+---
+mesh: {file: sheet.obj, weld: 1.0e-9}
+material: {young: 1.0e8, poisson: 0.3, thickness: 0.002, density: 1.0}
+loads: [{pressure: 1.0}]
+handles: [{box: [[-9.0, -9.0, -9.0], [0.1, 9.0, 9.0]], clamp: true}]
+time: {analysis: static, step: 0.5}
+---
+mesh: {grid: {width: 0.5, height: 0.5, nx: 2, ny: 2, pattern: alternating}}
+material: {cloth: paper, bending_model: midedge, friction_moment: 1.0e-4}
+handles: [{group: left, clamp: true}]
+loads: [{group: right, moment: 0.001}]
+time: {end: 0.1, step: auto, tolerance: 0.01}
+"""
+"""Scenes that together have most keys; without ``time`` it is drawn, as are ``gravity`` and ``petsc``."""
 
-CELLS = rarely(one_of(HUGE), st.integers(1, 4), 60)
-GRID = block(
-    {
-        "width": usual(0.1, 2.0),
-        "height": usual(0.1, 2.0),
-        "nx": CELLS,
-        "ny": CELLS,
-        "pattern": one_of(["diagonal", "alternating", "criss-cross"]),
-    }
-)
-AXES = [[0, 0, 1], [1, 2, 3], [0, 1e-100, 0], [1e200, 0, 1e200]]
-ROTATION = block({"axis": one_of(AXES) | vector(0.1, 1.0), "degrees": signed(0.0, 360.0)})
-SCALE = usual(0.5, 2.0) | st.lists(usual(0.5, 2.0), min_size=3, max_size=3)
-MOVE = {"rotate": ROTATION, "translate": vector(0.0, 1.0)}
-TRANSFORM = sometimes(2, {"scale": SCALE, **MOVE})
-SOURCE = joined(
-    rarely(st.just({"file": "sheet.obj"}), block({"grid": GRID}), 10), sometimes(3, {"transform": TRANSFORM})
-)
-
-CLOTH = block({"cloth": one_of(["gray-interlock", "paper", "11oz-black-denim"])})
-FABRIC = usual(10.0, 1e4).flatmap(
-    lambda c: block(
-        {
-            "density": usual(0.05, 1.0),
-            "membrane": block(
-                {
-                    "c11": st.just(c),
-                    "c22": st.just(c) | magnitude(),
-                    "c12": st.just(0.3 * c),
-                    "c33": usual(1.0, 1e4),
-                }
-            ),
-            "bending": usual(0.0, 1e-3) | st.lists(usual(0.0, 1e-3), min_size=3, max_size=3),
-        }
-    )
-)
-PLATE = block(
-    {
-        "young": usual(1e5, 1e11),
-        "poisson": st.floats(-0.9, 0.5),
-        "thickness": usual(1e-4, 1e-2),
-        "density": usual(0.1, 10.0),
-    }
-)
-MATERIAL = joined(
-    st.one_of(CLOTH, FABRIC, PLATE),
-    sometimes(
-        6,
-        {
-            "damping": usual(0.0, 0.1),
-            "warp_degrees": signed(0.0, 90.0),
-            "density_scale": usual(0.5, 2.0),
-            "stretching_scale": usual(0.5, 2.0),
-            "bending_scale": usual(0.0, 2.0),
-            "thicken": usual(0.5, 2.0),
-            "rest_curvature": vector(0.0, 2.0),
-        },
-    ),
-)
-
-SELECTION = st.one_of(
-    block({"nodes": st.lists(st.integers(0, 3), min_size=1, max_size=3, unique=True)}),
-    block({"group": one_of(["left", "corners", "sheet", "top"])}),
-    block({"box": usual(0.0, 1.0).map(lambda x: [[-9, -9, -9], [x, 9, 9]])}),
-)
-
-
-def _later(window: dict[str, Any]) -> dict[str, Any]:
-    if "until" in window:
-        window["until"] += max(window.get("from", 0.0), 0.0)
-    return window
-
-
-WINDOW = sometimes(4, {"from": signed(0.0, 0.05), "until": usual(1e-3, 0.1)}).map(_later)
-LOAD = joined(
-    st.one_of(
-        joined(SELECTION, block({"force": vector(0.0, 10.0)})),
-        block({"pressure": signed(0.0, 100.0)}),
-        block({"traction": vector(0.0, 10.0)}),
-    ),
-    WINDOW,
-)
-
-
-def _handle(motions: list[str]) -> Blocks:
-    moves = {"motion": one_of(motions), "interpolation": one_of(["hermite", "linear"])}
-    further = {
-        "axes": st.lists(one_of("xyz"), min_size=1, max_size=3),
-        "clamp": st.booleans(),
-        "fade": usual(0.0, 0.1),
-        "stiffness": usual(1.0, 1e4),
-    }
-    return joined(SELECTION, WINDOW, NOTHING | block(moves) if motions else NOTHING, sometimes(4, further))
-
-
-@st.composite
-def _motion(draw: Draw, placed: Blocks = TRANSFORM) -> list[dict[str, Any]]:
-    frames = []
-    time = draw(signed(0.0, 0.1))
-    for _ in range(draw(st.integers(1, 3))):
-        frames.append({"time": time, **draw(placed), **draw(sometimes(5, {"velocity": vector(0.0, 1.0)}))})
-        time = max(time + draw(usual(0.001, 0.1)), math.nextafter(time, math.inf))
-    return frames
-
-
-FRICTION = usual(0.0, 1.0) | st.tuples(usual(0.0, 1.0), st.floats(0.0, 1.0)).map(
-    lambda two: {"static": two[0], "kinetic": two[1] * two[0]}
-)
-CONTACT = joined(
-    block({"gap": usual(1e-5, 1e-2), "friction": FRICTION}),
-    NOTHING | block({"thickness": usual(0.0, 1e-3), "self": st.booleans()}),
-)
-PLACE, RADIUS = vector(0.0, 1.0), usual(0.1, 1.0)
-SHAPES = {
-    "plane": {"point": PLACE, "normal": signed(0.1, 1.0).map(lambda z: [0, 1, z])},
-    "sphere": {"center": PLACE, "radius": RADIUS},
-    "capsule": {"from": PLACE, "to": usual(2.0, 3.0).map(lambda x: [x, 0, 0]), "radius": RADIUS},
-    "box": {"min": st.just([-1, -1, -1]), "max": st.lists(RADIUS, min_size=3, max_size=3)},
-    "mesh": {"file": st.just("sheet.obj"), "transform": TRANSFORM},
-}
-
-
-def _obstacle(motions: list[str]) -> Blocks:
-    shapes = [
-        joined(
-            block({name: block(shape)}),
-            NOTHING if name in ("plane", "mesh") else block({"inside": st.booleans()}),
-        )
-        for name, shape in SHAPES.items()
-    ]
-    moved = block({"motion": _motion(sometimes(2, MOVE))})
-    named = block({"motion": one_of(motions)}) if motions else NOTHING
-    return joined(st.one_of(shapes), sometimes(2, {"friction": FRICTION}), st.one_of(NOTHING, named, moved))
-
-
-TIME = rarely(
-    joined(st.just({"analysis": "static"}), sometimes(2, {"step": usual(0.01, 1.0)})),
-    joined(
-        block({"end": usual(0.02, 1.0), "integrator": one_of(INTEGRATORS)}),
-        rarely(
-            block({"step": st.just("auto"), "tolerance": usual(1e-4, 0.5)}),
-            block({"step": usual(0.001, 0.1)}),
-            6,
-        ),
-    ),
-    6,
-)
 OPTIONS = listed("""
 ksp_type pc_type ksp_rtol snes_type snes_rtol ts_dt ts_type ksp_max_it mat_type snes_max_it ts_max_time
 snes_linesearch_type pc_factor_levels no_such_option ksp_view
 """)
 CHOICES = listed("cg gmres preonly lu cholesky jacobi none ksponly newtontr basic aij abc")
 PETSC = st.dictionaries(
-    one_of(OPTIONS),
-    one_of(CHOICES) | st.integers(-2, 100) | magnitude() | st.none() | st.booleans() | raw(NUMBERS),
+    st.sampled_from(OPTIONS),
+    st.sampled_from(CHOICES) | st.integers(-2, 100) | magnitude() | st.none() | st.booleans() | raw(NUMBERS),
     max_size=2,
-)
-SELDOM = sometimes(
-    4,
-    {
-        "wind": block({"velocity": vector(0.0, 20.0), "density": usual(0.0, 2.0), "drag": usual(0.0, 1.0)}),
-        "loads": st.lists(LOAD, min_size=1, max_size=2),
-        "initial": block(
-            {
-                "velocity": vector(0.0, 5.0),
-                "angular_velocity": vector(0.0, 5.0),
-                "noise": usual(0.0, 0.01),
-                "seed": st.integers(0, 2**63 - 1),
-            }
-        ),
-        "output": block(
-            {
-                "every": usual(0.001, 0.1),
-                "fields": st.lists(one_of(FIELDS), max_size=3),
-                "checkpoint": block({"seconds": usual(1.0, 60.0)}),
-                "reactions": st.booleans(),
-            }
-        ),
-        "probes": block({"tip": SELECTION}),
-        "solver": block(
-            {
-                "force_tolerance": usual(1e-9, 1e-3),
-                "step_tolerance": usual(1e-9, 1e-3),
-                "max_iterations": st.integers(1, 100),
-            }
-        ),
-        "petsc": PETSC,
-    },
 )
 
 
 @st.composite
 def scenes(draw: Draw) -> dict[str, Any]:
-    """Blocks of a valid scene, in which some numbers may be of any magnitude."""
-    motions = [f"m{i}" for i in range(draw(st.integers(0, 2)))]
-    blocks: dict[str, Any] = {
-        "title": "fuzz",
-        "mesh": draw(SOURCE),
-        "material": draw(MATERIAL),
-        "time": draw(TIME),
-        "handles": draw(st.lists(_handle(motions), max_size=2)),
-    }
-    if motions:
-        blocks["motions"] = {name: draw(_motion()) for name in motions}
-    if draw(st.integers(0, 2)) == 0:
-        names = ("one", "two")[: draw(st.integers(0, 2))]
-        blocks["contact"] = draw(CONTACT)
-        blocks["obstacles"] = {name: draw(_obstacle(motions)) for name in names}
-    return blocks | draw(sometimes(2, {"gravity": vector(0.0, 10.0)})) | draw(SELDOM)
+    """Blocks of a valid scene without some of the optional ones; some numbers may be of any magnitude."""
+    blocks: dict[str, Any] = draw(varied(draw(st.sampled_from(list(YAML(typ="safe").load_all(SCENES))))))
+    optional = ("handles", "wind", "loads", "initial", "output", "probes", "solver", "obstacles")
+    for key in draw(st.sets(st.sampled_from(optional), max_size=5)):
+        blocks.pop(key, None)
+    stepping = {"end": 0.1, "step": 0.01, "integrator": draw(st.sampled_from(INTEGRATORS))}
+    blocks.setdefault("time", draw(varied(stepping)))
+    if draw(st.booleans()):
+        blocks["gravity"] = draw(varied([0.0, 0.0, -9.81]))
+    if draw(st.integers(0, 3)) == 0:
+        blocks["petsc"] = draw(PETSC)
+    if "output" in blocks:
+        blocks["output"]["fields"] = draw(st.lists(st.sampled_from(FIELDS), max_size=3))
+    return blocks
 
 
 @st.composite
 def mutated(draw: Draw) -> dict[str, Any]:
     """Blocks of a scene in which one to three entries are mutated."""
-    blocks = deepcopy(draw(scenes()))  # scenes share some blocks
+    blocks = draw(scenes())
     for _ in range(draw(st.integers(1, 3))):
         paths = paths_of(blocks)
         if not paths:
             break
         *path, last = draw(st.sampled_from(paths))
-        block = blocks
-        for key in path:
-            block = block[key]
+        block = entry_at(blocks, path)
         what = draw(st.integers(0, 5))
         if what <= 2:
             block[last] = draw(anything())
@@ -309,7 +169,7 @@ def _settings(draw: Draw) -> tuple[str, ...]:
     for _ in range(draw(st.integers(0, 2))):
         equals = "" if draw(st.integers(0, 9)) == 0 else "="
         value = draw(anything() | magnitude())
-        chosen.append(f"{draw(one_of(PATHS))}{equals}{emit(value)}".replace("\0", ""))
+        chosen.append(f"{draw(st.sampled_from(PATHS))}{equals}{emit(value)}".replace("\0", ""))
     return tuple(chosen)
 
 
