@@ -12,10 +12,9 @@ from petsc4py import PETSc
 from lyra_petsc.arrays import Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import grid_sheet
-from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute, split_elements
+from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, vertex_graph
-from lyra_petsc.mesh.points import Numbering, Points
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.scene.schema import Grid
 
@@ -53,50 +52,6 @@ def mesh(request: pytest.FixtureRequest) -> tuple[Ints, int]:
 @pytest.fixture
 def part(comm: MPI.Comm, mesh: tuple[Ints, int]) -> LocalMesh:
     return distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)
-
-
-def test_every_vertex_has_one_owner_and_contiguous_numbers(
-    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
-) -> None:
-    points = part.layout
-    originals = np.concatenate(comm.allgather(points.mesh_vertices))
-    np.testing.assert_array_equal(np.sort(originals), np.arange(mesh[1]))
-    assert points.n_owned == len(points.mesh_vertices) == points.bounds[comm.rank + 1] - points.start
-    assert points.bounds[0] == 0
-    assert points.bounds[-1] == points.n_global == mesh[1]
-    # where no elements couple edges all rows are vertices
-    assert (points.n_vertices, points.n_vertices_global) == (points.n_owned, points.n_global)
-    assert points.n_edges == points.n_edges_global == len(points.edges) == len(points.padding) == 0
-    np.testing.assert_array_equal(part.vertex_data["number"], points.mesh_vertices)
-
-
-def test_a_rank_has_every_element_that_couples_its_rows(
-    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
-) -> None:
-    triangles, n_vertices = mesh
-    whole = whole_of(triangles, n_vertices)
-    mine = np.zeros(n_vertices, dtype=bool)
-    mine[part.layout.mesh_vertices] = True
-    numbers = np.empty(part.layout.n_global, dtype=np.int64)  # mesh index of each global number
-    for start, original in comm.allgather((part.layout.start, part.layout.mesh_vertices)):
-        numbers[start : start + len(original)] = original
-    for name, elements in part.elements.items():
-        expected = np.flatnonzero(mine[whole.elements[name].stencil].any(axis=1))
-        np.testing.assert_array_equal(np.sort(elements.index), expected)
-        # local numbers mean the same vertices of the mesh, in the same order within the element
-        back = numbers[part.layout.global_number[elements.stencil]]
-        np.testing.assert_array_equal(back, whole.elements[name].stencil[elements.index])
-        if "number" in elements.data:
-            np.testing.assert_array_equal(elements.data["number"], elements.index)
-
-
-def test_every_element_is_counted_on_one_rank(
-    comm: MPI.Comm, mesh: tuple[Ints, int], part: LocalMesh
-) -> None:
-    whole = whole_of(*mesh)
-    for name, elements in part.elements.items():
-        counted = np.concatenate(comm.allgather(elements.index[: elements.n_owned]))
-        np.testing.assert_array_equal(np.sort(counted), np.arange(len(whole.elements[name].stencil)))
 
 
 def test_ghosts_are_coupled_rows_with_the_values_of_their_owners(comm: MPI.Comm, part: LocalMesh) -> None:
@@ -190,18 +145,6 @@ def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:
     assert np.abs(np.diff(position[path])).max() == 1
 
 
-def test_numbering_is_by_owner_then_by_position() -> None:
-    numbering = Numbering.build(np.array([1, 0, 1, 0, 3]), np.array([4, 3, 2, 1, 0]), 4)
-    np.testing.assert_array_equal(numbering.bounds, [0, 2, 4, 4, 5])
-    np.testing.assert_array_equal(numbering.number, [3, 1, 2, 0, 4])
-
-
-def test_split_counts_an_element_where_its_first_point_is_owned() -> None:
-    split = split_elements(np.array([[0, 1], [1, 0], [2, 2]]), 4)
-    assert [(sorted(index), n) for index, n in split] == [([0, 1], 1), ([0, 1], 1), ([2], 1), ([], 0)]
-    assert split[1][0][0] == 1  # counted elements come first
-
-
 def with_edges(triangles: Ints, n_vertices: int) -> GlobalMesh:
     """The mesh with an unknown on every other interior edge, coupled to the four vertices of its hinge."""
     quads = hinges(triangles).vertices[::2]
@@ -274,6 +217,8 @@ def test_elements_find_the_unknowns_of_their_edges(
             touches |= my_edges[of_mesh.edges].any(axis=1)
         np.testing.assert_array_equal(np.sort(elements.index), np.flatnonzero(touches))
         np.testing.assert_array_equal(values[elements.stencil, 0], of_mesh.stencil[elements.index])
+        if "number" in elements.data:
+            np.testing.assert_array_equal(elements.data["number"], elements.index)
         if elements.edges is not None:
             assert of_mesh.edges is not None
             np.testing.assert_array_equal(values.ravel()[elements.edges], of_mesh.edges[elements.index])
@@ -293,21 +238,6 @@ def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: LocalM
     np.testing.assert_array_equal(values[:, 0], more.global_number)
     assert (more.n_vertices, more.n_edges) == (layout.n_vertices, layout.n_edges)
     more.destroy()
-
-
-def test_points_in_any_order_are_exchanged(comm: MPI.Comm) -> None:
-    # a ring of points; the ghosts of each rank are the last two points of the next rank, in reverse order
-    n = 4 * comm.size
-    numbering = Numbering.build(np.arange(n) // 4, np.arange(n), comm.size)
-    after = 4 * ((comm.rank + 1) % comm.size)
-    ghosts = numbering.number[[after + 3, after + 2] if comm.size > 1 else []]
-    points = Points(comm, numbering.bounds, ghosts)
-    values = np.zeros((points.n_local, 3))
-    values[:4] = points.global_number[:4, None]
-    points.update_ghosts(values)
-    np.testing.assert_array_equal(values[:, 0], points.global_number)
-    np.testing.assert_array_equal(points.local(points.global_number), np.arange(points.n_local))
-    points.destroy()
 
 
 def test_a_constant_with_one_value_takes_no_memory() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -151,17 +150,6 @@ def test_invalid_files_are_refused(tmp_path: Path, text: str, message: str) -> N
     with pytest.raises(InputError, match=message) as caught:
         obj_mesh(tmp_path, text)
     assert caught.value.file == str(tmp_path / "mesh.obj")
-
-
-def test_large_file_in_reasonable_time(tmp_path: Path) -> None:
-    n = 150
-    grid = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    cells = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1).reshape(-1, 4) + 1
-    lines = [f"v {i % (n + 1)} {i // (n + 1)} 0" for i in range((n + 1) ** 2)]
-    lines += [f"f {a}//1 {b}//1 {c}//1 {d}//1" for a, b, c, d in cells]
-    begin = time.process_time()
-    assert obj_mesh(tmp_path, "\n".join(lines)).n_triangles == 2 * n * n
-    assert time.process_time() - begin < 5.0
 
 
 def test_a_polygon_of_many_corners_is_refused(tmp_path: Path) -> None:

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from mesh_sources import grid_mesh
 
 from lyra_petsc.mesh.topology import boundary_edges, enclosed_volumes, hinges, junctions
-
-
-def test_hinge_of_two_triangles() -> None:
-    found = hinges(np.array([[0, 1, 2], [0, 2, 3]]))
-    assert found.vertices.tolist() == [[2, 0, 1, 3]]
-    assert found.triangles.tolist() == [[0, 1]]
 
 
 def test_hinges_agree_with_their_triangles() -> None:
@@ -67,10 +59,3 @@ def test_no_triangles_no_edges() -> None:
     empty = np.empty((0, 3), dtype=np.int64)
     assert hinges(empty).vertices.shape == (0, 4)
     assert boundary_edges(empty).edges.shape == (0, 2)
-
-
-def test_fast_on_a_large_mesh() -> None:
-    triangles = grid_mesh(nx=300, ny=300).triangles
-    begin = time.process_time()
-    hinges(triangles)
-    assert time.process_time() - begin < 2.0
