@@ -20,8 +20,8 @@ import numpy as np
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.library_formats import LIBRARIES, usual_spelling
-from lyra_petsc.mesh.mesh import Sheet
-from lyra_petsc.mesh.msh_file import ElementBlock, MshError, NoTrianglesError, assemble_sheet, element_type
+from lyra_petsc.mesh.mesh import ElementBlock, Sheet
+from lyra_petsc.mesh.msh_file import MshError, NoTrianglesError, assemble_sheet
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
@@ -213,10 +213,8 @@ def _read_mesh(path: Path, file: BinaryIO, *, note_loose: bool) -> Sheet:
     tags, points = load(), load()
     blocks = []
     try:
-        for kind, entity in head["blocks"]:
-            element_type(kind)
-            corners, groups = load(), load()
-            blocks.append(ElementBlock(kind, corners, np.full(len(corners), entity), groups))
+        for kind in head["kinds"]:
+            blocks.append(ElementBlock(kind, load(), load(), load()))
         names = {(dimension, tag): printable(name) for dimension, tag, name in head["names"]}
         sheet = assemble_sheet(tags, points, blocks, names, note_loose=note_loose)
     except NoTrianglesError as error:

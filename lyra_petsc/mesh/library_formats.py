@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.mesh import ElementBlock
 from lyra_petsc.mesh.readers import first_few, split_polygon
 
 LIBRARIES = {
@@ -61,25 +62,6 @@ class Refused(Exception):
     """The file cannot be used; the message is for the user."""
 
 
-class ReadElements(NamedTuple):
-    """Elements of one type.
-
-    Attributes
-    ----------
-    kind, entity : int
-        gmsh's number of the type, and the number of the geometrical entity.
-    corners : (n, k) int64
-        Tags of the nodes at the corners.
-    groups : (m, 2) int64
-        For each membership in a group the element (index in ``corners``) and the number of the group.
-    """
-
-    kind: int
-    entity: int
-    corners: Ints
-    groups: Ints
-
-
 _Names = list[tuple[int, int, str]]
 
 
@@ -90,7 +72,7 @@ class FileMesh(NamedTuple):
     ----------
     tags, points : (n,) int64, (n, 3) float64
         Nodes in file order.
-    elements : list of ReadElements
+    elements : list of ElementBlock
     names : list of (int, int, str)
         Dimension, number and name of each group that has a name.
     notes : list of str
@@ -99,7 +81,7 @@ class FileMesh(NamedTuple):
 
     tags: Ints
     points: Array
-    elements: list[ReadElements]
+    elements: list[ElementBlock]
     names: _Names
     notes: list[str]
 
@@ -168,25 +150,27 @@ def refuse_losses(library: str, announced: tuple[int | None, int], n_points: int
             raise Refused(f"{library} reads {here} of the {there} {what} in it; {_REMEDY}")
 
 
-def _elements(points: Array, cells: _Cells) -> ReadElements:
+def _elements(points: Array, cells: _Cells) -> ElementBlock:
     """Elements of a type of gmsh; polygons and strips are split into triangles."""
     name, corners, groups = cells
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
         wrong = np.unique(corners[(corners < 0) | (corners >= len(points))])
         raise Refused(f"its elements use points that it does not have: {first_few(wrong.tolist())}")
     base = name.rstrip("0123456789")
+    kind = 2
     if base == "polygon":
-        return ReadElements(2, 0, np.concatenate([_fan(points, polygon) for polygon in corners]), groups)
-    if base == "strip":
+        corners = np.concatenate([_fan(points, polygon) for polygon in corners])
+    elif base == "strip":
         first = np.arange(corners.shape[1] - 2)[:, None]
-        triangles = corners[:, first + np.where(first % 2, [1, 0, 2], [0, 1, 2])].reshape(-1, 3)
-        return ReadElements(2, 0, triangles, groups)
-    if base not in _KINDS:
+        corners = corners[:, first + np.where(first % 2, [1, 0, 2], [0, 1, 2])].reshape(-1, 3)
+    elif base in _KINDS:
+        straight, curved, n_corners = _KINDS[base]
+        if corners.ndim != 2 or corners.shape[1] < n_corners:
+            raise Refused(f"is damaged: a {name} of fewer than {n_corners} points")
+        kind, corners = straight if name == base else curved, corners[:, :n_corners]
+    else:
         raise Refused(f"elements of the type {name} are not read; {_REMEDY}")
-    straight, curved, n_corners = _KINDS[base]
-    if corners.ndim != 2 or corners.shape[1] < n_corners:
-        raise Refused(f"is damaged: a {name} of fewer than {n_corners} points")
-    return ReadElements(straight if name == base else curved, 0, corners[:, :n_corners], groups)
+    return ElementBlock(kind, corners, np.zeros(len(corners), np.int64), groups)
 
 
 def _fan(points: Array, polygon: Ints) -> Ints:

@@ -30,12 +30,12 @@ from lyra_petsc.mesh.gmsh_sandbox import enter_sandbox
 from lyra_petsc.mesh.library_formats import (
     LIBRARIES,
     FileMesh,
-    ReadElements,
     Refused,
     count_announced,
     read_format,
     refuse_losses,
 )
+from lyra_petsc.mesh.mesh import ElementBlock
 
 _EQUILATERAL = math.sqrt(3) / 4
 _UNGUARDED = (
@@ -213,7 +213,8 @@ def _gmsh_mesh(gmsh: ModuleType) -> FileMesh:
             rows = np.column_stack(
                 [np.tile(np.arange(len(corners)), len(groups)), np.repeat(groups, len(corners))]
             )
-            elements.append(ReadElements(int(kind), int(entity[1]), corners, rows.astype(np.int64)))
+            tag_of_each = np.full(len(corners), entity[1], np.int64)
+            elements.append(ElementBlock(int(kind), corners, tag_of_each, rows.astype(np.int64)))
     names = [(int(dim), int(tag), _group_name(gmsh, dim, tag)) for dim, tag in model.getPhysicalGroups()]
     named = [name for name in names if name[2]]
     return FileMesh(np.concatenate(tags), np.concatenate(points), elements, named, [])
@@ -222,17 +223,14 @@ def _gmsh_mesh(gmsh: ModuleType) -> FileMesh:
 def _write_mesh(mesh: FileMesh, file: BinaryIO) -> None:
     """Write a mesh as numpy arrays.
 
-    The first array is a JSON text with ``names`` and ``notes`` of the mesh, and for each of its blocks of
-    elements the type and the entity in ``blocks``. Then follow the tags and points of the nodes, and for each
-    block the corners and the groups of its elements.
+    The first array is a JSON text with ``names`` and ``notes`` of the mesh, and the ``kinds`` of its blocks
+    of elements. Then follow the tags and points of the nodes, and the arrays of each block.
     """
-    blocks = [(block.kind, block.entity) for block in mesh.elements]
-    head = json.dumps({"names": mesh.names, "notes": mesh.notes, "blocks": blocks}).encode()
-    for array in (np.frombuffer(head, np.uint8), mesh.tags, mesh.points):
+    kinds = [block.kind for block in mesh.elements]
+    head = json.dumps({"names": mesh.names, "notes": mesh.notes, "kinds": kinds}).encode()
+    arrays = [array for block in mesh.elements for array in (block.nodes, block.entity, block.groups)]
+    for array in (np.frombuffer(head, np.uint8), mesh.tags, mesh.points, *arrays):
         np.save(file, array)
-    for block in mesh.elements:
-        np.save(file, block.corners)
-        np.save(file, block.groups)
     file.flush()
 
 

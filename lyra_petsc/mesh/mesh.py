@@ -109,6 +109,27 @@ class Mesh:
         return len(self.triangles)
 
 
+class ElementBlock(NamedTuple):
+    """Elements of one type, as read from a source.
+
+    Attributes
+    ----------
+    kind : int
+        gmsh element type.
+    nodes : (n, corners) int64
+        Tags of the corner nodes.
+    entity : (n,) int64
+        Tag of the geometrical entity.
+    groups : (m, 2) int64
+        For each membership in a physical group the element (index in the block) and the tag of the group.
+    """
+
+    kind: int
+    nodes: Ints
+    entity: Ints
+    groups: Ints
+
+
 @dataclass
 class NamedSet:
     """A group as read from a source.

@@ -18,7 +18,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.mesh import NamedSet, Sheet
+from lyra_petsc.mesh.mesh import ElementBlock, NamedSet, Sheet
 from lyra_petsc.mesh.readers import drop_loose_vertices, first_few, printable, split_quads
 from lyra_petsc.scene.text import read_bytes
 
@@ -321,32 +321,6 @@ def _whole(table: Array) -> Ints:
 # -- elements ----------------------------------------------------------------------------------------
 
 
-@dataclass
-class ElementBlock:
-    """Elements of one type.
-
-    Attributes
-    ----------
-    kind : int
-        gmsh element type.
-    nodes : (n, corners) int64
-        Tags of the corner nodes.
-    entity : (n,) int64
-        Tag of the geometrical entity.
-    groups : (m, 2) int64
-        For each membership in a physical group the element (index in the block) and the tag of the group.
-    """
-
-    kind: int
-    nodes: Ints
-    entity: Ints
-    groups: Ints
-
-    @property
-    def dimension(self) -> int:
-        return ELEMENT_TYPES[self.kind][0]
-
-
 def element_type(kind: int) -> tuple[int, int, int]:
     """Dimension, corners and nodes of a gmsh element type; raises MshError if unknown."""
     try:
@@ -476,11 +450,12 @@ def assemble_sheet(
     """
     notes: list[str] = []
     blocks = _resolve_tags(blocks, tags)
-    triangles, entity, members = _triangles(points, [b for b in blocks if b.dimension == 2], notes)
+    triangles, entity, members = _triangles(points, _of_dimension(2, blocks), notes)
+    n_solids = sum(len(block.nodes) for block in _of_dimension(3, blocks))
     if len(triangles) == 0:
-        highest = max((block.dimension for block in blocks if len(block.nodes)), default=0)
+        highest = 3 if n_solids else 1 if _of_dimension(1, blocks) else 0
         raise NoTrianglesError("no triangles" + _WITHOUT_TRIANGLES.get(highest, ""))
-    if n_solids := sum(len(block.nodes) for block in blocks if block.dimension == 3):
+    if n_solids:
         notes.append(f"{n_solids} solid elements left out")
     triangles, members = _drop_repeated(triangles, entity, members)
     groups = [NamedSet(names.get((2, tag), str(tag)), 2, inside) for tag, inside in members.items()]
@@ -506,6 +481,10 @@ def assemble_sheet(
     return sheet
 
 
+def _of_dimension(dimension: int, blocks: list[ElementBlock]) -> list[ElementBlock]:
+    return [block for block in blocks if element_type(block.kind)[0] == dimension and len(block.nodes)]
+
+
 def _resolve_tags(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
     """``blocks`` up to dimension 2, with indices of nodes in file order instead of tags."""
     order = np.argsort(tags, kind="stable")
@@ -515,7 +494,7 @@ def _resolve_tags(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
         raise MshError(f"cannot be understood: several nodes have the tag {first_few(twice.tolist())}")
     numbered = []
     for block in blocks:
-        if block.dimension == 3:
+        if element_type(block.kind)[0] == 3:
             numbered.append(block)
             continue
         at = np.searchsorted(ascending, block.nodes)
@@ -584,7 +563,7 @@ def _drop_repeated(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> t
 
 def _lower_groups(dimension: int, blocks: list[ElementBlock], names: Names) -> list[NamedSet]:
     """Groups of points or curves."""
-    chosen = [block for block in blocks if block.dimension == dimension]
+    chosen = _of_dimension(dimension, blocks)
     if not chosen:
         return []
     nodes = np.concatenate([block.nodes[block.groups[:, 0]] for block in chosen])
