@@ -228,9 +228,11 @@ def _write_mesh(mesh: FileMesh, file: BinaryIO) -> None:
     """
     kinds = [block.kind for block in mesh.elements]
     head = json.dumps({"names": mesh.names, "notes": mesh.notes, "kinds": kinds}).encode()
-    arrays = [array for block in mesh.elements for array in (block.nodes, block.entity, block.groups)]
-    for array in (np.frombuffer(head, np.uint8), mesh.tags, mesh.points, *arrays):
+    for array in (np.frombuffer(head, np.uint8), mesh.tags, mesh.points):
         np.save(file, array)
+    for block in mesh.elements:
+        for array in (block.nodes, block.entity, block.groups):
+            np.save(file, array)
     file.flush()
 
 
