@@ -19,7 +19,6 @@ from lyra_petsc.output.stored import import_h5py_in_background
 from lyra_petsc.output.summary import library_versions, read_summary, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.load import STORED, with_stored_bending_model
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
@@ -67,8 +66,6 @@ def simulate(
     """
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
         import_h5py_in_background()
-        if choice.resume:
-            scene = on_root(comm, lambda: with_stored_bending_model(scene, directory.path / STORED)) or scene
         simulation = SteppedScene(comm, scene, phases)
         try:
             recorder = Recorder(simulation)

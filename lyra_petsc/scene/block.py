@@ -1,6 +1,6 @@
 """Base class of all blocks of scene keys: unknown keys are errors, and an empty key counts as absent.
 
-Messages, JSON Schema and the reference page are generated from the fields, rules and docstring of a block.
+JSON Schema and the reference page are generated from the fields and the docstring of a block.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from pydantic_core import CoreSchema
 from typing_extensions import Self
 
 from lyra_petsc.errors import suggest
-from lyra_petsc.scene.rules import Rule, holds
-from lyra_petsc.scene.values import problem, shown
+from lyra_petsc.scene.values import problem, require, shown
 
 _ENTRY = re.compile(r"(?P<names>\w+(?:, \w+)*)(?: : (?P<kind>.*))?")
 _UNIT = re.compile(r"\[([^\]]*)\]")
@@ -33,9 +32,6 @@ class Block(BaseModel):
 
     # keys that users may expect although they are not supported, with the message
     unsupported: ClassVar[dict[str, str]] = {}
-
-    # dependencies between keys
-    rules: ClassVar[tuple[Rule, ...]] = ()
 
     # required keys that `with_defaults` fills in in some cases
     conditional_defaults: ClassVar[frozenset[str]] = frozenset()
@@ -67,38 +63,35 @@ class Block(BaseModel):
         """Hook: add defaults that depend on which other keys are given."""
         return data
 
+    def check(self) -> None:
+        """Hook: raise a `problem` for values that do not go together."""
+
     @model_validator(mode="after")
-    def _check_rules(self) -> Self:
-        for rule in self.rules:
-            if not holds(rule.condition, self):
-                template = rule.message
-                text = template.format(**self.__dict__) if isinstance(template, str) else template(self)
-                raise problem(text, *filter(None, rule.at.split(".")))
+    def _check(self) -> Self:
+        self.check()
         return self
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         schema = handler.resolve_ref_schema(handler(core))
         described = attributes(cls)
-        keys = {}
         for name, field in cls.model_fields.items():
             key = field.alias or name
-            content = {word: value for word, value in schema["properties"][key].items() if word != "title"}
-            default = content.pop("default", None)
+            content = schema["properties"][key]
+            content.pop("title", None)
+            if content.get("default") == math.inf:  # no number in JSON
+                del content["default"]
             optional = not field.is_required() or name in cls.conditional_defaults
-            if "anyOf" in content and {"type": "null"} in content["anyOf"]:
-                pass
-            elif optional:  # an empty key counts as absent
-                content = {"anyOf": [content, {"type": "null"}]}
-            elif "$ref" in content:  # draft 7 ignores keywords beside a reference
-                content = {"allOf": [content]}
-            keys[key] = {"description": described[name].sentence, **content}
-            if default not in (None, math.inf):
-                keys[key]["default"] = default
-        schema.pop("title", None)
-        needed = [key for key in schema.get("required", ()) if key not in cls.conditional_defaults]
-        schema |= {"required": needed, "description": summary(cls), "properties": keys}
-        return schema | ({"allOf": [rule.condition for rule in cls.rules]} if cls.rules else {})
+            if optional and {"type": "null"} not in content.get("anyOf", ()):
+                # an empty key counts as absent
+                default = {"default": content.pop("default")} if "default" in content else {}
+                content = {"anyOf": [content, {"type": "null"}], **default}
+            schema["properties"][key] = {"description": described[name].sentence, **content}
+        schema["description"] = summary(cls)
+        schema["required"] = [
+            key for key in schema.get("required", ()) if key not in cls.conditional_defaults
+        ]
+        return schema
 
     def get(self, key: str) -> Any:
         """The value of a key, named as in `keys`; None if it is absent."""
@@ -108,6 +101,14 @@ class Block(BaseModel):
     def given(self, *keys: str) -> list[str]:
         """Those of ``keys`` that have a value."""
         return [key for key in keys if self.get(key) is not None]
+
+    def require_one(self, *keys: str) -> None:
+        """Raise a `problem` unless exactly one of ``keys`` has a value."""
+        require(len(self.given(*keys)) == 1, f"must have exactly one of {', '.join(keys)}")
+
+    def require_with(self, key: str, condition: object, message: str) -> None:
+        """Raise a `problem` at ``key`` if it has a value and the condition does not hold."""
+        require(self.get(key) is None or condition, message, key)
 
 
 @dataclass(frozen=True)

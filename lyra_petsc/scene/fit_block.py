@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
-from typing_extensions import Self
+from pydantic import BeforeValidator, WithJsonSchema
 
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, when
 from lyra_petsc.scene.values import (
-    ANY_AXES,
-    FINITE,
     Direction,
     Index,
-    JsonSchema,
     Name,
     NonNegative,
     Number,
@@ -26,6 +21,7 @@ from lyra_petsc.scene.values import (
     list_of,
     number,
     problem,
+    require,
     shown,
 )
 
@@ -47,11 +43,7 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return (number(value),)
 
 
-Table = Annotated[
-    Path, file_beside("table", ".csv", ".txt"), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})
-]
-_BOUNDS = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
-_NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]}
+Table = Annotated[Path, file_beside("table", ".csv", ".txt")]
 
 
 def _unique_axes(value: Any) -> tuple[str, ...]:
@@ -61,9 +53,7 @@ def _unique_axes(value: Any) -> tuple[str, ...]:
     return chosen
 
 
-_Axes = Annotated[
-    tuple[Direction, ...], BeforeValidator(_unique_axes), JsonSchema(ANY_AXES | {"uniqueItems": True})
-]
+_Axes = Annotated[tuple[Direction, ...], BeforeValidator(_unique_axes)]
 
 
 class Parameter(Block):
@@ -78,14 +68,13 @@ class Parameter(Block):
     """
 
     start: Number
-    bounds: Annotated[tuple[float, float], BeforeValidator(_bounds), JsonSchema(_BOUNDS)]
+    bounds: Annotated[tuple[float, float], BeforeValidator(_bounds)]
 
-    @model_validator(mode="after")
-    def _check_start(self) -> Self:
+    def check(self) -> None:
+        """Refuse a start outside of the bounds."""
         low, high = self.bounds
-        if not low <= self.start <= high:
-            raise problem(f"must lie within the bounds {low:g} to {high:g}, not {self.start:g}", "start")
-        return self
+        text = f"must lie within the bounds {low:g} to {high:g}, not {self.start:g}"
+        require(low <= self.start <= high, text, "start")
 
 
 class Overhang(Block):
@@ -117,11 +106,10 @@ class DrapeCoefficient(Block):
     radius: Positive
     support: NonNegative
 
-    @model_validator(mode="after")
-    def _check_support(self) -> Self:
-        if not self.support < self.radius:
-            raise problem(f"must be less than radius = {self.radius:g}, not {self.support:g}", "support")
-        return self
+    def check(self) -> None:
+        """Refuse a support that is not smaller than the sheet."""
+        text = f"must be less than radius = {self.radius:g}, not {self.support:g}"
+        require(self.support < self.radius, text, "support")
 
 
 class Quantity(Block):
@@ -147,15 +135,6 @@ class Quantity(Block):
         Time, or in a static analysis load factor; without this key the end.
     """
 
-    rules: ClassVar[tuple[Rule, ...]] = (
-        exactly_one("probe", "points", "overhang", "drape", "force"),
-        Rule(
-            when(given("axes"), one_of("probe", "force")),
-            "are of a probe or a force; leave axes out",
-            "axes",
-        ),
-    )
-
     probe: Name | None = None
     points: Table | None = None
     overhang: Overhang | None = None
@@ -163,6 +142,11 @@ class Quantity(Block):
     force: Index | None = None
     axes: _Axes | None = None
     at: Positive | None = None
+
+    def check(self) -> None:
+        """Refuse several quantities, and axes of one that has none."""
+        self.require_one("probe", "points", "overhang", "drape", "force")
+        self.require_with("axes", self.given("probe", "force"), "are of a probe or a force; leave axes out")
 
 
 class Measurement(Quantity):
@@ -179,21 +163,22 @@ class Measurement(Quantity):
         Standard deviation of each value, in its unit; a column ``uncertainty`` of the table replaces it.
     """
 
-    rules = (
-        *Quantity.rules,
-        Rule(
-            when(given("points"), absent("value", "table")),
-            "come with their values in the table; leave out value and table",
-            "points",
-        ),
-        Rule(when(absent("points"), one_of("value", "table")), "must have exactly one of value, table"),
-        Rule(when(given("table"), absent("at")), "has a column time; leave at out", "at"),
-        Rule(when(given("value"), given("uncertainty")), "missing (standard deviation)", "uncertainty"),
-    )
-
-    value: Annotated[tuple[float, ...], BeforeValidator(_numbers), JsonSchema(_NUMBERS)] | None = None
+    value: Annotated[tuple[float, ...], BeforeValidator(_numbers), WithJsonSchema({})] | None = None
     table: Table | None = None
     uncertainty: Positive | None = None
+
+    def check(self) -> None:
+        """Refuse values that are missing, or given twice."""
+        super().check()
+        given = self.given("value", "table")
+        self.require_with(
+            "points", not given, "come with their values in the table; leave out value and table"
+        )
+        if self.points is None:
+            self.require_one("value", "table")
+        self.require_with("table", self.at is None, "has a column time; leave at out")
+        if self.value is not None:
+            require(self.uncertainty is not None, "missing (standard deviation)", "uncertainty")
 
 
 class Fit(Block):
@@ -208,6 +193,4 @@ class Fit(Block):
     """
 
     parameters: Annotated[dict[Name, Parameter], block_of("keys of the scene", minimum=1)]
-    measurements: Annotated[
-        list[Measurement], list_of(" of measurements", minimum=1), Field(json_schema_extra={"minItems": 1})
-    ]
+    measurements: Annotated[list[Measurement], list_of(" of measurements", minimum=1)]

@@ -15,25 +15,19 @@ FILE = f"lyra_petsc-{lyra_petsc.__version__}.schema.json"
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON Schema (draft 7) of a scene.
+    """JSON Schema of a scene: the keys of all blocks with types, ranges and meaning.
 
-    It refuses what the loader refuses, except what JSON Schema cannot express: files that do not exist,
-    unknown groups and motions, a membrane stiffness that is not positive definite, and the order of times.
+    It accepts what the loader accepts; conditions between keys are checked by the loader alone.
     """
-    content = Scene.model_json_schema(ref_template="#/definitions/{model}")
-    definitions = content.pop("$defs")
-    keys = content["properties"]
+    content = Scene.model_json_schema()
     for key in ONE_OR_MANY:
-        entry = keys[key].pop("items")
-        many = {"type": keys[key].pop("type"), "items": entry, "minItems": 1}
-        keys[key] = {**keys[key], "anyOf": [entry, many]}
-    for key in ("motions", "obstacles", "probes"):
-        keys[key]["anyOf"][0]["propertyNames"] = {"pattern": r"\S"}
+        entry = content["properties"][key]
+        many = {name: entry.pop(name) for name in ("type", "items")}
+        entry["anyOf"] = [many["items"], many]
     return {
-        "$schema": "http://json-schema.org/draft-07/schema#",
-        "title": "Scene of lyra_petsc",
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
         **content,
-        "definitions": definitions,
+        "title": "Scene of lyra_petsc",
     }
 
 

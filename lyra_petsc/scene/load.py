@@ -18,10 +18,6 @@ from lyra_petsc.scene.values import shown
 # A JSON file with one of these keys is a scene of this program, not of the original one.
 _OUR_KEYS = {"mesh", "material", "time"}
 
-STORED, MESH_OF_RUN = "scene.yaml", "mesh.h5"
-"""Scene and mesh in the folder of a run. Scenes stored before ``bending_model`` existed mean hinges; the mesh
-shows that a ``scene.yaml`` is a stored one."""
-
 
 def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed: bool = True) -> Scene:
     """Read and check a scene: YAML, or the original program's conf.json.
@@ -51,9 +47,6 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
     with _refuse_recursion(path):
         data = plain(data)
-        if path.name == STORED and (path.parent / MESH_OF_RUN).exists():
-            for block in _blocks_without_model(data):
-                block["bending_model"] = "hinge"
         overridden = apply_overrides(data, overrides)
     scene = _load_checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
     scene._notes = notes
@@ -76,32 +69,6 @@ def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) 
         The scene cannot be used; the message names the key.
     """
     return _load_changed(data, changes or {}, None, Path.cwd())
-
-
-def _blocks_without_model(data: Any) -> list[dict[str, Any]]:
-    """The material blocks without ``bending_model`` of a scene given as plain values."""
-    return [block for block in _material_blocks(data) if block.get("bending_model") is None]
-
-
-def _material_blocks(data: Any) -> list[dict[str, Any]]:
-    blocks = data.get("material") if isinstance(data, dict) else None
-    return [block for block in (blocks if isinstance(blocks, list) else [blocks]) if isinstance(block, dict)]
-
-
-def with_stored_bending_model(scene: Scene, stored: Path) -> Scene:
-    """The scene of a resumed run, with hinges where neither it nor the ``stored`` scene names a model.
-
-    It is unchanged if the stored scene cannot be read.
-    """
-    try:
-        before = parse_yaml(read_text(stored), file=stored)
-    except InputError:
-        return scene
-    if not _blocks_without_model(before) or scene._given is None:
-        return scene
-    blocks = _material_blocks(scene._given)
-    chosen = [number for number, block in enumerate(blocks) if block.get("bending_model") is None]
-    return change_scene(scene, {f"material[{number}].bending_model": "hinge" for number in chosen})
 
 
 def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:

@@ -12,6 +12,9 @@ from lyra_petsc.scene.values import one_line, shown
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_BOUNDS = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
+"""pydantic's kinds of errors for numbers out of bounds."""
+
 
 def dotted(path: Sequence[str | int], data: Any = None) -> str:
     """``path`` written like ``handles[1].group``.
@@ -86,6 +89,10 @@ def _message(kind: str, message: str, value: Any, context: dict[str, Any]) -> st
         return message
     if kind == "missing":
         return "missing"
+    if kind in _BOUNDS:
+        (bound,) = (limit for name, limit in context.items() if name != "error")
+        given = f"{value:g}" if isinstance(value, float) else shown(value)
+        return f"must be {_BOUNDS[kind]} {bound:.10g}, not {given}"
     if kind == "literal_error":
         known = context["expected"].replace("'", "").replace(" or ", ", ")
         return f"must be one of {known}, not {shown(value)}"

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any
 
-from pydantic import PlainValidator
+from pydantic import BeforeValidator
 
-from lyra_petsc.scene.values import FINITE, number, problem, shown
+from lyra_petsc.scene.values import number, problem, shown
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -37,7 +37,7 @@ def _petsc_value(value: Any) -> Any:
     raise problem(f"must be text, a number, true or false, not {shown(value)}")
 
 
-PetscValue = Annotated[str | int | float | bool | None, PlainValidator(_petsc_value)]
+PetscValue = Annotated[str | int | float | bool | None, BeforeValidator(_petsc_value)]
 
 
 def petsc_options(value: Any) -> Any:
@@ -67,27 +67,3 @@ def _is_unsafe(name: str, value: Any) -> bool:
     if name == "pc_type" and value == "python":
         return False  # means the multigrid of this program: a scene cannot name another class
     return not _PLAIN.fullmatch(value) or (name.endswith("type") and value in ("python", "shell"))
-
-
-def _ignoring_case(pattern: re.Pattern[str]) -> str:
-    """A pattern for names in lower case, for names in any case; JSON Schema has no flag for this."""
-    letters = re.sub(r"(?<!\\)[a-z]", lambda letter: f"[{letter[0]}{letter[0].upper()}]", pattern.pattern)
-    return f"^({letters})$"
-
-
-def _text_or_number(pattern: str) -> dict[str, Any]:
-    return {"anyOf": [{"type": "string", "pattern": pattern}, FINITE, {"type": ["boolean", "null"]}]}
-
-
-_SHOWING = _ignoring_case(_SHOWS)
-PETSC_BLOCK: dict[str, Any] = {
-    "type": "object",
-    "propertyNames": {"pattern": rf"^({_NAME.pattern})$", "not": {"pattern": _ignoring_case(_REFUSED)}},
-    "patternProperties": {
-        _SHOWING: _text_or_number(rf"^{_SCREEN.pattern}$"),
-        rf"^(?!{_SHOWING[1:]})": _text_or_number(rf"^{_PLAIN.pattern}$"),
-        "[tT][yY][pP][eE]$": {"not": {"const": "shell"}},
-        "^(?![pP][cC]_[tT][yY][pP][eE]$).*[tT][yY][pP][eE]$": {"not": {"const": "python"}},
-    },
-}
-"""JSON Schema of `petsc_options`."""

@@ -17,29 +17,25 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Discriminator,
     Field,
     PrivateAttr,
     Tag,
     ValidationInfo,
+    WithJsonSchema,
     field_validator,
-    model_validator,
 )
-from typing_extensions import Self
 
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.materials.library import is_isotropic, isotropic_names, material_names, measured_names
 from lyra_petsc.scene.materials.measured_curves import Points, checked_points, read_curve
-from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
-from lyra_petsc.scene.rules import Rule, absent, any_of, exactly_one, given, holds, one_of, when
+from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
 from lyra_petsc.scene.values import (
-    ANY_AXES,
     AXES,
-    INDEX,
-    VECTOR,
     Angle,
     Axis,
     Bending,
@@ -48,7 +44,6 @@ from lyra_petsc.scene.values import (
     Flag,
     Fraction,
     Index,
-    JsonSchema,
     Name,
     NonNegative,
     Number,
@@ -72,6 +67,7 @@ from lyra_petsc.scene.values import (
     number,
     path_beside,
     problem,
+    require,
     shown,
     vector,
 )
@@ -135,15 +131,7 @@ class Grid(Block):
     pattern: Literal["diagonal", "alternating", "criss-cross"] = "diagonal"
 
 
-def _file(*endings: str) -> dict[str, Any]:
-    """JSON Schema of a file name with one of these endings, in upper or lower case."""
-    any_case = ("".join(f"[{letter}{letter.upper()}]" for letter in ending) for ending in endings)
-    return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
-
-
-MeshPath = Annotated[
-    Path, file_beside("mesh file", *MESH_SUFFIXES), JsonSchema(_file(*(end[1:] for end in MESH_SUFFIXES)))
-]
+MeshPath = Annotated[Path, file_beside("mesh file", *MESH_SUFFIXES)]
 
 
 class MeshSource(Block):
@@ -172,19 +160,6 @@ class MeshSource(Block):
         Name of the sheet, and of a surface group with its triangles.
     """
 
-    rules = (
-        exactly_one("file", "grid"),
-        *(
-            Rule(
-                when(given(key), given(file=_file("geo"))),
-                "is for .geo files only (others come with their elements)",
-                key,
-            )
-            for key in ("size", "algorithm")
-        ),
-        Rule(when(given("uv"), given(file=_file("obj"))), "is for .obj files only (others have no vt)", "uv"),
-    )
-
     file: MeshPath | None = None
     grid: Grid | None = None
     size: Positive | None = None
@@ -193,6 +168,16 @@ class MeshSource(Block):
     uv: UvScale | None = None
     weld: Positive | None = None
     name: Name | None = None
+
+    def check(self) -> None:
+        """Refuse keys for other kinds of files."""
+        self.require_one("file", "grid")
+        suffix = self.file.suffix.lower() if self.file is not None else ""
+        for key in ("size", "algorithm"):
+            self.require_with(
+                key, suffix == ".geo", "is for .geo files only (others come with their elements)"
+            )
+        self.require_with("uv", suffix == ".obj", "is for .obj files only (others have no vt)")
 
 
 class MembraneStiffness(Block):
@@ -213,21 +198,20 @@ class MembraneStiffness(Block):
     c12: Number
     c33: Positive
 
-    @model_validator(mode="after")
-    def _check_positive_definite(self) -> Self:
+    def check(self) -> None:
+        """Refuse a stiffness that is not positive definite."""
         _check_coupling("c", self.c11, self.c12, self.c22, "N/m")
-        return self
 
 
 def _check_coupling(letter: str, first: float, coupling: float, second: float, unit: str) -> None:
     """Refuse a stiffness that is not positive definite."""
     bound = first**0.5 * second**0.5
-    if abs(coupling) >= bound:
-        raise problem(
-            f"is not positive definite: |{letter}12| = {abs(coupling):g} must be below"
-            f" sqrt({letter}11 {letter}22) = {bound:g} {unit}",
-            f"{letter}12",
-        )
+    require(
+        abs(coupling) < bound,
+        f"is not positive definite: |{letter}12| = {abs(coupling):g} must be below"
+        f" sqrt({letter}11 {letter}22) = {bound:g} {unit}",
+        f"{letter}12",
+    )
 
 
 class PlateStiffness(Block):
@@ -248,10 +232,9 @@ class PlateStiffness(Block):
     d12: Number = 0.0
     d33: Positive
 
-    @model_validator(mode="after")
-    def _check_positive_definite(self) -> Self:
+    def check(self) -> None:
+        """Refuse a stiffness that is not positive definite."""
         _check_coupling("d", self.d11, self.d12, self.d22, "N·m")
-        return self
 
 
 BendingModel = Literal["hinge", "midedge"]
@@ -274,17 +257,7 @@ def _curve(value: Any, info: ValidationInfo) -> Points:
     raise problem(f"must be a file, or points like [[0.01, 5.0], [0.02, 12.0]], not {shown(value)}")
 
 
-_CURVE = {
-    "anyOf": [
-        {"type": "string"},
-        {
-            "type": "array",
-            "items": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
-            "minItems": 1,
-        },
-    ]
-}
-Curve = Annotated[Points, BeforeValidator(_curve), JsonSchema(_CURVE)]
+Curve = Annotated[Points, BeforeValidator(_curve), WithJsonSchema({"type": ["string", "array"]})]
 
 
 KES_CURVATURE, KES_ANGLE = 2.5, 8.0
@@ -317,26 +290,21 @@ class KesReport(Block):
     G: Pair | None = None
     width_of_shear: Pair | None = Field(default=None, alias="2HG")
 
-    @model_validator(mode="after")
-    def _check_ranges(self) -> Self:
+    def check(self) -> None:
+        """Refuse numbers that no fabric has."""
         for name, stiffness, loop, width, farthest in (
             ("B", self.B, "2HB", self.width_of_bending, KES_CURVATURE),
             ("G", self.G, "2HG", self.width_of_shear, KES_ANGLE),
         ):
             (low, high), unit = KES_RANGES[name]
             for value in stiffness or ():
-                if not value > 0.0:
-                    raise problem(f"must be > 0, not {shown(value)}", name)
-                if not low <= value <= high:
-                    raise problem(f"must be {low:g} to {high:g} {unit} as of fabrics, not {value:g}", name)
+                require(value > 0.0, f"must be > 0, not {shown(value)}", name)
+                text = f"must be {low:g} to {high:g} {unit} as of fabrics, not {value:g}"
+                require(low <= value <= high, text, name)
             for value, half in zip(width or (), stiffness or (), strict=False):
-                if value > 2.0 * farthest * half:
-                    raise problem(
-                        f"must be at most {2.0 * farthest:g} {name} = {2.0 * farthest * half:g}, "
-                        f"not {value:g}: no test goes far enough to see a wider loop",
-                        loop,
-                    )
-        return self
+                widest = 2.0 * farthest * half
+                text = f"must be at most {2.0 * farthest:g} {name} = {widest:g}, not {value:g}"
+                require(value <= widest, f"{text}: no test goes far enough to see a wider loop", loop)
 
 
 class LawCurves(Block):
@@ -361,7 +329,6 @@ class LawCurves(Block):
 
 
 _AnyLaw = Annotated[Annotated[MembraneLaw, Tag("[plain]")] | Annotated[LawCurves, Tag("[block]")], _BY_KIND]
-_BY_CURVES = given(law={"type": "object"})
 _AnyBending = Annotated[
     Annotated[Bending, Tag("[plain]")] | Annotated[PlateStiffness, Tag("[block]")], _BY_KIND
 ]
@@ -374,36 +341,13 @@ _ALTERNATIVES = (
 )
 
 
-def _not_one_alternative(material: Material) -> str:
-    used = [given[0] for given in (material.given(*keys) for keys, _ in _ALTERNATIVES) if given]
-    found = f"; {' and '.join(used)} are given" if used else ""
-    return (
-        "must be given in exactly one way: cloth, or density + membrane + bending,"
-        f" or young + poisson + thickness + density{found}"
-    )
-
-
-def _required(keys: tuple[str, ...], key: str) -> Rule:
-    """Rule that ``key`` is given if any of the ``keys`` of its alternative is."""
-    used = any_of(*keys) if key != "membrane" else {"allOf": [any_of(*keys), {"not": _BY_CURVES}]}
-    return Rule(when(used, given(key)), lambda m: f"missing (needed beside {m.given(*keys)[0]})", key)
-
-
 _NO_SHEAR = 1.0
 """Placeholder for c33 in a membrane with G of a KES report, which replaces it."""
 
-_FRICTION = {
-    "anyOf": [
-        {"type": "number", "exclusiveMinimum": 0},
-        {"type": "array", "not": {"items": {"enum": [0]}}},
-    ]
-}
-_HAS_FRICTION = {
-    "anyOf": [
-        given(friction_moment=_FRICTION),
-        given(kes={"type": "object", **given(**{"2HB": _FRICTION})}),
-    ]
-}
+
+def _nonzero(value: Any) -> bool:
+    """Whether a number, or one of a list, is given and not 0."""
+    return any(entry not in (None, 0) for entry in (value if isinstance(value, (list, tuple)) else [value]))
 
 
 class Material(Block):
@@ -460,75 +404,10 @@ class Material(Block):
         Numbers of a KES report, instead of bending, c33, friction_moment and friction_force.
     """
 
-    rules = (
-        Rule({"oneOf": [any_of(*keys) for keys, _ in _ALTERNATIVES]}, _not_one_alternative),
-        Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
-        *(_required(keys, key) for keys, required in _ALTERNATIVES for key in required),
-        Rule(
-            when(_BY_CURVES, absent("membrane", "young")),
-            "curves take the place of membrane; give them beside a cloth, or density and bending",
-            "law",
-        ),
-        Rule(
-            when(given(bending={"type": "object"}), given(bending_model={"const": "midedge"})),
-            "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three",
-            "bending",
-        ),
-        Rule(
-            when(_HAS_FRICTION, given(bending_model={"const": "midedge"})),
-            "friction_moment (2HB of kes) is for bending_model: midedge; with hinges it depends on the mesh",
-            "bending_model",
-        ),
-        Rule(
-            when(given(law={"const": "measured"}), given(cloth={"enum": measured_names()})),
-            lambda m: (
-                f"measured is for measured cloths: {', '.join(measured_names())}"
-                f"{'' if m.cloth is None else f'; {m.cloth} is none of them, leave law out'}"
-            ),
-            "law",
-        ),
-        Rule(
-            when(
-                given(law={"const": "neo-hookean"}),
-                {"anyOf": [given("young"), given(cloth={"enum": isotropic_names()})]},
-            ),
-            "neo-hookean is for isotropic sheets: give young, poisson, thickness and density, "
-            "or leave law out",
-            "law",
-        ),
-        *(
-            Rule(
-                {"not": given(kes=given(name), **{key: {"not": {"enum": [None, 0]}}})},
-                f"kes has {name}, which takes its place; leave one of them out",
-                key,
-            )
-            for name, key in (("B", "bending"), ("2HB", "friction_moment"), ("2HG", "friction_force"))
-        ),
-        *(
-            Rule(
-                {"not": given("young", kes=given(name))},
-                f"has {name}, which young, poisson and thickness give, too; leave one of them out",
-                "kes",
-            )
-            for name in ("B", "G")
-        ),
-        *(
-            Rule(
-                {"not": given(kes=given("G"), **condition)},
-                f"kes has G, which takes the place of {what}; leave one of them out",
-                at,
-            )
-            for condition, what, at in (
-                ({"membrane": given(c33={"not": {"const": _NO_SHEAR}})}, "c33", "membrane.c33"),
-                ({"law": {"type": "object"}}, "the curve of shear", "law"),
-                ({"law": {"const": "neo-hookean"}}, "the shear modulus of neo-hookean", "law"),
-            )
-        ),
-    )
     conditional_defaults = frozenset({"bending_model"})
 
     group: Name | None = None
-    cloth: Annotated[Name, JsonSchema({"enum": material_names()})] | None = None
+    cloth: Annotated[Name, WithJsonSchema({"enum": material_names()})] | None = None
     density: Positive | None = None
     membrane: MembraneStiffness | None = None
     bending: _AnyBending | None = None
@@ -559,7 +438,8 @@ class Material(Block):
             data["membrane"] = {"c33": _NO_SHEAR, **membrane}
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))
-        friction = holds(_HAS_FRICTION, data)
+        width = kes.get("2HB") if isinstance(kes, (dict, KesReport)) else None
+        friction = _nonzero(data.get("friction_moment")) or _nonzero(width)
         return {"bending_model": "midedge" if isotropic or plate or friction else "hinge", **data}
 
     @field_validator("cloth")
@@ -569,24 +449,81 @@ class Material(Block):
             raise problem(f"unknown cloth {cloth!r}, {suggest(cloth, material_names())}")
         return cloth
 
+    def check(self) -> None:
+        """Refuse numbers that are missing, given twice, or for another law or bending model."""
+        used = [given for given in (self.given(*keys) for keys, _ in _ALTERNATIVES) if given]
+        found = f"; {' and '.join(given[0] for given in used)} are given" if used else ""
+        require(
+            len(used) == 1,
+            "must be given in exactly one way: cloth, or density + membrane + bending,"
+            f" or young + poisson + thickness + density{found}",
+        )
+        self.require_with("density", self.cloth is None, "comes with the cloth; use density_scale")
+        by_curves = isinstance(self.law, LawCurves)
+        for keys, required in _ALTERNATIVES:
+            for key in required if self.given(*keys) else ():
+                text = f"missing (needed beside {self.given(*keys)[0]})"
+                require(self.get(key) is not None or (key == "membrane" and by_curves), text, key)
+        midedge = self.bending_model == "midedge"
+        isotropic = self.young is not None or self.cloth in isotropic_names()
+        if by_curves:
+            require(
+                not self.given("membrane", "young"),
+                "curves take the place of membrane; give them beside a cloth, or density and bending",
+                "law",
+            )
+        if isinstance(self.bending, PlateStiffness):
+            text = "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three"
+            require(midedge, text, "bending")
+        if _nonzero(self.friction_moment) or (self.kes is not None and _nonzero(self.kes.width_of_bending)):
+            require(
+                midedge,
+                "friction_moment (2HB of kes) is for bending_model: midedge; "
+                "with hinges it depends on the mesh",
+                "bending_model",
+            )
+        if self.law == "measured":
+            other = "" if self.cloth is None else f"; {self.cloth} is none of them, leave law out"
+            text = f"measured is for measured cloths: {', '.join(measured_names())}{other}"
+            require(self.cloth in measured_names(), text, "law")
+        if self.law == "neo-hookean":
+            require(
+                isotropic,
+                "neo-hookean is for isotropic sheets: give young, poisson, thickness and density, "
+                "or leave law out",
+                "law",
+            )
+        if self.kes is not None:
+            self._check_report(self.kes)
 
-_ALL_AXES = {
-    "anyOf": [
-        {"type": "null"},
-        {"allOf": [{"not": {"items": {"not": {"const": axis}}}} for axis in AXES]},
-    ]
-}
+    def _check_report(self, kes: KesReport) -> None:
+        """Refuse numbers that a KES report gives as well."""
+        one = "leave one of them out"
+        for name, key in (("B", "bending"), ("2HB", "friction_moment"), ("2HG", "friction_force")):
+            if kes.get(name) is not None:
+                text = f"kes has {name}, which takes its place; {one}"
+                require(self.get(key) in (None, 0), text, key)
+        for name in kes.given("B", "G") if self.young is not None else ():
+            raise problem(f"has {name}, which young, poisson and thickness give, too; {one}", "kes")
+        if kes.G is not None:
+            for wrong, part, at in (
+                (self.membrane is not None and self.membrane.c33 != _NO_SHEAR, "c33", "membrane.c33"),
+                (isinstance(self.law, LawCurves), "the curve of shear", "law"),
+                (self.law == "neo-hookean", "the shear modulus of neo-hookean", "law"),
+            ):
+                require(not wrong, f"kes has G, which takes the place of {part}; {one}", *at.split("."))
 
 
 MAX_SPEED = 1e8
 """Largest speed [m/s] in a scene; squares of much larger ones overflow."""
 
-_SPEEDS = {"items": {"minimum": -MAX_SPEED, "maximum": MAX_SPEED}}
-_NOT_TOO_FAST = Rule(
-    when(given("velocity"), {"properties": {"velocity": _SPEEDS}}),
-    f"must not be faster than {MAX_SPEED:g} m/s",
-    "velocity",
-)
+
+def _speed(velocity: Vec3) -> Vec3:
+    require(max(map(abs, velocity)) <= MAX_SPEED, f"must not be faster than {MAX_SPEED:g} m/s")
+    return velocity
+
+
+Velocity = Annotated[Vector, AfterValidator(_speed)]
 
 
 class UniformWind(Block):
@@ -602,15 +539,9 @@ class UniformWind(Block):
         Tangential drag coefficient.
     """
 
-    rules = (_NOT_TOO_FAST,)
-
-    velocity: Vector
+    velocity: Velocity
     density: NonNegative
     drag: NonNegative = 0.0
-
-
-_NODES = {"type": "array", "items": INDEX.schema, "minItems": 1, "uniqueItems": True}
-_BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
 
 
 class VertexChoice(Block):
@@ -627,8 +558,8 @@ class VertexChoice(Block):
     """
 
     group: Name | None = None
-    nodes: Annotated[list[Index], list_of(" of vertex numbers", minimum=1), JsonSchema(_NODES)] | None = None
-    box: Annotated[tuple[Vec3, Vec3], JsonSchema(_BOX)] | None = None
+    nodes: Annotated[list[Index], list_of(" of vertex numbers", minimum=1)] | None = None
+    box: tuple[Vec3, Vec3] | None = None
 
     @field_validator("nodes")
     @classmethod
@@ -652,13 +583,13 @@ class VertexChoice(Block):
 class Selector(VertexChoice):
     """Vertices by exactly one of group, nodes, box."""
 
-    rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
+    def check(self) -> None:
+        """Refuse several choices."""
+        self.require_one("group", "nodes", "box")
 
 
-def _window_ends_later(block: Any) -> Any:
-    if not block.start < block.until:
-        raise problem(f"must be later than from = {block.start:g}, not {block.until:g}", "until")
-    return block
+def _check_window(start: float, until: float) -> None:
+    require(start < until, f"must be later than from = {start:g}, not {until:g}", "until")
 
 
 Interpolation = Literal["monotone", "hermite", "linear"]
@@ -692,37 +623,7 @@ class Handle(Selector):
         Stiffness for each vertex and axis of springs that replace the constraint.
     """
 
-    rules = (
-        *Selector.rules,
-        Rule(
-            when(
-                given(clamp={"const": True}),
-                {"anyOf": [{"properties": {"axes": _ALL_AXES}}, absent("stiffness")]},
-            ),
-            "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
-            "clamp",
-        ),
-        Rule(
-            when(
-                given("symmetry"),
-                {
-                    "properties": {
-                        "axes": _ALL_AXES,
-                        "clamp": {"const": False},
-                        "from": {"maximum": 0},
-                        "fade": {"maximum": 0},
-                        "motion": {"type": "null"},
-                        "stiffness": {"type": "null"},
-                    }
-                },
-            ),
-            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, stiffness, "
-            "from and fade",
-            "symmetry",
-        ),
-    )
-
-    axes: Annotated[tuple[Direction, ...], JsonSchema(ANY_AXES)] = AXES
+    axes: tuple[Direction, ...] = AXES
     clamp: Flag = False
     symmetry: Direction | None = None
     motion: Name | None = None
@@ -748,7 +649,22 @@ class Handle(Selector):
         chosen = axes(value)
         return tuple(axis for axis in AXES if axis in chosen)
 
-    _check_window = model_validator(mode="after")(_window_ends_later)
+    def check(self) -> None:
+        """Refuse slopes and symmetry planes that cannot be held."""
+        super().check()
+        require(
+            not self.clamp or self.stiffness is None or self.axes == AXES,
+            "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
+            "clamp",
+        )
+        others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.given("motion", "stiffness")
+        self.require_with(
+            "symmetry",
+            self.axes == AXES and not others,
+            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, stiffness, "
+            "from and fade",
+        )
+        _check_window(self.start, self.until)
 
 
 class Keyframe(Block):
@@ -769,16 +685,14 @@ class Keyframe(Block):
         keyframe.
     """
 
-    rules = (_NOT_TOO_FAST,)
-
     time: Number
     scale: Scale = 1.0
     rotate: Rotation | None = None
     translate: Vector = (0.0, 0.0, 0.0)
-    velocity: Vector | None = None
+    velocity: Velocity | None = None
 
 
-Keyframes = Annotated[list[Keyframe], list_of(), Field(json_schema_extra={"minItems": 1})]
+Keyframes = Annotated[list[Keyframe], list_of()]
 
 
 class Friction(Block):
@@ -795,11 +709,10 @@ class Friction(Block):
     static: NonNegative
     kinetic: NonNegative
 
-    @model_validator(mode="after")
-    def _check_coefficients(self) -> Self:
-        if self.kinetic > self.static:
-            raise problem(f"must be at most static = {self.static:g}, not {self.kinetic:g}", "kinetic")
-        return self
+    def check(self) -> None:
+        """Refuse a kinetic coefficient above the static one."""
+        text = f"must be at most static = {self.static:g}, not {self.kinetic:g}"
+        require(self.kinetic <= self.static, text, "kinetic")
 
 
 _AnyFriction = Annotated[
@@ -882,11 +795,9 @@ class Capsule(Block):
     to: Vector
     radius: Positive
 
-    @model_validator(mode="after")
-    def _check_axis(self) -> Self:
-        if self.start == self.to:
-            raise problem("must be another point than from; for a ball give sphere", "to")
-        return self
+    def check(self) -> None:
+        """Refuse an axis without length."""
+        require(self.start != self.to, "must be another point than from; for a ball give sphere", "to")
 
 
 class Cuboid(Block):
@@ -901,12 +812,10 @@ class Cuboid(Block):
     min: Vector
     max: Vector
 
-    @model_validator(mode="after")
-    def _check_corners(self) -> Self:
+    def check(self) -> None:
+        """Refuse a box without volume."""
         for axis, low, high in zip(AXES, self.min, self.max, strict=True):
-            if low >= high:
-                raise problem(f"must be above min in {axis}: {high:g} is not above {low:g}", "max")
-        return self
+            require(low < high, f"must be above min in {axis}: {high:g} is not above {low:g}", "max")
 
 
 class ObstacleMesh(Block):
@@ -956,15 +865,6 @@ class Obstacle(Block):
         Friction coefficient, instead of that of ``contact``.
     """
 
-    rules = (
-        exactly_one(*SHAPES),
-        Rule(
-            when(given(inside={"const": True}), any_of("sphere", "capsule", "box")),
-            "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
-            "inside",
-        ),
-    )
-
     plane: Plane | None = None
     sphere: Sphere | None = None
     capsule: Capsule | None = None
@@ -980,6 +880,15 @@ class Obstacle(Block):
     ) = None
     interpolation: Interpolation = "monotone"
     friction: _AnyFriction | None = None
+
+    def check(self) -> None:
+        """Refuse several shapes, and sheets inside of a plane or a mesh."""
+        self.require_one(*SHAPES)
+        require(
+            not self.inside or self.given("sphere", "capsule", "box"),
+            "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
+            "inside",
+        )
 
     @property
     def shape(self) -> str:
@@ -1008,21 +917,6 @@ class AppliedLoad(VertexChoice):
         The load acts for from ≤ t ≤ until; by default always.
     """
 
-    rules = (
-        exactly_one("force", "pressure", "traction", "moment"),
-        Rule(
-            when(given("force"), one_of("group", "nodes", "box")),
-            "needs exactly one of group, nodes, box to act on",
-            "force",
-        ),
-        *(
-            Rule(when(given(kind), absent(key)), f"cannot select triangles for {kind}; use group", key)
-            for kind in ("pressure", "traction")
-            for key in ("box", "nodes")
-        ),
-        Rule(when(given("moment"), given("group")), "needs a group of boundary edges to act on", "moment"),
-    )
-
     force: Vector | None = None
     pressure: Number | None = None
     traction: Vector | None = None
@@ -1030,7 +924,16 @@ class AppliedLoad(VertexChoice):
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
-    _check_window = model_validator(mode="after")(_window_ends_later)
+    def check(self) -> None:
+        """Refuse several loads, and vertices or triangles on which a load cannot act."""
+        self.require_one("force", "pressure", "traction", "moment")
+        chosen = self.given("group", "nodes", "box")
+        self.require_with("force", len(chosen) == 1, "needs exactly one of group, nodes, box to act on")
+        for kind in self.given("pressure", "traction"):
+            for key in self.given("box", "nodes"):
+                raise problem(f"cannot select triangles for {kind}; use group", key)
+        self.require_with("moment", self.group is not None, "needs a group of boundary edges to act on")
+        _check_window(self.start, self.until)
 
 
 class Initial(Block):
@@ -1049,9 +952,7 @@ class Initial(Block):
         Seed of the random numbers for the noise.
     """
 
-    rules = (_NOT_TOO_FAST,)
-
-    velocity: Vector = (0.0, 0.0, 0.0)
+    velocity: Velocity = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)
     noise: NonNegative = 0.0
     seed: Seed = 0
@@ -1077,11 +978,6 @@ FIELD_UNITS = {
 }
 FIELDS = tuple(FIELD_UNITS)
 
-
-_FIELDS = {"type": "array", "items": {"enum": list(FIELDS)}}
-
-
-_STATIC = given(analysis={"const": "static"})
 _MEANINGLESS = "has no meaning in a static analysis; leave it out"
 
 
@@ -1109,43 +1005,6 @@ class Time(Block):
         Spectral radius of ``alpha2`` at high frequencies: 0 damps them within a step, 1 not at all.
     """
 
-    rules = (
-        *(
-            Rule(when(_STATIC, absent(key)), _MEANINGLESS, key)
-            for key in ("integrator", "tolerance", "spectral_radius")
-        ),
-        Rule(
-            when(_STATIC, {"properties": {"end": {"enum": [1, None]}}}),
-            "is 1 in a static analysis (the full load); leave it out",
-            "end",
-        ),
-        Rule(
-            when(_STATIC, {"properties": {"step": {"type": ["number", "null"], "maximum": 1}}}),
-            "is the first increment of the load factor, at most 1, not {step!r}",
-            "step",
-        ),
-        Rule({"anyOf": [_STATIC, given("end", "step")]}, "needs end and step"),
-        Rule(
-            when(given("tolerance"), given(step={"const": "auto"})),
-            "is for step: auto; with a fixed step leave it out",
-            "tolerance",
-        ),
-        Rule(
-            {"properties": {"tolerance": {"minimum": 1e-12}}},
-            "is at least 1e-12, not {tolerance:g}: double precision reaches no less",
-            "tolerance",
-        ),
-        Rule(
-            {"properties": {"tolerance": {"exclusiveMaximum": 1}}},
-            "is a fraction of the sheet's size, below 1, not {tolerance:g}",
-            "tolerance",
-        ),
-        Rule(
-            when(given("spectral_radius"), given(integrator={"const": "alpha2"})),
-            "is for integrator: alpha2; {integrator} has none, leave it out",
-            "spectral_radius",
-        ),
-    )
     conditional_defaults = frozenset({"end", "step"})
 
     analysis: Analysis = "dynamic"
@@ -1154,6 +1013,29 @@ class Time(Block):
     tolerance: Positive | None = None
     integrator: Integrator | None = None
     spectral_radius: Fraction | None = None
+
+    def check(self) -> None:
+        """Refuse keys for another analysis, integrator or kind of steps."""
+        if self.static:
+            for key in self.given("integrator", "tolerance", "spectral_radius"):
+                raise problem(_MEANINGLESS, key)
+            require(self.end == 1.0, "is 1 in a static analysis (the full load); leave it out", "end")
+            require(
+                isinstance(self.step, float) and self.step <= 1.0,
+                f"is the first increment of the load factor, at most 1, not {self.step!r}",
+                "step",
+            )
+        self.require_with("tolerance", self.adaptive, "is for step: auto; with a fixed step leave it out")
+        if self.tolerance is not None:
+            least = f"is at least 1e-12, not {self.tolerance:g}: double precision reaches no less"
+            require(self.tolerance >= 1e-12, least, "tolerance")
+            most = f"is a fraction of the sheet's size, below 1, not {self.tolerance:g}"
+            require(self.tolerance < 1.0, most, "tolerance")
+        self.require_with(
+            "spectral_radius",
+            self.integrator == "alpha2",
+            f"is for integrator: alpha2; {self.integrator} has none, leave it out",
+        )
 
     @property
     def scheme(self) -> str:
@@ -1222,7 +1104,9 @@ class Output(Block):
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
 
     every: Positive | None = 0.04
-    fields: Annotated[list[str], JsonSchema(_FIELDS)] = Field(default_factory=list)
+    fields: Annotated[list[str], WithJsonSchema({"type": "array", "items": {"enum": list(FIELDS)}})] = Field(
+        default_factory=list
+    )
     checkpoint: CheckpointInterval = Field(default_factory=CheckpointInterval)
     reactions: Flag = False
     vtkhdf: Flag = False
@@ -1287,25 +1171,6 @@ class Camera(Block):
         Percentage of the states that the fitted distance shows completely, from 50 to 100; by default 95.
     """
 
-    rules = (
-        *(
-            Rule(
-                when(given(here), given(other)),
-                f"needs {other} beside it; to have the distance fitted give direction",
-                here,
-            )
-            for here, other in (("position", "target"), ("target", "position"))
-        ),
-        *(
-            Rule(
-                when(given("position"), absent(key)),
-                "has no meaning beside position and target; leave it out",
-                key,
-            )
-            for key in ("direction", "zoom", "frame")
-        ),
-    )
-
     direction: Axis | None = None
     position: Vector | None = None
     target: Vector | None = None
@@ -1314,14 +1179,20 @@ class Camera(Block):
     zoom: Positive | None = None
     frame: Share | None = None
 
-    @model_validator(mode="after")
-    def _check_directions(self) -> Self:
-        if self.position is not None and self.position == self.target:
-            raise problem("is where the camera stands; it must look at another point", "target")
+    def check(self) -> None:
+        """Refuse half of a line of sight, or one given twice, or along the direction upwards."""
+        for here, other in (("position", "target"), ("target", "position")):
+            text = f"needs {other} beside it; to have the distance fitted give direction"
+            self.require_with(here, self.get(other) is not None, text)
+        for key in ("direction", "zoom", "frame"):
+            text = "has no meaning beside position and target; leave it out"
+            self.require_with(key, self.position is None, text)
+        if self.position is not None:
+            text = "is where the camera stands; it must look at another point"
+            require(self.position != self.target, text, "target")
         view = self.line_of_sight
-        if view is not None and self.up is not None and parallel(view, self.up):
-            raise problem("must not point along the line of sight", "up")
-        return self
+        if view is not None and self.up is not None:
+            require(not parallel(view, self.up), "must not point along the line of sight", "up")
 
     @property
     def line_of_sight(self) -> Vec3 | None:
@@ -1413,26 +1284,6 @@ class Scene(Block):
         PETSc options without the leading dash; an empty value is an option without value.
     """
 
-    # a static analysis starts at rest
-    rules = tuple(
-        Rule(
-            when(
-                given(time=_STATIC, initial={"type": "object"}),
-                {"properties": {"initial": {"properties": {key: {"items": {"const": 0}}}}}},
-            ),
-            _MEANINGLESS,
-            f"initial.{key}",
-        )
-        for key in ("velocity", "angular_velocity")
-    ) + (
-        Rule(
-            when(given("obstacles"), given("contact")),
-            # a function, as the braces in a template would mean a key
-            lambda _: "have no effect without contact; add the line 'contact: {friction: 0.3}'",
-            "obstacles",
-        ),
-    )
-
     title: Text = ""
     mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
@@ -1450,9 +1301,7 @@ class Scene(Block):
     solver: Solver = Field(default_factory=Solver)
     render: Render | None = None
     fit: Fit | None = None
-    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), JsonSchema(PETSC_BLOCK)] = Field(
-        default_factory=dict
-    )
+    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options)] = Field(default_factory=dict)
 
     _source: Path | None = PrivateAttr(default=None)
     _given: dict[str, Any] | None = PrivateAttr(default=None)
@@ -1525,17 +1374,23 @@ class Scene(Block):
 
     __hash__ = None  # type: ignore[assignment]
 
-    @model_validator(mode="after")
-    def _check_step_sizes(self) -> Self:
+    def check(self) -> None:
+        """Refuse blocks that do not go together, and names that nothing has."""
+        if self.time.static and self.initial is not None:  # a static analysis starts at rest
+            for key in ("velocity", "angular_velocity"):
+                require(not any(self.initial.get(key)), _MEANINGLESS, "initial", key)
+        self.require_with(
+            "obstacles",
+            self.contact is not None,
+            "have no effect without contact; add the line 'contact: {friction: 0.3}'",
+        )
         smallest = self.time.end * SMALLEST_STEP
-        if self.time.step != "auto" and self.time.step < smallest:
-            raise problem(_too_small(self.time.step, self.time.end), "time", "step")
-        if self.output.every is not None and self.output.every < smallest:
-            raise problem(_too_small(self.output.every, self.time.end), "output", "every")
-        return self
+        for value, at in ((self.time.step, ("time", "step")), (self.output.every, ("output", "every"))):
+            if isinstance(value, float):
+                require(value >= smallest, _too_small(value, self.time.end), *at)
+        self._check_references()
 
-    @model_validator(mode="after")
-    def _check_references(self) -> Self:
+    def _check_references(self) -> None:
         for name, keyframes in self.motions.items():
             _check_keyframes(keyframes, "motions", name)
         for i, handle in enumerate(self.handles):
@@ -1549,26 +1404,19 @@ class Scene(Block):
             for i, keyframe in enumerate(self.keyframes(obstacle)):
                 if keyframe.scale not in (1.0, (1.0, 1.0, 1.0)):
                     where = f"motion {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "it"
-                    raise problem(
-                        f"{where} scales in keyframe {i}, but an obstacle is rigid: leave out scale",
-                        *at,
-                        "motion",
-                    )
+                    text = f"{where} scales in keyframe {i}, but an obstacle is rigid: leave out scale"
+                    raise problem(text, *at, "motion")
         groups: set[str | None] = set()
         for i, material in enumerate(self.material):
             if material.group in groups:
-                what = (
-                    f"group {material.group!r}"
-                    if material.group
-                    else "triangles without a group of their own"
-                )
-                raise problem(f"is a second material for the {what}", "material", i, "group")
+                others = "triangles without a group of their own"
+                named = f"group {material.group!r}" if material.group else others
+                raise problem(f"is a second material for the {named}", "material", i, "group")
             groups.add(material.group)
         names = [source.name for source in self.mesh]
         for i, sheet in enumerate(names):
-            if sheet is not None and sheet in names[:i]:
-                raise problem(f"{sheet!r} is the name of an earlier sheet too", "mesh", i, "name")
-        return self
+            text = f"{sheet!r} is the name of an earlier sheet too"
+            require(sheet is None or sheet not in names[:i], text, "mesh", i, "name")
 
     def _check_motion(self, motion: str | None, *at: str | int) -> None:
         if motion is not None and motion not in self.motions:

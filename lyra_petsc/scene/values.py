@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import math
 import reprlib
-import sys
 from collections.abc import Callable
-from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
-
-from lyra_petsc.scene.rules import Condition, holds
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema
+from pydantic_core import PydanticCustomError
 
 Vec3 = tuple[float, float, float]
 Direction = Literal["x", "y", "z"]
@@ -37,6 +32,12 @@ def problem(message: str, *at: str | int) -> PydanticCustomError:
     """Error of a scene value; ``at`` is the path of the key relative to the block that is being checked."""
     # not in the template, as text of the user may contain braces; pydantic takes only characters of UTF-8
     return PydanticCustomError("scene", "{message}", {"message": one_line(message), "at": list(at)})
+
+
+def require(condition: object, message: str, *at: str | int) -> None:
+    """Raise a `problem` unless the condition holds."""
+    if not condition:
+        raise problem(message, *at)
 
 
 def shown(value: object) -> str:
@@ -162,26 +163,39 @@ def vector(value: Any) -> Vec3:
     return x, y, z
 
 
-def _pair(value: Any) -> tuple[float, float]:
-    """One number, which is used twice, or two; none is negative."""
+def _one_or_two(value: Any) -> tuple[float, float]:
+    """One number, which is used twice, or two."""
     values = value if isinstance(value, (list, tuple)) else (value, value)
-    if len(values) != 2:
-        raise problem(f"must be a number, or two (warp, weft), not {shown(value)}")
-    one, two = (number(entry) for entry in values)
-    if min(one, two) < 0.0:
-        raise problem(f"must be >= 0, not {shown(value)}")
-    return one, two
+    require(len(values) == 2, f"must be a number, or two, not {shown(value)}")
+    return number(values[0]), number(values[1])
+
+
+def _pair(value: Any) -> tuple[float, float]:
+    pair = _one_or_two(value)
+    require(min(pair) >= 0.0, f"must be >= 0, not {shown(value)}")
+    return pair
 
 
 def _uv_scale(value: Any) -> tuple[float, float] | Literal["ignore"]:
-    """``ignore``, or one number, which is used twice, or two; all above zero."""
     if value == "ignore":
         return "ignore"
-    values = value if isinstance(value, (list, tuple)) else (value, value)
-    if isinstance(value, str) or len(values) != 2:
-        raise problem(f"must be ignore, a number, or two, not {shown(value)}")
-    one, two = map(_POSITIVE.check, values)
-    return one, two
+    require(not isinstance(value, str), f"must be ignore, a number, or two, not {shown(value)}")
+    pair = _one_or_two(value)
+    require(min(pair) > 0.0, f"must be > 0, not {shown(value)}")
+    return pair
+
+
+def _one_or_three(*checks: tuple[Callable[[float], bool], str]) -> BeforeValidator:
+    """Validator of a number or three that satisfy the conditions, each given with its message."""
+
+    def check(value: Any) -> float | Vec3:
+        result = vector(value) if isinstance(value, (list, tuple)) else number(value)
+        for condition, message in checks:
+            entries = result if isinstance(result, tuple) else (result,)
+            require(all(map(condition, entries)), message.replace("VALUE", shown(value)))
+        return result
+
+    return BeforeValidator(check)
 
 
 def _axis(value: Any) -> Vec3:
@@ -227,120 +241,47 @@ def _step_length(value: Any) -> float | str:
         return "auto"
     if isinstance(value, str) and not _reads_as_number(value):
         raise problem(f"must be a number or auto, not {shown(value)}")
-    return _POSITIVE.check(value)
+    length = number(value)
+    require(length > 0.0, f"must be > 0, not {shown(value)}")
+    return length
 
 
-@dataclass(frozen=True, eq=False)
-class JsonSchema:
-    """JSON Schema of a value; pydantic gets a copy, as some versions modify it."""
-
-    schema: Condition
-
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> Condition:
-        return deepcopy(self.schema)
+def _schema_of(*kinds: str, numbers: int = 0) -> WithJsonSchema:
+    """JSON Schema of a value of one of these types, or of a list of ``numbers``."""
+    single: dict[str, Any] = {"type": list(kinds)}
+    many = {"type": "array", "items": {"type": "number"}, "minItems": numbers, "maxItems": numbers}
+    return WithJsonSchema({"anyOf": [single, many]} if numbers else single)
 
 
-@dataclass(frozen=True, eq=False)
-class Value(JsonSchema):
-    """JSON Schema of a value, and the function that checks and converts it."""
+_NUMBER = BeforeValidator(number)
+_WHOLE = BeforeValidator(integer)
+_NONZERO: tuple[Callable[[float], bool], str] = (lambda one: one != 0.0, "must not be 0")
 
-    check: Callable[[Any], Any]
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(self.check)
-
-
-def _constrained(schema: Condition, convert: Callable[[Any], Any], *allowed: tuple[Condition, str]) -> Value:
-    """A value whose numbers satisfy the conditions ``allowed``, each given with its message."""
-
-    def check(value: Any) -> Any:
-        result = convert(value)
-        for condition, message in allowed:
-            if not all(holds(condition, one) for one in (result if isinstance(result, tuple) else [result])):
-                raise problem(message.replace("VALUE", shown(value)))
-        return result
-
-    return Value(schema, check)
-
-
-def _real(allowed: str, **bounds: float) -> Value:
-    """A number within bounds, given as keywords of JSON Schema; ``allowed`` is their text in messages."""
-    schema = FINITE | bounds
-    if "exclusiveMinimum" in bounds:
-        del schema["minimum"]
-    return _constrained(schema, number, (bounds, f"must be {allowed}, not VALUE"))
-
-
-def _one_or_three(*allowed: tuple[Condition, str]) -> Value:
-    schema = FINITE | allowed[-1][0]
-    return _constrained({"anyOf": [schema, _triple(schema)]}, _number_or_vector, *allowed)
-
-
-def _number_or_vector(value: Any) -> float | Vec3:
-    return vector(value) if isinstance(value, (list, tuple)) else number(value)
-
-
-def _whole(lowest: int, highest: int) -> Value:
-    return _constrained(
-        {"type": "integer", "minimum": lowest, "maximum": highest},
-        integer,
-        ({"minimum": lowest}, f"must be a whole number >= {lowest}, not VALUE"),
-        ({"maximum": highest}, f"must be a whole number <= {highest}, not VALUE"),
-    )
-
-
-def _triple(of: Condition) -> Condition:
-    return {"type": "array", "items": of, "minItems": 3, "maxItems": 3}
-
-
-# JSON Schema of values; the bounds exclude .inf, a number in YAML
-FINITE: Condition = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
-VECTOR = _triple(FINITE)
-ANY_AXES: Condition = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
-_ANY_NAME: Condition = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
-_NONZERO = {"not": {"const": 0}}, "must not be 0"
-_ABOVE_ZERO = {"exclusiveMinimum": 0}, "must be > 0, not VALUE"
-_POSITIVE = _real("> 0", exclusiveMinimum=0)
-
-Number = Annotated[float, Value(FINITE, number)]
-Positive = Annotated[float, _POSITIVE]
-NonNegative = Annotated[float, _real(">= 0", minimum=0)]
-Fraction = Annotated[float, _real("from 0 to 1", minimum=0, maximum=1)]
-Poisson = Annotated[float, _real("in (-1, 0.5]", exclusiveMinimum=-1, maximum=0.5)]
-Angle = Annotated[float, _real("from 1 to 120 degrees", minimum=1, maximum=120)]
-Share = Annotated[float, _real("from 50 to 100 percent", minimum=50, maximum=100)]
-StepLength = Annotated[
-    float | Literal["auto"], Value({"anyOf": [_POSITIVE.schema, {"const": "auto"}]}, _step_length)
-]
-Until = Annotated[float, Value({"type": "number"}, _until)]
-Vector = Annotated[Vec3, Value(VECTOR, vector)]
-Axis = Annotated[Vec3, Value(VECTOR | {"contains": {"not": {"const": 0}}}, _axis)]
+Number = Annotated[float, _NUMBER]
+Positive = Annotated[float, Field(gt=0), _NUMBER]
+NonNegative = Annotated[float, Field(ge=0), _NUMBER]
+Fraction = Annotated[float, Field(ge=0, le=1), _NUMBER]
+Poisson = Annotated[float, Field(gt=-1, le=0.5), _NUMBER]
+Angle = Annotated[float, Field(ge=1, le=120), _NUMBER]
+Share = Annotated[float, Field(ge=50, le=100), _NUMBER]
+StepLength = Annotated[float | Literal["auto"], BeforeValidator(_step_length)]
+Until = Annotated[float, BeforeValidator(_until)]
+Vector = Annotated[Vec3, BeforeValidator(vector)]
+Axis = Annotated[Vec3, BeforeValidator(_axis)]
 Scale = Annotated[float | Vec3, _one_or_three(_NONZERO)]
-PositiveScale = Annotated[float | Vec3, _one_or_three(_NONZERO, _ABOVE_ZERO)]
-_ENTRY: Condition = FINITE | {"minimum": 0}
-Pair = Annotated[
-    tuple[float, float],
-    Value({"anyOf": [_ENTRY, {"type": "array", "items": _ENTRY, "minItems": 2, "maxItems": 2}]}, _pair),
+PositiveScale = Annotated[
+    float | Vec3, _one_or_three(_NONZERO, (lambda one: one > 0.0, "must be > 0, not VALUE"))
 ]
-_ABOVE: Condition = FINITE | {"exclusiveMinimum": 0}
+Bending = Annotated[float | Vec3, _one_or_three((lambda one: one >= 0.0, "must be >= 0 [N·m], not VALUE"))]
+Pair = Annotated[tuple[float, float], BeforeValidator(_pair), _schema_of("number", numbers=2)]
 UvScale = Annotated[
     tuple[float, float] | Literal["ignore"],
-    Value(
-        {
-            "anyOf": [
-                {"const": "ignore"},
-                _ABOVE,
-                {"type": "array", "items": _ABOVE, "minItems": 2, "maxItems": 2},
-            ]
-        },
-        _uv_scale,
-    ),
+    BeforeValidator(_uv_scale),
+    _schema_of("number", "string", numbers=2),
 ]
-Bending = Annotated[float | Vec3, _one_or_three(({"minimum": 0}, "must be >= 0 [N·m], not VALUE"))]
-Count = Annotated[int, _whole(1, LARGEST_INDEX)]
-INDEX = _whole(0, LARGEST_INDEX)
-Index = Annotated[int, INDEX]
-Seed = Annotated[int, _whole(0, 2**63 - 1)]
-Text = Annotated[str, Value({"type": "string", "pattern": r"^[^\0]*$"}, _text)]
-Name = Annotated[str, Value(_ANY_NAME, _name)]
-Flag = Annotated[bool, Value({"type": "boolean"}, _flag)]
+Count = Annotated[int, Field(ge=1, le=LARGEST_INDEX), _WHOLE]
+Index = Annotated[int, Field(ge=0, le=LARGEST_INDEX), _WHOLE]
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1), _WHOLE]
+Text = Annotated[str, BeforeValidator(_text)]
+Name = Annotated[str, BeforeValidator(_name), _schema_of("string", "integer")]
+Flag = Annotated[bool, BeforeValidator(_flag)]

