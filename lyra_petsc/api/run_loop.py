@@ -106,7 +106,7 @@ class _RunLoop:
         self._callbacks, self._comm = callbacks, simulation.comm
         self._versions = library_versions()
         self._waiting = Waiting(self._comm)
-        self._notes_shown = simulation.earlier_notes
+        self._notes_shown = simulation.run_notes.earlier
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
         if resumed:
@@ -208,7 +208,7 @@ class _RunLoop:
             else [],
             "integrator": simulation.scene.time.scheme,
             "time": simulation.time,
-            "estimated_error": simulation.estimated_error if simulation.local_error else None,
+            "estimated_error": simulation.accuracy.estimated if simulation.accuracy else None,
             "energy_balance": simulation.guard.content() if simulation.guard else None,
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,

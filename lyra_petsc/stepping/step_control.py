@@ -118,29 +118,31 @@ class StepControl:
         """Whether ``time`` [s] is the end of the run."""
         return time >= self.end - SLACK * min(self.step, self.smallest)
 
-    def halve_after_failure(self) -> bool:
-        """Halve Δt after a failed attempt; return False if it is as small as it may be."""
-        self.successes = 0
-        if 0.5 * self.factor * self.step < self.smallest:
-            return False
-        self.factor *= 0.5
-        return True
+    def can_halve(self) -> bool:
+        """Whether Δt may be half as long."""
+        return 0.5 * self.factor * self.step >= self.smallest
 
-    def shorten(self, dt: float, *, first: bool) -> bool:
-        """Halve a step of dt [s] that was solved, but rejected for its energy; return False if it is as small
-        as it may be. ``first``: it is the step's first halving, after which a larger Δt is tried later.
-        """
+    def halve(self) -> None:
+        """Halve Δt after a failed attempt."""
         self.successes = 0
-        if first:
-            self.patience = min(2 * self.patience, MAX_PATIENCE)
-        if 0.5 * dt < self.smallest or self._halvings(dt) >= HALVINGS:
-            return False
-        self.factor = 0.5 * dt / self.step
-        return True
+        self.factor *= 0.5
+
+    def can_shorten(self, dt: float) -> bool:
+        """Whether a step of dt [s], which may have been cut to end at an event, may be half as long."""
+        return 0.5 * dt >= self.smallest and self._halvings(dt) < HALVINGS
 
     def _halvings(self, dt: float) -> int:
         """Halvings from the nominal step to dt [s]; 0 for a step that was cut to end at an event."""
         return round(math.log2(self.step / dt)) if dt >= self.factor * self.step * (1.0 - SLACK) else 0
+
+    def shorten(self, dt: float, *, first: bool) -> None:
+        """Halve a step of dt [s] that was solved, but rejected for its energy. ``first``: it is the step's
+        first halving, after which a larger Δt is tried later.
+        """
+        self.successes = 0
+        if first:
+            self.patience = min(2 * self.patience, MAX_PATIENCE)
+        self.factor = 0.5 * dt / self.step
 
     def record_success(self, iterations: int) -> None:
         """Double a shortened Δt after enough successful steps."""

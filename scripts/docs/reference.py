@@ -1,4 +1,4 @@
-"""Writes docs/reference/ from the program itself: keys of a scene, PETSc options, commands.
+"""Writes docs/reference/ from the program itself: keys of a scene, PETSc options, commands, recovery.
 
 ``python scripts/docs/reference.py`` after a change of these; tests/docs/test_reference.py says when.
 """
@@ -21,6 +21,7 @@ from lyra_petsc.linear.presets import DIRECT_UNTIL, PRESETS
 from lyra_petsc.scene.block import Block, attributes, summary
 from lyra_petsc.scene.materials.library import ClothTable, library_entries, material_names
 from lyra_petsc.scene.schema import FIELDS, Scene
+from lyra_petsc.stepping.recovery import STRATEGIES
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "reference"
@@ -268,7 +269,32 @@ def commands_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-PAGES = {"scene.md": scene_page, "petsc.md": petsc_page, "commands.md": commands_page}
+def recovery_page() -> str:
+    """The page of the ways in which a step that is not accepted is repeated."""
+    rows = ["| an attempt at a step is repeated because | with | if |", "| --- | --- | --- |"]
+    rows += [
+        f"| {', or '.join(trouble.value for trouble in strategy.troubles)} | {strategy.name} "
+        f"| {strategy.condition} |"
+        for strategy in STRATEGIES
+    ]
+    parts = [
+        "# Steps that are repeated",
+        MADE,
+        "A failed attempt changes no state. The first line that applies is taken; where none does, the run "
+        "ends with exit code 3 and the state before the step. Each attempt counts as `rejected`. See "
+        "[time steps](../time.md) for the error and the energy of a step, [failure](../failure.md) for what "
+        "is reported.",
+        "\n".join(rows),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+PAGES = {
+    "scene.md": scene_page,
+    "petsc.md": petsc_page,
+    "commands.md": commands_page,
+    "recovery.md": recovery_page,
+}
 
 
 def main() -> None:

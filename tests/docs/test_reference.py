@@ -25,7 +25,7 @@ def reference() -> ModuleType:
     return module_of(ROOT / "scripts" / "docs" / "reference.py")
 
 
-@pytest.mark.parametrize("name", ["scene.md", "petsc.md", "commands.md"])
+@pytest.mark.parametrize("name", ["scene.md", "petsc.md", "commands.md", "recovery.md"])
 def test_the_pages_are_up_to_date(name: str, reference: ModuleType) -> None:
     text = (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8")
     assert text == reference.PAGES[name](), "run: python scripts/docs/reference.py"

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from physics import grid, shape, stepped
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping import simulation as stepping_of_scenes
+from lyra_petsc.stepping import accuracy
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import StepControl, ToleranceControl
 
@@ -62,7 +62,8 @@ def test_the_error_keeps_the_tolerance(
             lengths.append(simulation.step().dt)
         error = np.linalg.norm(shape(simulation) - converged, axis=1).max() / SIZE
         assert 0.05 * tolerance < error < 2.0 * tolerance
-        assert simulation.estimated_error < tolerance
+        assert simulation.accuracy is not None
+        assert simulation.accuracy.estimated < tolerance
     assert max(lengths) > 1.5 * min(lengths)
 
 
@@ -94,7 +95,7 @@ def test_smallest_and_largest_step_are_kept_with_a_note(comm: MPI.Comm) -> None:
 def test_many_steps_of_first_order_are_noted(
     integrator: str, notes: int, comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stepping_of_scenes, "FIRST_ORDER_STEPS", 3)
+    monkeypatch.setattr(accuracy, "FIRST_ORDER_STEPS", 3)
     time = {"end": END, "step": "auto", "integrator": integrator}
     with simulated(comm, time=time) as simulation:
         for _ in range(5):
@@ -155,7 +156,8 @@ def test_first_order_error_estimate_of_free_fall_is_exact(comm: MPI.Comm) -> Non
             simulation.step()
         fallen = shape(simulation)[:, 2]
         error = np.abs(fallen + 0.5 * 9.81 * END**2).max() / SIZE
-        assert simulation.estimated_error == pytest.approx(error, rel=0.02)
+        assert simulation.accuracy is not None
+        assert simulation.accuracy.estimated == pytest.approx(error, rel=0.02)
         assert error < 1.2 * 0.02
 
 

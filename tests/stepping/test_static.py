@@ -211,7 +211,7 @@ def test_the_tangent_includes_moving_handles(comm: MPI.Comm) -> None:
         with at_rest(comm, **content) as simulation:
             x.append(shape(simulation))
             if more == 1.0:
-                rate = simulation.problem.points.gather(simulation._equilibrium.saved_state(1.0)[0]["rate"])
+                rate = simulation.problem.points.gather(simulation.equilibrium.saved_state(1.0)[0]["rate"])
     expected = (x[1] - x[0]) / 0.01
     assert np.abs(rate - expected).max() < 0.05 * np.abs(expected).max()
 

@@ -1,0 +1,84 @@
+"""What a checkpoint holds of a run besides positions and velocities, and how a run continues from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.stepping import term_states
+from lyra_petsc.stepping.problem import refuse_contact
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.simulation import SteppedScene
+
+
+def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Arrays (n_owned, 3) and numbers of a checkpoint besides positions and velocities; collective.
+
+    With them `resume` continues as if the run had never stopped.
+    """
+    system, time = run.problem.system, run.time
+    arrays, integrator = system.saved_histories()
+    balance, budget = run.energy_balance.saved_state()
+    of_stepper, stepper = run.stepper.saved_state(time)
+    arrays = arrays | balance | of_stepper
+    scalars = {
+        "time": time,
+        "step": run.step_number,
+        "scheme": run.scene.time.scheme,
+        "budget": budget,
+        "totals": dict(run.totals),
+        "stability": run.stability,
+        **run.run_notes.saved_state(),
+        **run.control.saved_state(),
+        "estimated_error": 0.0 if run.accuracy is None else run.accuracy.estimated,
+        "integrator": integrator,
+        **stepper,
+        "energy": None if run.guard is None else run.guard.saved_state(),
+        "late_starts": sorted(system.reference.late),
+        "obstacles": term_states.obstacle_places(system),
+    }
+    if run.equilibrium is not None:
+        more, scalars["equilibrium"] = run.equilibrium.saved_state(time)
+        arrays |= more
+    if run.accuracy is not None:
+        more, numbers = run.accuracy.local_error.saved_state()
+        arrays, scalars["integrator"] = arrays | more, integrator | numbers
+    return arrays, scalars
+
+
+def resume(
+    run: SteppedScene,
+    arrays: Mapping[str, Array],
+    scalars: Mapping[str, Any],
+    edges: Mapping[str, Array],
+    elements: Mapping[str, tuple[Ints, Array]],
+) -> None:
+    """Continue from a `saved_state`; x and v of the owned rows are in ``run.problem.system`` already.
+
+    ``edges`` and ``elements`` are those of `term_states`; collective.
+    """
+    system = run.problem.system
+    system.state.update_ghosts()
+    term_states.restore_fixed(system, arrays, edges, elements)
+    run.time, run.step_number = scalars["time"], scalars["step"]
+    # loads and handles that only the changed scene starts earlier start now; the others have started
+    system.set_references(run.time)
+    system.hold_targets(run.time)
+    refuse_contact(system, run.scene, f"at {run.time_text()}")
+    run.energy_balance.restore(arrays, scalars["budget"])
+    run.control.restore(scalars)
+    if run.equilibrium is not None:
+        run.equilibrium.restore(arrays, scalars["equilibrium"], run.time)
+    system.restore_histories(arrays, scalars["integrator"])
+    if run.guard is not None:
+        run.guard.restore(scalars["energy"], same=scalars["scheme"] == run.scene.time.scheme)
+    if run.accuracy is not None:
+        run.accuracy.estimated = scalars["estimated_error"]
+        run.accuracy.local_error.restore(arrays, scalars["integrator"])
+    term_states.restore_changing(system, elements, scalars["obstacles"])
+    run.stepper.restore(arrays, scalars, run.time, run.step_number)
+    run.totals |= scalars["totals"]
+    run.stability = run.stability and scalars["stability"]
+    run.run_notes.restore(scalars)
