@@ -50,21 +50,6 @@ USUAL_OPTIONS = ("ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_type", "pc_type", "s
 NUMERICAL = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius", "solver.", "petsc.")
 """Keys that change how a scene is solved; other keys change the scene, which then has its own reference."""
 
-SYNONYMS = {
-    "step": "dt",
-    "timestep": "dt",
-    "time_step": "dt",
-    "h": "mesh",
-    "size": "mesh",
-    "rtol": "ksp_rtol",
-    "scheme": "integrator",
-    "method": "integrator",
-    "ts_dt": "dt",
-    "ts_time_step": "dt",
-    "ts_type": "integrator",
-}
-"""Other names that users may try for the keys; the error message gives the right name."""
-
 MAX_COMBINATIONS = 10_000
 
 
@@ -164,9 +149,9 @@ def scene_key(key: str) -> str:
         return SHORT_NAMES.get(key, "mesh")
     if "." in key or "[" in key or key in list(Scene.keys()):
         return key
-    if OPTION.fullmatch(key) and key not in SYNONYMS:
+    if OPTION.fullmatch(key) and key not in (*STEP_OPTIONS, "ts_type"):
         return f"petsc.{key}"
-    hint = suggest(SYNONYMS.get(key.lower(), key), [*SHORT_NAMES, *USUAL_OPTIONS])
+    hint = suggest(key, [*SHORT_NAMES, *USUAL_OPTIONS])
     raise InputError(
         f"unknown key, {hint}; any key of the scene can vary by its path, as in time.step",
         key=f"--vary {key}",

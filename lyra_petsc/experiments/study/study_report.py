@@ -6,7 +6,6 @@ import itertools
 import math
 import os
 import platform
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -119,8 +118,6 @@ TARGETS = (0.1, 0.01, 0.001)
 DEFAULT_TARGET = 0.01
 """The accuracy for which the diagram marks the recommended setting."""
 
-FINEST_TARGET = 1e-6
-
 
 @dataclass(frozen=True)
 class Advice:
@@ -140,62 +137,27 @@ class Advice:
     text: str
 
 
-def advise(rows: Sequence[StudyRow], quantities: Sequence[str], axis: Axis | None = None) -> list[Advice]:
+def advise(rows: Sequence[StudyRow], quantities: Sequence[str]) -> list[Advice]:
     """The fastest setting for each accuracy among those that ran; nothing is extrapolated.
 
-    Parameters
-    ----------
-    rows : sequence of StudyRow
-    quantities : sequence of str
-        The first one decides; the text names others in which the recommended row is less accurate.
-    axis : Axis, optional
-        The text says if the recommended row is the coarsest along this axis.
+    The first quantity decides; the text names others in which the recommended row is less accurate.
     """
     able = _rows_with_error(rows, quantities[0])
-    if not able:
-        return []
-    best = min(row.error_bound(quantities[0]) for row in able)
-    targets = list(TARGETS)
-    while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
-        targets.append(targets[-1] / 10.0)
-    coarsest = [group[0] for group in families(able, axis).values()] if axis is not None else []
-    return [_advice(able, quantities, float(f"{target:.3g}"), coarsest) for target in targets]
+    return [_advice(able, quantities, target) for target in TARGETS] if able else []
 
 
-def _advice(
-    rows: Sequence[StudyRow], quantities: Sequence[str], target: float, coarsest: Sequence[StudyRow]
-) -> Advice:
+def _advice(rows: Sequence[StudyRow], quantities: Sequence[str], target: float) -> Advice:
     quantity = quantities[0]
-
-    def error(row: StudyRow) -> float:
-        return row.error_bound(quantity)
-
-    good = [row for row in rows if error(row) <= target]
+    good = [row for row in rows if row.error_bound(quantity) <= target]
     if not good:
-        best = min(rows, key=error)
+        best = min(rows, key=lambda row: row.error_bound(quantity))
         text = f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run_time)}"
         nothing = "nothing that ran is accurate enough; the most accurate is"
         return Advice(target, None, f"For {percent(target)} {nothing} {text}.")
     winner = min(good, key=lambda row: row.run_time)
-    tried = ", the coarsest that ran" if any(row is winner for row in coarsest) else ""
     text = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run_time)}"
-    text += f" ({_error(winner, quantity)}{tried})"
-    high = max(winner.result.run_seconds)
-    ties = [
-        row for row in good if row.integrator == winner.integrator and min(row.result.run_seconds) <= high
-    ]
-    if ties := [row for row in ties if row is not winner]:
-        text += f", or as fast within the spread, {setting(min(ties, key=error))}"
-    for line in dict.fromkeys(row.integrator for row in rows if row.integrator != winner.integrator):
-        others = [row for row in rows if row.integrator == line]
-        if able := [row for row in others if error(row) <= target]:
-            row = min(able, key=lambda row: row.run_time)
-            text += f"; {line} needs {seconds(row.run_time)} ({_without_line(row)})"
-        else:
-            row = min(others, key=error)
-            found = f"{_without_line(row)}: {_error(row, quantity)}, {seconds(row.run_time)}"
-            text += f"; {line} did not reach it ({found})"
-    return Advice(target, winner, f"{text}.{_disagreement(good, winner, quantities, target)}")
+    text += f" ({_error(winner, quantity)})."
+    return Advice(target, winner, text + _disagreement(good, winner, quantities, target))
 
 
 def _disagreement(
@@ -227,10 +189,6 @@ def setting(row: StudyRow) -> str:
     return shared_label(row, None) or row.case.title
 
 
-def _without_line(row: StudyRow) -> str:
-    return setting(row).removeprefix(row.integrator).removeprefix(", ") or row.integrator
-
-
 def _error(row: StudyRow, quantity: str) -> str:
     text = f"error {_error_text(row, quantity)}"
     largest = row.error_bound("position_max")
@@ -247,11 +205,10 @@ def _error_text(row: StudyRow, quantity: str) -> str:
 
 def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
     """Mark the fastest row for 1 %, which the diagram shows by a star; None if no row reaches 1 %."""
-    for one in advice:
-        if one.row is not None and math.isclose(one.target, DEFAULT_TARGET):
-            one.row.recommended = True
-            return one.row
-    return None
+    row = next((one.row for one in advice if one.target == DEFAULT_TARGET), None)
+    if row is not None:
+        row.recommended = True
+    return row
 
 
 COUNTS = ("steps", "rejected", "newton_iterations", "linear_iterations")
@@ -264,13 +221,6 @@ def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
     keys = {axis.path: axis.key for axis in plan.axes}
     varied = [axis.key for axis in plan.axes if axis.path not in ("time.integrator", "time.step", "mesh")]
     refined = [axis.key for axis in plan.axes if axis.refines]
-
-    def spread(name: str, median: float, times: list[float]) -> dict[str, Any]:
-        return {
-            name: median,
-            f"{name}_min": min(times, default=None),
-            f"{name}_max": max(times, default=None),
-        }
 
     def tolerance(name: str) -> Any:
         key = keys.get(f"solver.{name}")
@@ -300,8 +250,10 @@ def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
         **{f"order_{axis}_{name}": row.orders.get((axis, name)) for axis in refined for name in names},
         "repeats": len(result.timings),
         "ranks": result.ranks,
-        **spread("run_seconds", row.run_time, result.run_seconds),
-        **spread("total_seconds", row.total_time, result.total_seconds),
+        "run_seconds": row.run_time,
+        "run_seconds_min": min(result.run_seconds, default=None),
+        "run_seconds_max": max(result.run_seconds, default=None),
+        "total_seconds": row.total_time,
         **{f"seconds_{phase}": result.phase_seconds.get(phase) for phase in PHASES},
         **{name: getattr(result, name) for name in COUNTS},
         "pareto": row.on_front,
@@ -309,9 +261,7 @@ def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
     }
     missing = set() if row.passed else {"dt_mean", "dt_min", "dt_max", *COUNTS}
     missing |= set() if result.vertices else {"h", "vertices", "triangles"}
-    missing |= {
-        key for key, value in columns.items() if isinstance(value, float) and not math.isfinite(value)
-    }
+    missing |= {key for key, value in columns.items() if value in (math.inf, -math.inf) or value != value}
     return columns | dict.fromkeys(missing)
 
 
@@ -354,15 +304,14 @@ def _describe_runs(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str
     done = [row for row in rows if row.passed]
     values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
     varied = "; ".join(f"{key} = {', '.join(texts)}" for key, texts in values.items())
-    repeats, end = plan.request.repeats, f"every {seconds(plan.interval)} to {seconds(plan.end)}"
-    times = {1: "once", 2: "twice"}.get(repeats, f"{repeats} times")
+    end = f"every {seconds(plan.interval)} to {seconds(plan.end)}"
     meshes = dict.fromkeys((row.result.vertices, row.result.triangles) for row in done)
     count = len(plan.sample_times()) - 1
     static = plan.base.time.static
     return [
         f"Scene: {plan.request.scene}" + (f" ({plan.base.title})" if plan.base.title else ""),
         f"{len(rows)} combinations of {varied}; {len(rows) - len(done)} failed",
-        f"Each was timed {times}, one at a time, on {ranks} MPI rank(s) of {machine()}; "
+        f"Repeats of each: {plan.request.repeats}, one at a time, on {ranks} MPI rank(s) of {machine()}; "
         "after a warm-up step; median and range",
         "Mesh: " + "; ".join(f"{v} vertices, {t} triangles" for v, t in meshes),
         "Compared at the full load" if static else f"Compared at {count} times, {end}",
@@ -568,7 +517,6 @@ class StudyView(View[Outcome[Any]]):
         self.title = f"Error against run time: {self.plan.base.title or self.plan.request.scene}"
         self.orders: list[Order] = []
         self.advice: dict[Physics, list[Advice]] = {}
-        self.plan.notes += note_load(self.ranks)
 
     @property
     def ranks(self) -> int:
@@ -583,7 +531,7 @@ class StudyView(View[Outcome[Any]]):
         self.orders = observed_orders(runner.rows, plan.axes, names)
         for physics in runner.references:
             mark_front(runner.rows_of(physics), names[0])
-            self.advice[physics] = advise(runner.rows_of(physics), names, main_axis(plan.axes))
+            self.advice[physics] = advise(runner.rows_of(physics), names)
             choose_recommended(self.advice[physics])
         self.columns, self.ready = list(csv_row(plan, runner.rows[0])), True
 
@@ -619,14 +567,7 @@ class StudyView(View[Outcome[Any]]):
                     "kind": one.kind,
                     "reference": one.description,
                     "run_seconds": one.seconds,
-                    "own_error": {
-                        name: {
-                            "error": own.error,
-                            "observed_order": own.order,
-                            "trusted": own.trusted,
-                        }
-                        for name, own in one.own_errors.items()
-                    },
+                    "own_error": {name: asdict(own) for name, own in one.own_errors.items()},
                     "notes": one.notes,
                 }
                 for physics, one in known.items()
@@ -692,25 +633,6 @@ def all_versions() -> dict[str, str]:
     return found
 
 
-def note_load(ranks: int) -> list[str]:
-    """A note if other processes leave fewer idle cores than there are ranks."""
-    cores, load = os.cpu_count() or 1, -math.inf
-    with suppress(OSError):
-        load = os.getloadavg()[0]
-    note = f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
-    note += "run times may be larger and spread more than on an idle one"
-    return [note] if load + ranks > cores + 0.5 else []
-
-
-def processor() -> str:
-    """Model of this machine's processor."""
-    with suppress(OSError):
-        named = re.search(r"^model name[^:]*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)
-        if named:
-            return named[1].strip()
-    return platform.processor() or platform.machine()
-
-
 def machine() -> str:
     """Processor and number of cores."""
-    return f"{processor()}, {os.cpu_count() or 1} cores"
+    return f"{platform.processor() or platform.machine()}, {os.cpu_count() or 1} cores"

@@ -207,12 +207,3 @@ def test_requests_are_read_from_their_file(tmp_path: Path) -> None:
     (tmp_path / "request.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="is damaged"):
         read_request(tmp_path)
-
-
-def test_a_busy_machine_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from lyra_petsc.experiments.study import study_report as conduct
-
-    monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)
-    monkeypatch.setattr(conduct.os, "getloadavg", lambda: (2.1, 0.0, 0.0))
-    assert conduct.note_load(2) == []
-    assert "load 2.1 on 4 cores" in conduct.note_load(3)[0]
