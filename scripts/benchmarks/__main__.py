@@ -82,7 +82,6 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--scenes", nargs="+", default=[], metavar="WORD", help="those of contact with a word in their names")
     add("--gap", type=float, metavar="M", help="contact gap over the ball (a quarter of a mesh edge)")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
-    add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
     asked = parser.parse_args(list(words))
     chosen = QUICK if asked.quick else DEFAULT
@@ -158,14 +157,12 @@ class Bench:
         method: str,
         ranks: int,
         petsc: Sequence[str] = (),
-        *,
-        plain: str = "",
         **changes: float,
     ) -> Any:
-        what = f"{vertices} vertices, {method}, {ranks} rank(s)" + (", plain numba" if plain else "")
+        what = f"{vertices} vertices, {method}, {ranks} rank(s)"
         what += "".join(f", {name} {value:g}" for name, value in changes.items())
         words, limits = [*self._petsc, *petsc], self._asked.limits
-        return self._attempt(what, measures.row, vertices, method, ranks, words, limits, plain, **changes)
+        return self._attempt(what, measures.row, vertices, method, ranks, words, limits, **changes)
 
     def save(self) -> None:
         text = json.dumps(self.results, indent=1, ensure_ascii=False)
@@ -176,11 +173,11 @@ class Bench:
         """Perform all measurements."""
         asked = self._asked
         few = Limits(1, 1.0, 600.0)
-        for plain, method in itertools.product(self._plain, METHODS):  # so that no row includes compilation
-            self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few, plain)
+        for method in METHODS:  # so that no row includes compilation
+            self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few)
         for vertices in asked.vertices:
-            for method, ranks, plain in itertools.product(METHODS, asked.ranks, self._plain):
-                self._add("rows", self._row(vertices, method, ranks, plain=plain))
+            for method, ranks in itertools.product(METHODS, asked.ranks):
+                self._add("rows", self._row(vertices, method, ranks))
             for name, command in asked.peers:
                 what, given = f"{vertices} vertices, peer {name}", (name, command, vertices)
                 self._measure("rows", what, measures.peer_row, *given, self._folder, asked.limits)
@@ -201,11 +198,6 @@ class Bench:
 
     def _measure(self, where: str, what: str, work: Callable[..., Any], *given: Any) -> None:
         self._add(where, self._attempt(what, work, *given))
-
-    @property
-    def _plain(self) -> Sequence[str]:
-        """Cache folders of kernels: the default one (""), and with ``--plain`` that of plain numba."""
-        return ["", str((self._folder / "plain").resolve())] if self._asked.plain else [""]
 
     def _compare(self) -> None:
         """Measure what was requested of: bending models, another checkout, contact."""

@@ -61,16 +61,12 @@ def row(
     ranks: int,
     petsc: Sequence[str],
     limits: Limits,
-    plain: str = "",
     **changes: float,
 ) -> Result:
-    """Measure set-up, steps and memory of the hanging square; ``changes`` are options of `hanging_square`.
-
-    With a folder ``plain``, kernels are in plain numba, see ``worker.py``.
-    """
-    scene = hanging_square(vertices, method, **changes)
-    found = _steps("steps", scene, ranks, petsc, limits, **({"plain": plain} if plain else {}))
-    return found | {"who": f"{method}, plain numba" if plain else method}
+    """Measure set-up, steps and memory of the hanging square; ``changes`` are options of `hanging_square`."""
+    return _steps("steps", hanging_square(vertices, method, **changes), ranks, petsc, limits) | {
+        "who": method
+    }
 
 
 def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:

@@ -3,13 +3,11 @@
     mpirun -n P python worker.py JOB.json RESULT.json [-petsc options]
 
 ``JOB.json`` holds ``kind`` (a name in `KINDS`), ``scene`` and further parameters of the kind; times are in
-seconds of wall time, between barriers, unless stated otherwise. With ``plain``, a folder for numba's cache,
-kernels call the functions of ``tests/kernels/plain_vectors.py`` instead of those in LLVM's language.
+seconds of wall time, between barriers, unless stated otherwise.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import re
@@ -22,12 +20,6 @@ from typing import Any
 import petsc4py
 
 petsc4py.init([sys.argv[0], *sys.argv[3:]])
-
-if plain := json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")).get("plain"):
-    # before the module that they replace is imported; another cache, as cached kernels contain the others
-    os.environ["NUMBA_CACHE_DIR"] = plain
-    sys.path.append(str(Path(__file__).parents[2] / "tests" / "kernels"))
-    sys.modules["lyra_petsc.kernels.vectors"] = importlib.import_module("plain_vectors")
 
 import numpy as np  # noqa: E402
 from mpi4py import MPI  # noqa: E402

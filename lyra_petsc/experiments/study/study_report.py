@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import platform
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -633,6 +634,15 @@ def all_versions() -> dict[str, str]:
     return found
 
 
+def processor() -> str:
+    """Model of this machine's processor."""
+    with suppress(OSError):
+        named = re.search(r"^model name[^:]*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)
+        if named:
+            return named[1].strip()
+    return platform.processor() or platform.machine()
+
+
 def machine() -> str:
     """Processor and number of cores."""
-    return f"{platform.processor() or platform.machine()}, {os.cpu_count() or 1} cores"
+    return f"{processor()}, {os.cpu_count() or 1} cores"
