@@ -26,7 +26,6 @@ from lyra_petsc.startup import python_command
 
 PR_SET_NO_NEW_PRIVS = 38
 CLONE_THREAD = 0x10000
-TIOCSTI, TIOCLINUX = 0x5412, 0x541C
 # flags of open for writing; the last is the bit of O_TMPFILE that O_DIRECTORY lacks
 WRITING = (os.O_WRONLY, os.O_RDWR, os.O_CREAT, os.O_TRUNC, 0o20000000)
 
@@ -140,6 +139,8 @@ def supported_layers() -> list[str]:
 
 def _load_seccomp() -> bool:
     """Load the filter of system calls; whether the whole of it is in force."""
+    from termios import TIOCLINUX, TIOCSTI  # Linux only
+
     try:
         library = ctypes.CDLL("libseccomp.so.2")
     except OSError:

@@ -39,10 +39,8 @@ READ_RATE = 100_000
 MESH_SECONDS = 3600
 """Limit on the CPU time of meshing."""
 
-FIRST_REPORT = 5.0
-"""Seconds until the first report of progress; each interval is twice the last, at most `MAX_INTERVAL`."""
-
-MAX_INTERVAL = 60.0
+REPORT_INTERVAL = 20.0
+"""Seconds between reports of progress."""
 
 ALGORITHMS = {"mesh-adapt": 1, "automatic": 2, "delaunay": 5, "frontal-delaunay": 6}
 """Names of gmsh's algorithms for triangles, and their numbers in gmsh (``Mesh.Algorithm``)."""
@@ -175,15 +173,12 @@ def _wait(
     path: Path, process: subprocess.Popen[bytes], file: BinaryIO, report: Callable[[str], None] | None
 ) -> bytes:
     """Wait for the library's process, reporting progress; returns what the process wrote to stderr."""
-    began, interval = time.monotonic(), FIRST_REPORT
+    began = time.monotonic()
     while True:
         try:
-            return process.communicate(timeout=interval)[1]
+            return process.communicate(timeout=REPORT_INTERVAL)[1]
         except subprocess.TimeoutExpired:
-            interval = min(2.0 * interval, MAX_INTERVAL)
-        outcome = _read_outcome(file)
-        if outcome.get("stage") != "mesh" and time.monotonic() - began < 2.0 * FIRST_REPORT:
-            continue  # most scripts that take this long to read never end, and the time limit ends them
+            outcome = _read_outcome(file)
         doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading it"
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"

@@ -162,8 +162,7 @@ def test_another_algorithm_on_request_only(script: Path) -> None:
 
 
 def test_progress_of_gmsh_is_reported(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library_file, "FIRST_REPORT", 0.01)
-    monkeypatch.setattr(library_file, "MAX_INTERVAL", 0.1)
+    monkeypatch.setattr(library_file, "REPORT_INTERVAL", 0.1)
     script.write_text(SQUARE)
     lines: list[str] = []
     library_file.read_by_library(script, 0.006, report=lines.append)
