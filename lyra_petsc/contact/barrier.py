@@ -20,24 +20,24 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import contact_pairs, surface_shares
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
-from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles
+from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles, StepInterval
 from lyra_petsc.contact.obstacle_search import ObstacleSearch
 from lyra_petsc.contact.one_sided import Springs
+from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
 from lyra_petsc.contact.sheet_search import SheetSearch
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.symmetry import symmetry_walls
-from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.mesh.topology import connected_pieces, edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.protocols import LimitsStep
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Contacts, Offsets, Pair, StepInterval, UpcomingStep
+from lyra_petsc.terms.term import Offsets, UpcomingStep
 
 KEPT_FRACTION = 0.2
 """Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
@@ -155,6 +155,55 @@ class ActivePairs(NamedTuple):
         return self.pair, self.weight, self.beta, self.derivatives
 
 
+class Pair(NamedTuple):
+    """The two simplices (vertex, edge or triangle) that an element keeps apart.
+
+    Attributes
+    ----------
+    parts : tuple of tuples of int
+        Local rows of the vertices of each simplex of a sheet: two, or one in front of an obstacle.
+    obstacle : str
+        Name of the obstacle, empty between sheets.
+    thickness : float
+        Distance [m] of the mid-surfaces at which the gap is zero.
+    """
+
+    parts: tuple[tuple[int, ...], ...]
+    obstacle: str
+    thickness: float
+
+
+class Contacts(NamedTuple):
+    """Pairs in contact at the end of a step that this rank counts.
+
+    Attributes
+    ----------
+    points, sheet_beta, beta : (m, 4)
+        Local rows of the vertices, their coefficients β, 0 for points of obstacles, and those of all points:
+        the vector between the nearest points is Σ β_i p_i.
+    normal : (m, 3)
+        Unit normals towards the first simplex.
+    force, stiffness : (m,)
+        Normal force [N] and second derivative b″ of the energy with respect to the distance [N/m], > 0.
+    obstacle : (m,)
+        Number of the obstacle, −1 between sheets.
+    velocity : (m, 3)
+        Velocity [m/s] of the obstacle at the contact, times Σ β_i; 0 between sheets.
+    pair : (m,)
+        Numbers of the term's elements.
+    """
+
+    points: Ints
+    sheet_beta: Array
+    beta: Array
+    normal: Array
+    force: Array
+    stiffness: Array
+    obstacle: Ints
+    velocity: Array
+    pair: Ints
+
+
 _EMPTY = np.empty(0)
 _EMPTY_ROWS = np.empty(0, dtype=np.int64), _EMPTY, _EMPTY, np.empty((0, 4)), _EMPTY, np.empty((0, 6))
 NO_PAIRS = ActivePairs(*unwritable(_EMPTY, *_EMPTY_ROWS))
@@ -176,13 +225,12 @@ class ContactBarrier(LimitsStep):
     """
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
-        empty = {"what": np.empty((0, 9)), "number": np.empty((0, 4))}
         self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
         self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, 0.0)
-        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
-        self.surface = np.ascontiguousarray(surface, dtype=np.int32)
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32)))
+        self.surface: NDArray[np.int32] = np.ascontiguousarray(surface, dtype=np.int32)
         self.surface_marks = marks
         self._capacity = 0
         self._searched: Ints | None = None  # triangles that the search has
@@ -190,7 +238,7 @@ class ContactBarrier(LimitsStep):
         self._narrowing = np.empty(0, dtype=np.int64)  # in the same units, by vertex
         self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
         self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
-        self._remembered = Remembered(self._find_active)
+        self.set_pairs(no_near_pairs(), self.stencil, 0)
 
     def set_up(
         self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, self_contact: bool, static: bool
@@ -208,18 +256,19 @@ class ContactBarrier(LimitsStep):
         self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, self.search_distance)
         start, stage, end = self._next_obstacle_x = self._obstacle_search.x
         self._at_rest = ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(0.0, 0.0))
-        self.stale = False
+        self.obstacles_have_moved = False
 
-    def set_elements(self, elements: Elements) -> None:
-        super().set_elements(elements)
-        what = elements.data["what"].reshape(-1, 9).astype(np.int64)
-        self.number = elements.data["number"].astype(np.int64)
-        self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
-        self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
-        narrowing = what[:, 8] / AREA_UNITS
+    def set_pairs(self, pairs: NearPairs, stencil: NDArray[np.int32], n_counted: int) -> None:
+        """Take the near pairs with a vertex of this rank, in local rows ``stencil`` (E, 4); this rank counts
+        the first ``n_counted``.
+        """
+        self.set_elements(Elements(stencil, n_owned=n_counted))
+        self.number, self.kind, self.obstacle = pairs.vertices, pairs.kind, pairs.obstacle
+        self.points = np.where(pairs.obstacle_points < 0, pairs.obstacle_points, self.stencil)
+        narrowing = pairs.narrowing / AREA_UNITS
         self.offset = self.barrier.thickness / narrowing + self.obstacles.radius[self.obstacle]
-        self.shares = surface_shares.shares(what[:, 6])
-        self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * what[:, 7]
+        self.shares = surface_shares.shares(pairs.surroundings)
+        self.pair_stiffness = self.barrier.stiffness / AREA_UNITS * pairs.stiffness
         self.gap = np.where(self._are_secondary(), EDGE_GAP, 1.0) * self.barrier.gap
         # distance from the image in a wall over that from the wall: k (g − 2 d)³ / 2 d = 4 k (g / 2 − d)³ / d
         image_scale = np.where(self.obstacle >= self.obstacles.first_wall, 2.0, 1.0)
@@ -258,7 +307,7 @@ class ContactBarrier(LimitsStep):
         start, stage, end = self._next_obstacle_x = np.stack([self.obstacles.positions(t) for t in times])
         largest = np.linalg.norm(self._next_obstacle_x - search.x, axis=-1).max(initial=0.0)
         planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
-        self.stale = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
+        self.obstacles_have_moved = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
         search.deviations = self.obstacles.path_deviations(step.start, step.end)
         return ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(*times[:2]))
 
@@ -268,10 +317,16 @@ class ContactBarrier(LimitsStep):
 
     # -- search ------------------------------------------------------------------------------------
 
-    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
+    def near_pairs(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> NearPairs | None:
+        """The pairs that may come nearer than ``search_distance`` along straight displacements dx (N, 3) [m]
+        of points x (N, 3) [m]; None if there are too many, so that shorter ones must be searched.
+
+        ``numbers`` (N,) are the points' global numbers, ``triangles`` (F, 3 + m) near triangles with their
+        marks. Ranks that see the same points find the same pairs.
+        """
         if self.moving:
             self._obstacle_search.move(self._next_obstacle_x)
-        self.stale = False
+        self.obstacles_have_moved = False
         if triangles is not self._searched:
             self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
             self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
@@ -303,7 +358,7 @@ class ContactBarrier(LimitsStep):
         if len(every) > limit:
             return None
         if not len(every):
-            return every[:, :4], every
+            return no_near_pairs()
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
@@ -313,8 +368,9 @@ class ContactBarrier(LimitsStep):
             edges = np.flatnonzero(kind == EDGE_EDGE)
             units[edges] >>= self._symmetry_planes(x, points[edges])
         narrowing = np.where(obstacle < 0, self._narrowing[np.maximum(points, 0)].max(axis=1), AREA_UNITS)
-        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6], units, narrowing])
-        return np.where(sheet, points, first[:, None]), what
+        vertices = numbers[np.where(sheet, points, first[:, None])]
+        obstacle_points = np.where(sheet, 0, points)
+        return NearPairs(vertices, kind, obstacle, obstacle_points, every[:, 6], units, narrowing)
 
     def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
         """Number of symmetry planes in which all vertices of pairs of edges ``points`` (m, 4) lie, (m,)."""
@@ -373,6 +429,7 @@ class ContactBarrier(LimitsStep):
         return bool(self.active_elements(x, frozen).any())
 
     def active_elements(self, x: Array, frozen: ObstaclePositions) -> NDArray[np.bool_]:
+        """Which pairs (E,) have a non-zero Hessian at positions x (n_local, 3), springs included."""
         out = np.zeros(self.n_elements, dtype=np.bool_)
         if self.n_elements:
             out[self.active_pairs(x, frozen.stage).pair] = True
@@ -524,16 +581,17 @@ class ContactBarrier(LimitsStep):
             contact_pairs.add_gradient(x, obstacle_x, *self._pair_data, given, gradient, on_obstacles)
             yield int(obstacle), gradient
 
-    def obstacle_forces(self, x: Array, frozen: ObstaclePositions, count: int) -> Array:
+    def obstacle_forces(self, x: Array, frozen: ObstaclePositions) -> Array:
+        """Force [N] of this rank's pairs on each obstacle, its torque [N m] about the origin, the sum over
+        contacts of the magnitudes of normal forces [N], and 0, (obstacles, 8).
+        """
         out = np.zeros((len(self.obstacles.each), 8))
         for obstacle, force in self._obstacle_gradients(x, frozen.stage):
             out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         _, _, normal_force, _, pair = self.find_contacts(x, frozen.stage, self.n_owned)
         on = self.obstacle[pair] >= 0
         np.add.at(out[:, 6], self.obstacle[pair][on], normal_force[on])
-        return out[:count]
-
-    pushes = True
+        return out
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
         to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
@@ -636,7 +694,7 @@ def area_factors(triangles: Ints, area: Array) -> Ints:
     mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
     and friction would oscillate.
     """
-    sheet = np.unique(patches.connected_pieces(triangles), return_inverse=True)[1]
+    sheet = np.unique(connected_pieces(triangles), return_inverse=True)[1]
     mean = np.bincount(sheet, area) / np.bincount(sheet)
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
     factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)

@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact import patches
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.mesh import patches
 
 
 class DistanceBounds:

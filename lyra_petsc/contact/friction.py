@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import friction_pairs
-from lyra_petsc.contact.barrier import HALFWAY_CURVATURE, ContactBarrier
+from lyra_petsc.contact.barrier import HALFWAY_CURVATURE, ContactBarrier, Contacts
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE
 from lyra_petsc.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
 from lyra_petsc.kernels.sorting import sort_rows
@@ -29,7 +29,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Contacts, EndFriction, Offsets, StartingFriction, UpcomingStep
+from lyra_petsc.terms.term import Offsets, UpcomingStep
 
 MAX_ELASTIC_SLIP = 0.01
 """Largest slip of a sticking pair over the gap. If the kinetic coefficient is below the static one, all pairs
@@ -88,6 +88,76 @@ class ObstacleMotion(NamedTuple):
     end_points: Array
 
 
+class EndFriction(NamedTuple):
+    """Friction of the counted pairs in the equations of a step, and its limits at the end of the step.
+
+    Attributes
+    ----------
+    points, beta : (m, 4)
+        As in `Contacts`.
+    tangents : (m, 2, 3)
+        Unit vectors perpendicular to the normal and to each other.
+    gradients : (m, 2, 4, 3)
+        Gradients of the relative displacement along ``tangents`` with respect to the points' positions.
+    normal_force : (m,)
+        Normal force of the step [N], 0 for pairs that are no longer in contact.
+    force, applied : (m, 2)
+        Friction [N] along ``tangents`` in the equations of the step: that with which a pair of the end
+        begins, and that of the pairs of the equations, which follow them and end.
+    static, kinetic : (m,)
+        Largest friction [N] of sticking pairs, and of sliding ones.
+    slides, held : (m,)
+        Whether the pair slides in the equations of the step, and whether it sticks in them.
+    obstacle, velocity : (m,), (m, 3)
+        As in `Contacts`.
+    still : float
+        Displacement [m] in a step up to which a sticking pair counts as at rest.
+    """
+
+    points: Ints
+    beta: Array
+    tangents: Array
+    gradients: Array
+    normal_force: Array
+    force: Array
+    applied: Array
+    static: Array
+    kinetic: Array
+    slides: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    obstacle: Ints
+    velocity: Array
+    still: float
+
+
+class StartingFriction(NamedTuple):
+    """Friction of the counted pairs at the start of a step, in two tangential components.
+
+    Attributes
+    ----------
+    points : (m, 4)
+        Local rows of the vertices.
+    gradients : (m, 2, 4, 3)
+        Gradients of the relative displacement's components with respect to the points' positions.
+    size : (m, 4)
+        Largest norms of the gradients over all tangential directions.
+    weight, limit : (m,)
+        Normal forces, in proportion to which masses are divided, and largest friction [N].
+    force : (m, 2)
+        Friction of the elastic slip, opposite to it [N].
+    moved : (m, 2)
+        Relative displacement in the step by the motion of the obstacle alone [m].
+    """
+
+    points: Ints
+    gradients: Array
+    size: Array
+    weight: Array
+    limit: Array
+    force: Array
+    moved: Array
+
+
 class _EndedStep(NamedTuple):
     """What friction is after a step that is not accepted yet.
 
@@ -115,7 +185,7 @@ def _no_pairs() -> Pairs:
 
 def _order(key: Ints) -> Ints:
     """Rows (E,) of keys (E, 10) in ascending order of the keys."""
-    return sort_rows(np.arange(len(key)), key, np.empty((len(key), 0)), 0)
+    return sort_rows(np.arange(len(key)), key)
 
 
 class CoulombFriction(Stateful):
@@ -128,8 +198,6 @@ class CoulombFriction(Stateful):
         Number of vertices that this rank owns.
     """
 
-    slips = True
-
     def __init__(self, scene: Scene, n_vertices: int) -> None:
         assert scene.contact is not None
         self._sheet_friction = coefficients(scene.contact.friction)
@@ -138,19 +206,22 @@ class CoulombFriction(Stateful):
         self._contact_time: float | None = None  # [s], of the last part of a load step
         self._ended: _EndedStep | None = None  # until that step is accepted
         self._next_pairs: Pairs | None = None  # of the present Newton iterate
-        self.stale = False
-        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
+        self.pairs_have_changed = False
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32)))
+        self.set_pairs(self.stencil, np.empty((0, COLUMNS)), 0)
 
     def set_up(self, contact: ContactBarrier) -> None:
         """Take the contact term whose pairs have friction."""
         self._contact = contact
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._sheet_friction]
         self._coefficients = np.array(each)
-        self._obstacle_loads = np.zeros((len(contact.obstacles.each), 8))  # in the last step
+        self.obstacle_loads = np.zeros((len(contact.obstacles.each), 8))  # in the last step
 
-    def set_elements(self, elements: Elements) -> None:
-        super().set_elements(elements)
-        data = elements.data["what"].reshape(-1, COLUMNS)
+    def set_pairs(self, stencil: NDArray[np.int32], data: Array, n_counted: int) -> None:
+        """Take the pairs in contact with a vertex of this rank, in local rows ``stencil`` (E, 4), and their
+        data (E, 35) as in `Pairs`; this rank counts the first ``n_counted``.
+        """
+        self.set_elements(Elements(stencil, n_owned=n_counted))
         n = len(data)
         unpacked = self._unpacked(data)
         self._beta, self._tangents, self._gradients, self._constant, self._slip, self._contact_point = (
@@ -185,13 +256,16 @@ class CoulombFriction(Stateful):
 
     # -- pairs -------------------------------------------------------------------------------------
 
-    def current_elements(self) -> tuple[Ints, Array]:
-        self.stale, self._element_pairs = False, self._next_pairs or self._pairs
+    def current_pairs(self) -> tuple[Ints, Array]:
+        """Global numbers of the vertices (E, 4) of the pairs that this rank counts in the step's equations,
+        and their data (E, 35).
+        """
+        self.pairs_have_changed, self._element_pairs = False, self._next_pairs or self._pairs
         return self._element_pairs.stencil, self._element_pairs.data
 
     def begin_step(self) -> None:
         self._next_pairs = None
-        self.stale |= self._element_pairs is not self._pairs
+        self.pairs_have_changed |= self._element_pairs is not self._pairs
 
     def changed_contacts(self, x: Array, start: Array, frozen: ObstacleMotion) -> tuple[float, float]:
         contact, given = self._contact, self._element_pairs
@@ -206,7 +280,7 @@ class CoulombFriction(Stateful):
         return float(change), float(continued.sum())
 
     def take_contacts(self) -> None:
-        self.stale = True
+        self.pairs_have_changed = True
 
     def _update_pairs(self, x: Array, obstacle_x: Array, old: Pairs) -> None:
         """Store the pairs in contact at x (n_local, 3) and obstacle_x (m, 3); those in ``old`` keep their
@@ -216,7 +290,7 @@ class CoulombFriction(Stateful):
         if not contact.n_elements and not len(self._pairs.key):
             return
         beta, normal, force, _, pair = contact.find_contacts(x, obstacle_x, contact.n_owned)
-        self._pairs, self.stale = self._pairs_of(x, x, (beta, normal, force, pair), old)[0], True
+        self._pairs, self.pairs_have_changed = self._pairs_of(x, x, (beta, normal, force, pair), old)[0], True
 
     def _pairs_of(
         self, x: Array, start: Array, contacts: tuple[Array, Array, Array, Ints], old: Pairs
@@ -244,21 +318,20 @@ class CoulombFriction(Stateful):
         return Pairs(key, data, contact.number[pair]), pair, order, previous
 
     def initialise_pairs(self, x: Array, frozen: ObstacleMotion) -> None:
+        """Store the pairs in contact at positions x (n_local, 3), where a run begins or is resumed."""
         self._update_pairs(x, frozen.end_points, self._pairs)
 
-    @property
-    def obstacle_places(self) -> Mapping[str, tuple[int, int]]:
-        return self._contact.obstacles.places
-
-    def restore_elements(
-        self, vertices: Ints, values: Array, own: range, places: Mapping[str, tuple[int, int]]
-    ) -> None:
+    def restore_pairs(self, vertices: Ints, values: Array, places: Mapping[str, tuple[int, int]]) -> None:
+        """Restore the pairs of a `state` with a vertex of this rank; ``places`` are the numbers and first
+        points that the obstacles had.
+        """
         obstacle, kept = values[:, 1].copy(), np.ones(len(values), dtype=np.bool_)
         values = values.copy()
         for name, (number, first) in places.items():  # the scene's obstacles may be others, in another order
             at = np.flatnonzero(obstacle == number)
-            kept[at] = name in self.obstacle_places
-            values[at, 1], now = self.obstacle_places.get(name, (number, first))
+            now_places = self._contact.obstacles.places
+            kept[at] = name in now_places
+            values[at, 1], now = now_places.get(name, (number, first))
             points = values[at, 2:6]
             values[at, 2:6] = np.where(points < 0, points + (first - now), points)
         vertices, values = vertices[kept], values[kept]
@@ -386,17 +459,21 @@ class CoulombFriction(Stateful):
     def accept(self, x: Array, frozen: ObstacleMotion) -> None:
         self._contact_time = None
         if self._ended is not None and self._ended.time == frozen.time:  # not of a rejected attempt
-            self._pairs, self._obstacle_loads, self.stale = self._ended.pairs, self._ended.loads, True
+            self._pairs, self.obstacle_loads, self.pairs_have_changed = (
+                self._ended.pairs,
+                self._ended.loads,
+                True,
+            )
             self._work += self._ended.work
         elif not self.n_elements:
-            self._obstacle_loads = np.zeros_like(self._obstacle_loads)
+            self.obstacle_loads = np.zeros_like(self.obstacle_loads)
             self._update_pairs(x, frozen.end_points, self._element_pairs)
         else:
             old, data, heat = self._moved_pairs(x, frozen)
-            self._obstacle_loads, number = self._forces(x, data), self._obstacle[: self.n_owned]
+            self.obstacle_loads, number = self._forces(x, data), self._obstacle[: self.n_owned]
             on = np.flatnonzero(number >= 0)
             slip = np.linalg.norm(old.data[:, friction_pairs.SLIP : SLID], axis=1)
-            np.add.at(self._obstacle_loads[:, 7], number[on], (self._stiffness[: self.n_owned] * slip)[on])
+            np.add.at(self.obstacle_loads[:, 7], number[on], (self._stiffness[: self.n_owned] * slip)[on])
             np.add.at(self._work, self.stencil[: self.n_owned, 0], heat)
             self._update_pairs(x, frozen.end_points, old)
         self._ended = None
@@ -495,7 +572,7 @@ class CoulombFriction(Stateful):
         owned, data = slice(self.n_owned), self._pairs.data.copy()
         slip = np.einsum("eck,ec->ek", self._tangents[owned], -friction / self._stiffness[owned, None])
         data[:, friction_pairs.SLIP : SLID] = slip
-        self._pairs, self.stale = self._pairs._replace(data=data), True
+        self._pairs, self.pairs_have_changed = self._pairs._replace(data=data), True
 
     def accept_substep(self, x: Array, frozen: ObstacleMotion) -> None:
         self.accept(x, frozen)
@@ -545,11 +622,11 @@ class CoulombFriction(Stateful):
         return float(np.vdot(np.abs(after - given), slip)), float(np.maximum(after, given).sum())
 
     def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
-        return self._pairs, self._work.copy(), self._obstacle_loads, self._contact_time
+        return self._pairs, self._work.copy(), self.obstacle_loads, self._contact_time
 
     def restore_contacts(self, state: tuple[Pairs, Array, Array, float | None]) -> None:
-        self._pairs, self._work, self._obstacle_loads, self._contact_time = state
-        self.stale = True
+        self._pairs, self._work, self.obstacle_loads, self._contact_time = state
+        self.pairs_have_changed = True
 
     def _forces(self, x: Array, data: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 8)."""
@@ -560,9 +637,6 @@ class CoulombFriction(Stateful):
             friction_pairs.add_gradient(x, *(part[rows] for part in data), force)
             out[obstacle, :6] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         return out
-
-    def obstacle_forces(self, x: Array, frozen: ObstacleMotion, count: int) -> Array:
-        return self._obstacle_loads[:count]
 
     def initialise(self, x: Array) -> None:
         """No pairs are in contact before the first step."""

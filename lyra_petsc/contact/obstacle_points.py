@@ -11,10 +11,19 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import surface_shares
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.terms.term import StepInterval
 
 SHARP_ANGLE = 0.5
 """Angle [rad] between two triangles of an obstacle above which their common edge has the full gap."""
+
+
+class StepInterval(NamedTuple):
+    """An interval of a step: 0 is its start, 1 its stage, 2 its end, and time is linear in between.
+
+    With ``begin`` = ``end`` = 1 obstacles stay where they are at the stage.
+    """
+
+    begin: float
+    end: float
 
 
 class ObstaclePositions(NamedTuple):

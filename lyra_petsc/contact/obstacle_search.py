@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import contact_pairs
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.contact.near import near_pairs, swept_boxes
 from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.sheet_search import SheetSearch, Simplices
-from lyra_petsc.mesh.near import near_pairs, swept_boxes
 
 
 class ObstacleSearch:

@@ -9,13 +9,13 @@ import math
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.contact import patches
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, approach_bound, distance
 from lyra_petsc.contact.distance_bounds import DistanceBounds
+from lyra_petsc.contact.near import near_pairs_by_tree
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import inlined, kernel, leaf
-from lyra_petsc.mesh import patches
-from lyra_petsc.mesh.near import near_pairs_by_tree
-from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.mesh.topology import connected_pieces, edge_table
 
 EXTRA_RADIUS = 0.7
 """Additional search radius for neighbouring patches over the radius: their simplices are not searched again
@@ -56,8 +56,8 @@ class SheetSearch:
     """
 
     def __init__(self, surface: Ints, uv: Array) -> None:
-        patch = patches.split_into_patches(uv.mean(axis=1), patches.connected_pieces(surface))
-        patch = np.unique(patches.connected_pieces(surface, patch), return_inverse=True)[1].astype(np.int64)
+        patch = patches.split_into_patches(uv.mean(axis=1), connected_pieces(surface))
+        patch = np.unique(connected_pieces(surface, patch), return_inverse=True)[1].astype(np.int64)
         self._patch, self._flat = patch, patches.flat_patches(surface, uv, patch)
         self._n = len(self._flat.first) - 1
         # the vertices of each patch once, as places among the corners of all triangles

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -10,6 +12,11 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array, Ints, Mask
+
+Result = TypeVar("Result")
+
+TIE = 1e-6
+"""Relative difference up to which two sizes count as equal."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,15 @@ class Points:
         found = np.searchsorted(self.ghosts, np.where(inside, -1, numbers), sorter=order)
         ghost = order[np.minimum(found, len(order) - 1)] if len(order) else found
         return np.where(inside, numbers - self.start, self.n_owned + ghost)
+
+    def extended(self, owned: Array) -> Array:
+        """Copy (n_local, 3) of the first n_owned rows of ``owned``, followed by those of the ghosts;
+        collective.
+        """
+        out = np.empty((self.n_local, 3))
+        out[: self.n_owned] = owned[: self.n_owned]
+        self.update_ghosts(out)
+        return out
 
     def update_ghosts(self, values: Array | NDArray[np.float32]) -> None:
         """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
@@ -242,3 +258,27 @@ class Layout(Points):
         """Numbers, counting only vertices, of vertices given by the global numbers of their rows."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
         return rows - self.bounds[rank] + self.vertex_bounds[rank]
+
+
+def describe_worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
+    """Describe the row with the largest size, among equals that with the smallest number; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    sizes : (n,)
+        Sizes of this rank's rows; not NaN, may be infinite. At least one rank has a row.
+    numbers : (n,) int64
+        Numbers of the rows, unique over all ranks.
+    describe : callable
+        Returns the description of a row; called on the rank that has the row, and broadcast.
+    """
+    largest = comm.allreduce(float(sizes.max(initial=-np.inf)), MPI.MAX)
+    bad = np.flatnonzero(sizes >= largest * (1.0 - TIE)) if len(sizes) else np.empty(0, np.int64)
+    none = np.iinfo(np.int64).max
+    first = int(numbers[bad].min()) if len(bad) else none
+    number, rank = comm.allreduce((first, comm.rank), MPI.MIN)
+    mine = describe(int(bad[np.argmin(numbers[bad])])) if rank == comm.rank and number != none else None
+    result: Result | None = comm.bcast(mine, root=rank)
+    assert result is not None
+    return result

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container
 from lyra_petsc.mesh.select import FLAT, select_vertices
+from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
 
@@ -77,7 +77,7 @@ def symmetry_walls(scene: Scene, mesh: Mesh) -> list[Wall]:
     if not planes:
         return []
     sheet = np.zeros(len(x), dtype=np.int64)
-    sheet[triangles] = np.unique(patches.connected_pieces(triangles), return_inverse=True)[1].reshape(-1, 1)
+    sheet[triangles] = np.unique(connected_pieces(triangles), return_inverse=True)[1].reshape(-1, 1)
     walls = []
     for number, axis, position, held in planes:
         above = x[:, axis] - position

@@ -128,3 +128,25 @@ def unique_edges(triangles: Ints) -> Ints:
     """All edges of ``triangles`` (F, 3), each once, as pairs of vertices (E, 2), lower vertex first."""
     table = edge_table(triangles)
     return np.sort(side_vertices(triangles, table.sides[table.first])[:, :2], axis=1)
+
+
+def connected_pieces(triangles: Ints, patch: Ints | None = None) -> Ints:
+    """Number of the piece (F,) of each triangle (F, 3): triangles of a patch connected by vertices."""
+    node = triangles
+    if patch is not None:
+        patch_corners = np.column_stack([np.repeat(patch, 3), triangles.ravel()])
+        node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    links = np.concatenate([node[:, :2], node[:, 1:]])
+    return connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
+
+
+def connected_components(n: int, pairs: Ints) -> Ints:
+    """Lowest number (n,) of the component of each of n nodes that are connected by pairs (m, 2)."""
+    component: Ints = np.arange(n)
+    while len(pairs):
+        low, high = np.sort(component[pairs], axis=1).T
+        np.minimum.at(component, high, low)  # joins whole components, as these are their lowest numbers
+        while not np.array_equal(component, shorter := component[component]):
+            component = shorter
+        pairs = pairs[component[pairs[:, 0]] != component[pairs[:, 1]]]
+    return component

@@ -85,6 +85,5 @@ class Accuracy:
         if not system.has_active_pairs or is_set("ts_adapt_dt_min"):
             return 0.0
         fastest = float(system.points.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
-        skins = (term.skin for term in system.active.changing if term.search_distance > 0.0)
-        through = min(skins, default=math.inf) / max(fastest, 1e-300)
+        through = (math.inf if system.contact is None else system.contact.skin) / max(fastest, 1e-300)
         return min(IMPACT_SKIN_FRACTION * through, IMPACT_RUN_FRACTION * self._control.end)

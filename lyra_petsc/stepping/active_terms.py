@@ -9,7 +9,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.terms.protocols import HasDirectors, LimitsStep, SharesFrozen, Stateful
+from lyra_petsc.terms.protocols import HasDirectors, LimitsStep, MovingTargets, SharesFrozen, Stateful
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
@@ -29,16 +29,14 @@ class ActiveTerms:
         Loads that follow the shape of the sheet.
     sheet, constraints : list of Elastic
         Terms that add to the energy of the sheet, and springs by which handles pull.
-    moving, pushing : list of Elastic
-        Terms of ``sheet`` with moving targets; of these the ones whose targets do work by forces (obstacles).
+    moving, targets : list of Elastic
+        Terms of ``sheet`` with moving targets or obstacles; of these the ones with targets.
     limiting : list of LimitsStep
-        Terms that limit the length of steps.
+        Terms that limit the length of steps, besides contact.
     stateful : list of Stateful
         Terms with a state.
-    changing : list of Elastic
-        Terms whose stencils change (pairs that are near).
-    separating : list of Elastic
-        Terms of ``changing`` that keep parts from passing through each other (contact).
+    sliding : list of CoulombFriction
+        Friction of contact, if there is any.
     with_edges : list of HasDirectors
         Terms with directors.
     coarse : dict of Elastic → Elastic
@@ -56,11 +54,11 @@ class ActiveTerms:
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.moving = [term for term in self.sheet if term.moving]
-        self.pushing = [term for term in self.moving if term.pushes]
-        self.limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
+        self.targets = [term for term in self.moving if isinstance(term, MovingTargets)]
+        limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
+        self.limiting = [term for term in limiting if not term.registration.of_contact]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
-        self.changing = [term for term in self.elastic if term.registration.neighbours]
-        self.separating = [term for term in self.changing if term.detects_collisions]
+        self.sliding: list[Any] = [term for term in self.constraints if term.registration.of_contact]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
@@ -92,28 +90,27 @@ class ActiveTerms:
 
     def moving_energy(self, x: Array) -> float:
         """Energy [J] of this rank's terms with moving targets, without obstacles, at the present targets."""
-        terms = [term for term in self.moving if not term.pushes]
-        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in terms)
+        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in self.targets)
 
     def accept_substep(self, x: Array) -> None:
         """Notify terms that a part of a static load step ended at positions x."""
-        for term in self.changing:
+        for term in self.sliding:
             term.accept_substep(x, self.frozen[term])
 
     def friction_lag(self, x: Array) -> dict[str, Array]:
         """The results of `Elastic.friction_lag` of all terms."""
-        return {name: sums for t in self.changing for name, sums in t.friction_lag(x, self.frozen[t]).items()}
+        return {name: sums for t in self.sliding for name, sums in t.friction_lag(x, self.frozen[t]).items()}
 
     def slip_under_changed_forces(self, x: Array, dx: Array) -> Array:
         """The sums of `Elastic.slip_under_changed_forces` over all terms, (2,)."""
-        sums = [t.slip_under_changed_forces(x, dx, self.frozen[t]) for t in self.changing]
+        sums = [t.slip_under_changed_forces(x, dx, self.frozen[t]) for t in self.sliding]
         return np.sum(sums, axis=0)
 
-    def contact_state(self) -> dict[Elastic, Any]:
+    def contact_state(self) -> dict[Any, Any]:
         """State of the contacts of all terms, for `restore_contacts`."""
-        return {term: term.contact_state() for term in self.changing}
+        return {term: term.contact_state() for term in self.sliding}
 
-    def restore_contacts(self, states: Mapping[Elastic, Any]) -> None:
+    def restore_contacts(self, states: Mapping[Any, Any]) -> None:
         """Return to a `contact_state`."""
         for term, state in states.items():
             term.restore_contacts(state)

@@ -218,9 +218,7 @@ class EnergyBalance:
     def _moving_targets(self) -> list[tuple[Array, Array]]:
         """Positions of the targets that move with handles, and the forces on them, by term."""
         active, x = self._system.active, self._system.x
-        return [
-            term.targets(x, active.frozen[term]) for term in active.moving if isinstance(term, MovingTargets)
-        ]
+        return [term.targets(x, active.frozen[term]) for term in active.targets]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
         """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
@@ -297,13 +295,8 @@ class EnergyBalance:
         8); collective.
         """
         system, total = self._system, np.zeros((count, 8))
-        for term in system.active.elastic:
-            found = term.obstacle_forces(system.x, system.active.frozen[term], count)
-            if found is not None:
-                total += found
-        if impulses := system.contact_impulses:
-            on = impulses.obstacle < count  # not symmetry planes
-            np.add.at(total, impulses.obstacle[on], impulses.loads[on])
+        if system.contact is not None:
+            total += system.contact.obstacle_loads(system.x, system.active.frozen)[:count]
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

@@ -42,7 +42,6 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.stepping.state import resized
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -114,9 +113,7 @@ class EndForces:
         """Gain of the step just taken from x0, v0 (n_local, 3), whose account the ledger has."""
         system, layout = self._system, self._system.points
         if system.discretisation.stencils_change:  # ghosts may have changed in the step
-            x0, v0 = (resized(values, layout.n_owned, layout.n_local) for values in (x0, v0))
-            for values in (x0, v0):
-                layout.update_ghosts(values)
+            x0, v0 = (layout.extended(values) for values in (x0, v0))
         x1, v1, n = system.x, system.v, layout.n_owned
         moved = x1[:n] - x0[:n]
         moved[: layout.n_vertices] -= system.dt * self._drift
@@ -184,11 +181,12 @@ class EndForces:
         this rank's terms with targets, and energy of springs at both ends.
         """
         system, rise, springs = self._system, 0.0, [0.0, 0.0]
-        work = system.contact_impulses.work if system.contact_impulses else 0.0
-        for term in system.active.pushing:
+        contact, work = system.contact, system.contact_impulses.work if system.contact_impulses else 0.0
+        if contact is not None and contact.obstacles_move:
             for x, time in ((x0, system.t0), (x1, system.t1)):
-                work += 0.5 * term.work(x, time, system.t0, system.t1)
-        turning = [t for t in self._targets if t.n_elements and t not in system.active.pushing]
+                work += 0.5 * contact.barrier.work(x, time, system.t0, system.t1)
+        barrier = None if contact is None else contact.barrier
+        turning = [term for term in self._targets if term.n_elements and term is not barrier]
         first = self._frozen(turning, system.t0, x0)
         last = self._frozen(turning, system.t1, x1)
         for term in turning:
@@ -204,16 +202,18 @@ class EndForces:
 
     def _force_of_targets(self, x0: Array, x1: Array) -> Array:
         """Force (3,) [N] of the sheet on targets and obstacles in the step from x0 to x1 (n_local, 3)."""
-        system, force = self._system, np.zeros_like(x1)
-        near = [term for term in self._plain if term.detects_collisions]
-        both = [term for term in (*self._targets, *near) if not term.slips]
+        system, force, contact = self._system, np.zeros_like(x1), self._system.contact
+        both: list[Elastic] = [term for term in self._targets if not term.registration.of_contact]
+        if contact is not None:
+            both.append(contact.barrier)
         for x, time in ((x0, system.t0), (x1, system.t1)):
             for term, frozen in self._frozen(both, time, x).items():
                 term.add_gradient(x, frozen, force)
         force *= 0.5
-        for term in system.active.changing:
-            if term.slips:  # by the force at the stage, which the impulses complete
-                term.add_gradient(system.stage_positions, system.active.frozen[term], force)
+        if contact is not None and contact.friction is not None:
+            # by the force at the stage, which the impulses complete
+            friction = contact.friction
+            friction.add_gradient(system.stage_positions, system.active.frozen[friction], force)
         total: Array = force[: system.points.n_vertices].sum(axis=0)
         return total + (system.contact_impulses.loads[:, :3].sum(axis=0) if system.contact_impulses else 0.0)
 

@@ -81,5 +81,5 @@ class Objective:
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
         """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
-        fixed = [term for term in self._system.active.elastic if not term.registration.neighbours]
+        fixed = [term for term in self._system.active.elastic if not term.registration.of_contact]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}

@@ -29,7 +29,6 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
-from lyra_petsc.stepping.failure.near_pairs import nearest_pair
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -52,7 +51,9 @@ from lyra_petsc.terms.term import Elastic, Load, Term
 from lyra_petsc.terms.units_check import unit_notes
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.barrier import Barrier
+    from lyra_petsc.contact.barrier import Barrier, ContactBarrier
+    from lyra_petsc.contact.friction import CoulombFriction
+    from lyra_petsc.contact.scene_contact import SceneContact
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
 
 
@@ -389,6 +390,20 @@ def _set_up_contact(
         cast(CoulombFriction, terms["friction"]).set_up(contact)
 
 
+def _scene_contact(
+    discretisation: Discretisation, terms: Mapping[str, Term], mass: Array
+) -> SceneContact | None:
+    """Contact of the scene with masses (n_owned,) [kg] of the rows, or None."""
+    if "contact" not in terms:
+        return None
+    from lyra_petsc.contact.scene_contact import SceneContact
+
+    barrier, friction = terms["contact"], terms.get("friction")
+    return SceneContact(
+        discretisation, cast("ContactBarrier", barrier), cast("CoulombFriction | None", friction), mass
+    )
+
+
 def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
@@ -415,6 +430,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         list(terms.values()),
         held,
         integrator=integrator,
+        contact=_scene_contact(discretisation, terms, mass),
         starts=[Window.of(handle).start for handle in scene.handles],
         events=event_times(scene),
     )
@@ -469,7 +485,11 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: flo
     InputError
         Names the nearest pair.
     """
-    near = nearest_pair(system, system.x)
+    if (contact := system.contact) is None:
+        return
+    from lyra_petsc.contact.nearest_pair import nearest_pair
+
+    near = nearest_pair(contact, system.x, system.active.frozen[contact.barrier])
     if near is None or near.gap > minimum:
         return
     distance, remedy = "not apart", "move them apart"

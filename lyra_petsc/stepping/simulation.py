@@ -268,11 +268,7 @@ class SteppedScene:
         if not attempt.converged:
             return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
         system, n = self.problem.system, self.problem.points.n_owned
-        if system.suits_contact:
-            resolved = system.resolves_contact()
-        else:
-            resolved = not system.collisions.touches(system.stage_positions)
-        if not resolved:
+        if not (system.resolves_contact() if system.suits_contact else not system.touches_at_stage):
             return Trouble.UNRESOLVED
         if self.accuracy is not None and not self.accuracy.accepts(v_before[:n], dt):
             return Trouble.INACCURATE

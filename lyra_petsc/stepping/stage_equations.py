@@ -18,20 +18,19 @@ This module works on arrays only, without PETSc. Methods that return sums over r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.linear.block_rows import squared_norm_without
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms
 from lyra_petsc.stepping.applied_loads import AppliedLoads
-from lyra_petsc.stepping.collisions import Collisions
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.directors import Directors
 from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
@@ -40,25 +39,21 @@ from lyra_petsc.stepping.predicted_stress import PredictedStress
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.start_acceleration import StartAcceleration
-from lyra_petsc.stepping.state import State, resized
+from lyra_petsc.stepping.state import State
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
 from lyra_petsc.terms.protocols import FollowsHandles
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.impacts import ContactImpulses
+    from lyra_petsc.contact.impacts import ContactImpulses, StepEnd
+    from lyra_petsc.contact.scene_contact import SceneContact
 
 
 Energy = TypeVar("Energy", bound=Elastic)
 
-FOLLOWED = 0.1
-"""Change of the normal forces in a step over their sum above which the step is solved again with friction by
-those at its end. Otherwise an impulse corrects friction."""
-
-RESOLVED = 0.2
-"""Mean displacement of the vertices in contact by the change of their normal forces in a step, over the skin
-of the contact search, up to which the step resolves contact."""
+MAX_TURN = 0.25
+"""Largest angle [rad] by which a Newton iteration of a static analysis may turn a director."""
 
 
 class StageEquations:
@@ -72,6 +67,7 @@ class StageEquations:
     terms : sequence of Term
     held : ExactHandles
     integrator : Integrator
+    contact : SceneContact or None
     starts : list of float
         Times [s] at which handles start to act.
     events : list of float
@@ -95,7 +91,6 @@ class StageEquations:
     start_acceleration : StartAcceleration
     active : ActiveTerms
     applied : AppliedLoads
-    collisions : Collisions
     directors : Directors
     predicted_stress : PredictedStress
         That of the Jacobian.
@@ -103,8 +98,6 @@ class StageEquations:
         Whether the edges' unknowns are being solved for at the end of the step.
     usual, in_contact : Integrator
         The scene's integrator, and the one that takes the steps in which something touches.
-    touches : bool
-        Whether anything touches at the positions of the state.
     has_active_pairs : bool
         Whether any pair of a term with changing stencils acted when the block rows were last renewed.
     prescribed_force : (n_owned, 3) or None
@@ -112,10 +105,8 @@ class StageEquations:
     """
 
     prescribed_force: Array | None = None
-    contact_impulses: ContactImpulses | None = None
     has_active_pairs = solving_edges = False
-    touches = False
-    _normal_force = _next_normal_forces = np.empty(0)  # at the start and the end of the step
+    _start_velocity: Array | None = None  # found by `find_start`
     _past_velocity: Array | None = None  # (n_owned, 3) before the last step, if there is contact
 
     def __init__(
@@ -126,12 +117,15 @@ class StageEquations:
         held: ExactHandles,
         *,
         integrator: Integrator,
+        contact: SceneContact | None,
         starts: list[float],
         events: list[float],
     ) -> None:
         self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
         self.active = active = ActiveTerms(terms)
-        self.usual, self.in_contact = integrator, integrator.for_contact() if active.changing else integrator
+        self.contact = contact
+        self.usual, self.in_contact = integrator, integrator.for_contact() if contact else integrator
+        discretisation.when_ghosts_change(self._follow_ghosts)
         self.held = held
         following = [term.reference_rows for term in terms if isinstance(term, FollowsHandles)]
         rows = np.concatenate([held.reference_rows, *following])
@@ -155,7 +149,7 @@ class StageEquations:
         self.t0 = self.t1 = self.moving_energy_before = 0.0
         self._squares: list[float] = []
         self.start_acceleration = StartAcceleration(self, events)
-        self.collisions, self.directors = Collisions(self), Directors(self)
+        self.directors = Directors(self)
         self.predicted_stress = PredictedStress()
 
     @property
@@ -188,29 +182,24 @@ class StageEquations:
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
         self.update_stencils(self.x)  # energies at the start of a run need all stencils
-        for term in self.active.changing:
-            term.initialise_pairs(self.x, self.active.frozen[term])
-        self.touches = self.collisions.touches(self.x)
-        self._normal_force = self._normal_forces()
+        if self.contact is not None:
+            self.contact.initialise(self.x, self.active.frozen)
 
     # -- a step ------------------------------------------------------------------------------------
 
     def begin_step(self, t0: float, t1: float) -> None:
         """Set up the equations of the step from t0 to t1 [s], and freeze its data; collective."""
         self.t0, self.t1 = t0, t1
-        self.collisions.begin_step()
-        for term in self.active.changing:
-            term.begin_step()
+        self._start_velocity = None
         self.predicted_stress.forget()
         after = self.integrator.stage_offset(self.dt)
         self.prescribed.begin_step(t0, t1, self.x)
-        displacement = self.expected_displacement() if self.discretisation.limits_motion else None
-        self.update_stencils(self.x, displacement, self.expected_displacement)
+        if self.contact is not None:
+            self.contact.begin_step()
+            self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
         self._freeze(t0 + after)
-        if self.active.pushing:  # obstacles may have come near
-            # again, with the ghosts of now
-            displacement = None if displacement is None else self.expected_displacement()
-            self.update_stencils(self.x, displacement, self.expected_displacement)
+        if self.contact is not None and self.contact.obstacles_move:  # they may have come near
+            self.contact.update(self.x, self.expected_displacement(), self.expected_displacement)
         self.start_acceleration.begin_step(t0 + after)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
@@ -325,47 +314,60 @@ class StageEquations:
         self.state.set(moved, rate)
         if not self.integrator.dynamic:
             return
-        if self.active.changing and self.stage.offset < self.dt:
-            # pairs that come near between the stage and the end
+        if self.contact is None:
+            return
+        if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
             self.update_stencils(self._xs, self.x - self._xs)
-        if self.active.changing:
-            self.touches = self.collisions.touches(self.x)
-        if self.active.separating:
-            self._past_velocity, self.contact_impulses = rate_before, None
-            self._next_normal_forces = self._normal_forces()
-            if self.suits_contact and self.discretisation.has_near_elements:
-                from lyra_petsc.stepping import impacts  # needed only if something is near
+        self._past_velocity = rate_before
+        step = self._step_end(self.v)
+        impulses = self.contact.finish(step, self.active.frozen, damps=self.suits_contact)
+        if impulses is not None:
+            self.state.set(self.x[:n], self.v[:n] + impulses.change)
+            self.in_contact.shift_past_velocities(impulses.change)
 
-                self.contact_impulses = impacts.end_step(self)
+    def _step_end(self, v: Array) -> StepEnd:
+        """The step's end with velocities v (n_local, 3), for contact."""
+        from lyra_petsc.contact.impacts import StepEnd
+
+        free, held, order = self.prescribed.free, self.prescribed.indices, self.integrator.order
+        return StepEnd(self.points, self.mass, free, held, self.x, v, self.t0, self.t1, order)
+
+    def held_by_friction(self, v: Array, acceleration: Array) -> Array:
+        """The accelerations (n_owned, 3) [m/s²] at the start of a step with velocities v (n_local, 3) and the
+        friction that opposes motion; collective.
+        """
+        if self.contact is None:
+            return acceleration
+        return self.contact.hold(self._step_end(v), acceleration, self.active.frozen)
+
+    @property
+    def contact_impulses(self) -> ContactImpulses | None:
+        """The impulses of contact at the end of the step just accepted."""
+        return None if self.contact is None else self.contact.impulses
+
+    @property
+    def near(self) -> bool:
+        """Whether any parts are near each other."""
+        return self.contact is not None and self.contact.near
+
+    @property
+    def touches(self) -> bool:
+        """Whether anything touches at the positions of the state."""
+        return self.contact is not None and self.contact.touches
 
     @property
     def suits_contact(self) -> bool:
         """Whether the integrator of the step is one for steps in which something touches."""
         return self.integrator is not self.usual or self.usual is self.in_contact
 
-    def _normal_forces(self) -> Array:
-        """Normal forces [N] at the owned vertices of the state, (n_vertices,); collective."""
-        out = np.zeros_like(self.x)
-        for term in self.present(self.active.separating):
-            out[:, 0] += term.normal_forces(self.x, self.active.frozen[term])
-        if self.discretisation.has_near_elements:
-            self.points.add_to_owners(out)
-        return out[: self.points.n_vertices, 0].copy()
+    @property
+    def touches_at_stage(self) -> bool:
+        """Whether anything touches at the stage of the step just accepted; collective."""
+        return self.contact is not None and self.contact.is_touching(self._xs, self.active.frozen)
 
     def resolves_contact(self) -> bool:
-        """Whether the normal forces changed so little in the step that integrators of second order follow
-        them; collective.
-
-        A formula of second order continues a motion that contact has ended in the step: parts would rebound
-        with up to their speed, and friction would reverse the sliding.
-        """
-        if self.integrator.order == 1 or not self.active.separating:
-            return True
-        before, now = self._normal_force, self._next_normal_forces
-        mass = self.mass[: self.points.n_vertices][np.maximum(before, now) > 0.0]
-        change, mass = self.points.global_sum(float(np.abs(now - before).sum()), float(mass.sum())).tolist()
-        skin = min(term.skin for term in self.active.separating)
-        return bool(change * self.dt**2 <= RESOLVED * skin * mass)
+        """Whether the step's integrator can follow the changes of the normal forces in it; collective."""
+        return self.integrator.order == 1 or self.contact is None or self.contact.resolved(self.dt)
 
     def saved_histories(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Arrays (n_owned, 3) and numbers of the histories of both integrators."""
@@ -381,7 +383,8 @@ class StageEquations:
         """Let the integrators that did not take the step just accepted, from velocities v_before (n_owned,
         3), go on from its end.
         """
-        self._normal_force = self._next_normal_forces
+        if self.contact is not None:
+            self.contact.accept()
         if self.integrator is self.usual:
             return
         rate = (self.stage_velocity - v_before) / self.dt
@@ -397,8 +400,7 @@ class StageEquations:
         collective.
         """
         if self._xh is self.x:
-            self._xh = resized(x_before, self.points.n_owned, self.points.n_local)
-            self.points.update_ghosts(self._xh)
+            self._xh = self.points.extended(x_before)
 
     def initial_edge_moments(self) -> float:
         """Norm [N] of the moments on free edges at the start of a run, handles set; collective."""
@@ -426,8 +428,7 @@ class StageEquations:
         self.objective.forget()
         self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
-        self._xh = resized(x_before, n, self.points.n_local)
-        self.points.update_ghosts(self._xh)
+        self._xh = self.points.extended(x_before)
         self.active.move_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
         self.solving_edges = True
@@ -463,9 +464,11 @@ class StageEquations:
 
     def obstacle_work(self) -> float:
         """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
+        if self.contact is None or not self.contact.obstacles_move:
+            return 0.0
         at = self.t0 + self.stage.offset if self.integrator.dynamic else self.t1
-        work = sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
-        return work + (self.contact_impulses.work if self.contact_impulses else 0.0)
+        work = self.contact.barrier.work(self._xs, at, self.t0, self.t1)
+        return work + (self.contact.impulses.work if self.contact.impulses else 0.0)
 
     def move_targets_to_end(self) -> float:
         """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
@@ -481,30 +484,139 @@ class StageEquations:
         ``increment`` (n_owned, 3) [m/s] is added to the velocities; collective.
         """
         x = self.evaluate_at(v)[0]
-        displacement = resized(increment * self.stage.c, len(increment), self.points.n_local)
-        self.points.update_ghosts(displacement)
-        return x, displacement
+        return x, self.points.extended(increment * self.stage.c)
+
+    # -- limits of motion --------------------------------------------------------------------------
+
+    def _stage_positions_of(self, v: Array) -> Array:
+        """Positions (n_owned, 3) [m] of the stage at velocities v (n_owned, 3), without ghosts."""
+        return self.stage.c * v + self._xh[: len(v)]
+
+    @property
+    def limits_steps(self) -> bool:
+        """Whether `largest_step` may be less than 1.
+
+        So it is with contact, and in statics with directors, which would else reach a distant equilibrium.
+        """
+        turns = bool(self.active.with_edges) and not self.integrator.dynamic
+        return self.contact is not None or bool(self.active.limiting) or turns
+
+    def largest_step(self, v: Array, increment: Array) -> float:
+        """Largest fraction of an increment (n_owned, 3) [m/s] from v that may be taken; collective."""
+        turn = 0.0 if self.integrator.dynamic else self.directors.largest_turn(increment * self.stage.c)
+        return self._free_fraction(v, increment, MAX_TURN / turn if turn > MAX_TURN else 1.0)
+
+    def moves_freely(self, v: Array, increment: Array) -> bool:
+        """Whether no collision limits an increment (n_owned, 3) [m/s] from v; collective."""
+        return self._free_fraction(v, increment, 1.0) == 1.0
+
+    def _free_fraction(self, v: Array, increment: Array, maximum: float) -> float:
+        if self.active.limiting:
+            x, displacement = self.displacement(v, increment)
+            frozen = self.active.frozen
+            allowed = [term.largest_step(x, displacement, frozen[term]) for term in self.active.limiting]
+            maximum = -self.points.global_max(-min(maximum, *allowed))[0]
+        if self.contact is None:
+            return maximum
+        obstacles = self.active.frozen[self.contact.barrier]
+        x, dx = self._stage_positions_of(v), self.stage.c * increment
+        return self.contact.collisions.limit(x, dx, obstacles, maximum)
+
+    def separated(self, v: Array, increment: Array) -> Array | None:
+        """The increment (n_owned, 3) [m/s] from v, changed to separate the parts that it brings too near;
+        None if there are none; collective.
+        """
+        if self.contact is None:
+            return None
+        obstacles = self.active.frozen[self.contact.barrier]
+        x, dx = self._stage_positions_of(v), self.stage.c * increment
+        moved = self.contact.collisions.separate(x, dx, obstacles, self.prescribed.free)
+        return None if moved is None else moved / self.stage.c
+
+    def contact_at(self, v: Array) -> tuple[SceneContact, Discretisation, Array, float, Mask, Any]:
+        """What Newton's model of contact takes from the equations at velocities v (n_owned, 3)."""
+        assert self.contact is not None
+        obstacles, x = self.active.frozen[self.contact.barrier], self._stage_positions_of(v)
+        return self.contact, self.discretisation, x, self.stage.c, self.prescribed.free, obstacles
+
+    def find_start(self) -> bool:
+        """Find velocities from which the step's solve can start without a collision; whether there are any.
+
+        Free vertices stay, or keep their velocities, or obstacles push them; obstacles and prescribed
+        unknowns move as they must; collective.
+        """
+        if self.contact is None:
+            return True
+        still, c, n = self.stationary_velocity(), self.stage.c, self.points.n_owned
+        driven = np.zeros_like(still)
+        self.prescribe(driven)
+        driven = np.where(self.prescribed.free, 0.0, c * (driven - still))
+        if not any(self.points.global_max(self.contact.obstacles_move or bool(driven.any()))):
+            return True
+        guesses = [np.zeros_like(still)]
+        if not self.integrator.starts_at_rest:
+            guesses.append(c * (self.v[:n] - still))
+        obstacles = self.active.frozen[self.contact.barrier]
+        free, pushes = self.prescribed.free, len(guesses) > 1
+        found = self.contact.collisions.start(self.x[:n], guesses, driven, free, obstacles, pushes=pushes)
+        self._start_velocity = None if found is None else still + found / c
+        return found is not None
+
+    def start_velocity(self) -> Array:
+        """Collision-free velocities (n_owned, 3) [m/s] for the first guess, with the prescribed ones.
+
+        They are those that `find_start` found, else `stationary_velocity`.
+        """
+        found = self._start_velocity
+        v = self.stationary_velocity() if found is None or self.solving_edges else found.copy()
+        self.prescribe(v)
+        return v
+
+    def end_is_free(self, v: Array) -> bool:
+        """Whether the sheet moves from the stage with velocities v (n_owned, 3) to the end of the step
+        without a collision; collective.
+        """
+        iterates = self.integrator.iterates
+        if self.contact is None or (self.stage.offset == self.dt and iterates):
+            return True
+        from lyra_petsc.contact.obstacle_points import StepInterval
+
+        x = self.x[: len(v)]
+        end = self.integrator.end(x, self.v[: len(v)], v, self.dt)[0]
+        # Newton's method has checked the displacement to the stage, a single linear solve has not
+        here = self._stage_positions_of(v) if iterates else x
+        obstacles = self.active.frozen[self.contact.barrier]
+        return self.contact.collisions.is_free(here, end - here, obstacles, StepInterval(1.0, 2.0))
+
+    def may_collide(self, approach: float) -> bool:
+        """Whether parts may collide in the step, approaching by more than ``approach`` [m]; collective."""
+        if not self.near or not self.integrator.dynamic or self.solving_edges:
+            return False
+        assert self.contact is not None
+        return self.contact.may_collide(self.x, self.expected_displacement(), self.active.frozen, approach)
+
+    @property
+    def may_impact(self) -> bool:
+        """Whether parts that are near move by a notable part of the gap in the step; collective."""
+        if self.contact is None:
+            return False
+        return self.contact.may_impact(self.stage.c * self._vs[: self.points.n_vertices])
 
     # -- residual and Jacobian -----------------------------------------------------------------------
 
-    def update_stencils(
-        self, x: Array, displacement: Array | None = None, ahead: Callable[[int], Array] | None = None
-    ) -> None:
-        """Update changing stencils to positions x (n_local, 3), and all arrays to their ghosts; collective.
-
-        ``displacement`` and ``ahead`` are as in `Discretisation.update_stencils`.
+    def update_stencils(self, x: Array, displacement: Array | None = None) -> None:
+        """Update the near pairs to positions x (n_local, 3), or to all along a displacement, and all arrays
+        to their ghosts; collective.
         """
-        discretisation = self.discretisation
-        if not discretisation.stencils_change or not discretisation.update_stencils(x, displacement, ahead):
-            return
-        layout = self.points
-        n, n_local = layout.n_owned, layout.n_local
+        if self.contact is not None:
+            self.contact.update(x, displacement)
+
+    def _follow_ghosts(self) -> None:
+        """Resize all arrays to the layout's present ghosts; collective."""
         same = self._xh is self.x
         self.state.resize()
-        self._xh = self.x if same else resized(self._xh, n, n_local)
-        self._xs, self._vs = resized(self._xs, n, n_local), resized(self._vs, n, n_local)
-        for values in (self._xh, self._xs, self._vs):
-            layout.update_ghosts(values)
+        self._xh = self.x if same else self.points.extended(self._xh)
+        self._xs, self._vs = self.points.extended(self._xs), self.points.extended(self._vs)
         self.__dict__.pop("_vertex_rows", None)
         self.prescribed.resize()
 
@@ -541,8 +653,10 @@ class StageEquations:
         yield self._with_square("inertia", self.mass[:, None] * vdot)
         del vdot
         constraints = self.present(self.active.constraints)
-        for name, slips in (("springs", False), ("friction", True)):
-            if terms := [term for term in constraints if term.slips is slips]:
+        friction = [term for term in constraints if term.registration.of_contact]
+        springs = [term for term in constraints if term not in friction]
+        for name, terms in (("springs", springs), ("friction", friction)):
+            if terms:
                 yield self._with_square(name, self._sum(terms, x))
         yield self._with_square("loads", -self.applied.force_at(x))
         if self.damping.active:
@@ -560,8 +674,8 @@ class StageEquations:
 
     def present(self, terms: Sequence[Energy]) -> list[Energy]:
         """Those of ``terms`` that have elements on any rank: all while something is near."""
-        near = self.discretisation.has_near_elements
-        return [term for term in terms if near or not term.registration.neighbours]
+        near = self.near
+        return [term for term in terms if near or not term.registration.of_contact]
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
         return self.active.gradient(terms, at, self.points)
@@ -603,65 +717,42 @@ class StageEquations:
 
         The list is empty without such elements.
         """
-        near = self.active.changing
-        if not near:
+        if self.contact is None:
             return []
-        acting = [np.count_nonzero(mask[: t.n_owned]) for t, mask in self.acting_elements(self._xs).items()]
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
-        fixed, every, *numbers = self.points.global_sum(
-            *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
-        ).astype(np.int64)
-        pairs = [
-            f"{t.name} {acts} of {known}"
-            for t, acts, known in zip(near, numbers, numbers[len(near) :], strict=False)
-        ]
-        return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
-
-    def acting_elements(self, x: Array) -> dict[Elastic, NDArray[np.bool_]]:
-        """Which elements of each term with changing stencils act at positions x (n_local, 3)."""
-        frozen = self.active.frozen
-        return {term: term.active_elements(x, frozen.get(term)) for term in self.active.changing}
+        numbers = self.points.global_sum(*(pattern.n_couplings for pattern in patterns))
+        fixed, every = numbers.astype(np.int64)
+        pairs = self.contact.summary(self._xs, self.active.frozen)
+        return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({pairs})"]
 
     def update_pattern(self) -> bool:
         """Update the pattern of the block rows to the pairs that act at the positions last evaluated.
 
         Returns whether the pattern changed; collective.
         """
-        if not self.discretisation.has_near_elements:
-            self.has_active_pairs = False
-            return self.discretisation.update_pattern({})
-        acting = self.acting_elements(self._xs)
+        acting = self.contact.acting(self._xs, self.active.frozen) if self.contact and self.near else {}
         if acting:
             number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
             self.has_active_pairs = any(self.points.global_max(number))
+        else:
+            self.has_active_pairs = False
         return self.discretisation.update_pattern(acting)
 
     @property
     def has_friction_pairs(self) -> bool:
-        """Whether there are friction pairs: one linear solve cannot decide whether they stick or slide.
-
-        Collective.
-        """
-        if not self.discretisation.has_near_elements:
-            return False
-        return any(self.points.global_max(sum(term.n_friction_pairs for term in self.active.changing)))
+        """Whether there are friction pairs; collective."""
+        return self.contact is not None and self.contact.has_friction_pairs
 
     def follow_contacts(self, v: Array) -> bool:
         """Give friction the contacts at velocities v (n_owned, 3) that solve the stage, where these differ
         notably from those of its equations; returns whether they do; collective.
         """
-        if not (self.integrator.dynamic and self.discretisation.has_near_elements):
+        if not self.near or not self.integrator.dynamic or self.solving_edges:
             return False
-        terms = [term for term in self.active.changing if term.slips]
-        if not terms or self.solving_edges:
-            return False
+        assert self.contact is not None
         x, _ = self.evaluate_at(v)
-        sums = [term.changed_contacts(x, self.x, self.active.frozen[term]) for term in terms]
-        change, total = self.points.global_sum(*np.sum(sums, axis=0)).tolist()
-        if change <= FOLLOWED * total:
+        if not self.contact.follow(x, self.x, self.active.frozen):
             return False
-        for term in terms:
-            term.take_contacts()
         self.objective.forget()
         self.evaluate_at(v)
         return True

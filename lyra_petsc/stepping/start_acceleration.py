@@ -81,13 +81,7 @@ class StartAcceleration:
         if turns:
             active.move_targets(UpcomingStep(system.t0, system.t1, at, x, system.reference.at))
         acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
-        if system.discretisation.has_near_elements:
-            from lyra_petsc.stepping import impacts  # needed only if something is near
-
-            for term in active.changing:
-                if term.slips:
-                    acceleration = impacts.hold_by_friction(system, term, v, acceleration)
-        return acceleration
+        return system.held_by_friction(v, acceleration)
 
     def _balance_moments(self, v: Array) -> None:
         """Set the rates of free directors, in v (n_local, 3) and in the state; collective.

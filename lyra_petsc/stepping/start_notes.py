@@ -10,6 +10,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.scene.schema import Keyframe, Scene
 from lyra_petsc.scene.values import AXES
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -70,8 +71,6 @@ def nothing_holds(
     loads = [entry for entry in terms if entry.role is Role.LOAD and entry.name not in on_edges]
     if not scene.time.static or scene.contact is not None or not loads:
         return []
-    from lyra_petsc.mesh.patches import connected_pieces  # with kernels; needed in statics only
-
     piece = np.empty(mesh.n_vertices, dtype=np.int64)
     piece[mesh.triangles] = np.unique(connected_pieces(mesh.triangles), return_inverse=True)[1][:, None]
     force: Array = np.zeros((mesh.n_vertices, 3))

@@ -147,7 +147,7 @@ class Stepper:
             static=static,
             newton=self._iterates,
             iterations=0.0 if static else expected_iterations(system, step),
-            contact=system.discretisation.limits_motion,
+            contact=system.contact is not None,
         )
 
     @property
@@ -217,12 +217,16 @@ class Stepper:
         self._trace = Trace(snes, system, lambda: newton.linear_iterations)
         if system.discretisation.stencils_change or (system.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
-        if PETSc.Options().getBool("contact_monitor", False) and system.discretisation.limits_motion:
-            from lyra_petsc.stepping.newton.contact_monitor import (
-                ContactMonitor,  # needed with the option only
-            )
+        if PETSc.Options().getBool("contact_monitor", False) and system.contact is not None:
+            from lyra_petsc.contact.contact_monitor import ContactMonitor  # needed with the option only
 
-            snes.setMonitor(ContactMonitor(system, lambda: newton.step_fraction))
+            snes.setMonitor(
+                ContactMonitor(
+                    system.contact,
+                    lambda v: (system.evaluate_at(v)[0], system.active.frozen),
+                    lambda: newton.step_fraction,
+                )
+            )
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
@@ -319,7 +323,7 @@ class Stepper:
         before = system.x[: self._shape[0]].copy() if system.solves_edges_at_end else None
         rate_before = system.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        if system.discretisation.limits_motion and not system.collisions.find_start():
+        if not system.find_start():
             self._trace.begin_solve()
             failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
@@ -330,11 +334,7 @@ class Stepper:
                 break
             newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
             velocity, message = self._solve(t0, velocity)
-        if (
-            velocity is not None
-            and system.discretisation.limits_motion
-            and not system.collisions.end_is_free(velocity)
-        ):
+        if velocity is not None and not system.end_is_free(velocity):
             velocity, message = None, WOULD_CROSS
         newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
         outcome = self._newton.convergence
@@ -419,7 +419,7 @@ class Stepper:
         self.ts.setTimeStep(length)
         self._newton.begin_solve()
         if not self._iterates and not is_set("ksp_rtol"):
-            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if system.discretisation.has_near_elements else ONCE)
+            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if system.near else ONCE)
         self._trace.begin_solve()
         try:
             self.ts.step()

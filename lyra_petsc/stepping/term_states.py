@@ -79,7 +79,9 @@ def restore_fixed(
 
 def obstacle_places(system: StageEquations) -> dict[str, tuple[int, int]]:
     """Number of each obstacle in `element_arrays`, and of its first point, by name."""
-    return {name: place for term in system.active.changing for name, place in term.obstacle_places.items()}
+    if system.contact is None:
+        return {}
+    return system.contact.barrier.obstacles.places
 
 
 def restore_changing(
@@ -91,12 +93,10 @@ def restore_changing(
 
     ``places`` are the `obstacle_places` of the checkpoint.
     """
-    layout = system.points
-    for term in system.active.changing:
-        if term.name in elements:
-            own = range(layout.start, layout.start + layout.n_owned)
-            term.restore_elements(*_send_to_owners(system, *elements[term.name]), own, places)
-            term.initialise_pairs(system.x, system.active.frozen[term])
+    friction = None if system.contact is None else system.contact.friction
+    if friction is not None and friction.name in elements:
+        friction.restore_pairs(*_send_to_owners(system, *elements[friction.name]), places)
+        friction.initialise_pairs(system.x, system.active.frozen[friction])
 
 
 def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:

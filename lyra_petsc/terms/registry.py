@@ -57,8 +57,8 @@ class Registration:
         Whether stiffness-proportional damping acts through the term.
     bends : bool
         Whether the term resists bending; without such a term sheets wrinkle as finely as their mesh.
-    neighbours : bool
-        Whether stencils change as points come near each other.
+    of_contact : bool
+        Whether its elements are near pairs, which change: contact and its friction.
     coarse : str
         Name of the term that replaces this one on coarse levels of multigrid, which have no edge unknowns.
         This term's module then has ``coarse_elements(rest)``, the elements of that term.
@@ -73,7 +73,7 @@ class Registration:
     columns: Mapping[str, str] = field(default_factory=dict)
     damped: bool = False
     bends: bool = False
-    neighbours: bool = False
+    of_contact: bool = False
     coarse: str = ""
     module_name: str = ""
 
@@ -147,7 +147,7 @@ REGISTRY: list[Registration] = [
         Role.ELASTIC,
         "contact_energy",
         {"contacts": "sum", "smallest_gap": "min", "friction_work": "sum"},
-        neighbours=True,
+        of_contact=True,
         module_name="lyra_petsc.contact.barrier",
     ),
     Registration(
@@ -155,7 +155,7 @@ REGISTRY: list[Registration] = [
         _has_contact_friction,
         Role.CONSTRAINT,
         columns={"friction_work": "sum"},
-        neighbours=True,
+        of_contact=True,
         module_name="lyra_petsc.contact.friction",
     ),
     Registration(

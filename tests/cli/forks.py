@@ -32,7 +32,7 @@ EARLY = (
     *("h5py", "ruamel.yaml", "lyra_petsc.cli.app", "lyra_petsc.cli.progress", "lyra_petsc.scene.load"),
     *("lyra_petsc.scene.dump", "lyra_petsc.scene.json_schema", "lyra_petsc.mesh.build"),
     *("lyra_petsc.mesh.obj_file", "lyra_petsc.mesh.msh_file", "lyra_petsc.mesh.library_file"),
-    *("lyra_petsc.mesh.near", "lyra_petsc.kernels.scatter", "lyra_petsc.terms.membrane"),
+    *("lyra_petsc.kernels.scatter", "lyra_petsc.terms.membrane"),
     *("lyra_petsc.terms.bending.hinge_forces", "lyra_petsc.terms.bending.hinge_rows"),
     *("lyra_petsc.terms.handles.prescribed_handles", "lyra_petsc.linear.block_product"),
     *("lyra_petsc.linear.block_rows", "lyra_petsc.linear.gauss_seidel", "lyra_petsc.linear.edge_couplings"),

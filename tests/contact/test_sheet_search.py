@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
+from lyra_petsc.contact.near import near_pairs as near_patches
 from lyra_petsc.contact.sheet_search import SheetSearch
-from lyra_petsc.mesh.near import near_pairs as near_patches
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

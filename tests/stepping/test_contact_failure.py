@@ -8,8 +8,8 @@ import pytest
 from mpi4py import MPI
 from physics import grid, scene_of
 
+from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.failure.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel(2)
@@ -233,7 +233,8 @@ def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm)
         simulation = SteppedScene(comm, scene_of(scene | {"obstacles": obstacles}))
         simulation.step()
         system = simulation.problem.system
-        nearest, obstacle = worst_pair(system), nearest_obstacle(system)
+        x, frozen = system.evaluated[0], system.active.frozen[system.contact.barrier]
+        nearest, obstacle = (find(system.contact, x, frozen) for find in (blocking_pair, nearest_obstacle))
         assert nearest is not None
         assert not nearest.obstacle
         assert (None if obstacle is None else obstacle.obstacle) == name

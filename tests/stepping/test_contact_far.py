@@ -48,14 +48,14 @@ def test_one_search_serves_several_steps(
     """If vertices move by more than the gap, gravity bends their paths, and forces are evaluated within the
     step: searches look 1, 2, 3, 4, 4, … steps ahead.
     """
-    searches, search = 0, ContactBarrier.neighbours
+    searches, search = 0, ContactBarrier.near_pairs
 
     def counted(*given: Any) -> Any:
         nonlocal searches
         searches += 1
         return search(*given)
 
-    monkeypatch.setattr(ContactBarrier, "neighbours", counted)
+    monkeypatch.setattr(ContactBarrier, "near_pairs", counted)
     thrown = {"handles": [], "initial": {"velocity": [0.0, 0.0, -6.0]}}
     simulation = SteppedScene(comm, scene_of(SCENE | FAR | thrown | timed(integrator)))
     searches = 0
@@ -80,14 +80,14 @@ def test_damping_is_a_multiple_of_the_stiffness_until_something_is_near() -> Non
         values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         system.damping.freeze(system.x, system.active.frozen)
         assert system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
-        assert not system.discretisation.has_near_elements
+        assert not system.near
     floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
     with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
         values = system.discretisation.rows.zeros()
         system.damping.freeze(system.x, system.active.frozen)
         assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
-        assert system.discretisation.has_near_elements
+        assert system.near
 
 
 @pytest.mark.parallel

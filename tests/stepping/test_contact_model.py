@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import direct_solver, gathered, grid, scene_of
 
-from lyra_petsc.stepping.newton.contact_model import ContactModel
+from lyra_petsc.contact.contact_model import ContactModel
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]

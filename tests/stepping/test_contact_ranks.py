@@ -23,8 +23,8 @@ from physics import (
 
 from lyra_petsc.contact import barrier as contact_barrier
 from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.contact_model import ContactModel
 from lyra_petsc.stepping.energy_balance import EnergyBalance
-from lyra_petsc.stepping.newton.contact_model import springs_along
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
@@ -262,7 +262,7 @@ def test_collisions_are_expected_if_parts_are_near_and_approach_fast(comm: MPI.C
         def collides(first: float, second: float) -> bool:
             system.state.set(system.x[:n], np.where(lower, first, second) * [0.0, 0.0, 1.0])
             system.begin_step(0.0, 0.004)
-            return system.collisions.may_collide(0.05)
+            return system.may_collide(0.05)
 
         assert collides(-15.0, -15.0)
         assert not collides(-11.0, -11.0)
@@ -273,40 +273,40 @@ def test_collisions_are_expected_if_parts_are_near_and_approach_fast(comm: MPI.C
 def test_points_as_far_from_the_end_of_a_displacement_as_allowed_are_near_its_start() -> None:
     with Simulation(falling(0.02), MPI.COMM_SELF) as simulation:
         contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, x = simulation.problem.discretisation, simulation.problem.system.x + 1.0
+        known, x = simulation.problem.system.contact.search, simulation.problem.system.x + 1.0
         reach = 0.5 * contact.approach_limit
         x_way = np.zeros_like(x)
         x_way[:, 0] = 1.0
-        known.update_stencils(x, 0.3 * reach * x_way)
+        known.update(x, 0.3 * reach * x_way)
         back = x - 0.69 * reach * x_way
-        assert known.searched_fraction(back, -0.1 * reach * x_way) == 1.0
-        assert known.searched_fraction(back, -reach * x_way) == pytest.approx(0.31)
-        assert known.searched_fraction(x, reach * x_way) == 1.0
-        assert known.searched_fraction(x, 2.0 * reach * x_way) == pytest.approx(0.65)
+        assert known.fraction_covered(back, -0.1 * reach * x_way) == 1.0
+        assert known.fraction_covered(back, -reach * x_way) == pytest.approx(0.31)
+        assert known.fraction_covered(x, reach * x_way) == 1.0
+        assert known.fraction_covered(x, 2.0 * reach * x_way) == pytest.approx(0.65)
 
 
 @pytest.mark.parallel
 def test_searches_look_ahead_where_the_step_is_expected_to_lead(comm: MPI.Comm) -> None:
     with Simulation(falling(0.02), comm) as simulation:
         contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, near = simulation.problem.discretisation, simulation.problem.system.x
-        assert known.has_near_elements
+        known, near = simulation.problem.system.contact.search, simulation.problem.system.x
+        assert known.near
         step = np.full_like(near, -3.0 * contact.approach_limit)
         x = near - 5.0 * step
-        known.update_stencils(x)
-        assert not known.has_near_elements
-        known.update_stencils(x, step, lambda steps: -steps * step)  # a wrong guess
-        assert known.searched_fraction(x, step) == 1.0
-        assert known.searched_fraction(x, -step) < 0.2
+        known.update(x)
+        assert not known.near
+        known.update(x, step, lambda steps: -steps * step)  # a wrong guess
+        assert known.fraction_covered(x, step) == 1.0
+        assert known.fraction_covered(x, -step) < 0.2
         x = x + step
-        known.update_stencils(x, step, lambda steps: steps * step)
-        assert known.searched_fraction(x, 2.0 * step) == 1.0
-        assert known.searched_fraction(x, 3.0 * step) < 1.0
+        known.update(x, step, lambda steps: steps * step)
+        assert known.fraction_covered(x, 2.0 * step) == 1.0
+        assert known.fraction_covered(x, 3.0 * step) < 1.0
         x = x + 2.0 * step
-        known.update_stencils(x, step, lambda steps: steps * step)  # to the floor
-        assert not known.has_near_elements
-        assert known.searched_fraction(x, step) == 1.0
-        assert known.searched_fraction(x, 2.0 * step) < 1.0
+        known.update(x, step, lambda steps: steps * step)  # to the floor
+        assert not known.near
+        assert known.fraction_covered(x, step) == 1.0
+        assert known.fraction_covered(x, 2.0 * step) < 1.0
 
 
 def test_only_the_start_of_increments_through_many_parts_is_searched(
@@ -317,12 +317,12 @@ def test_only_the_start_of_increments_through_many_parts_is_searched(
     layers = [grid(0.3, 0.3, 8, 8) | {"transform": {"translate": [0.0, 0.0, 0.02 * n]}} for n in range(12)]
     with Simulation({"mesh": layers, "contact": {"gap": 1e-3}}, comm) as simulation:
         barrier = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, x = simulation.problem.discretisation, simulation.problem.system.x
+        known, x = simulation.problem.system.contact.search, simulation.problem.system.x
         numbers = simulation.problem.points.global_number[: len(x)]
         results = np.random.default_rng(1).uniform(-0.3, 0.3, (12 * 81, 3))[numbers]
-        known.update_stencils(x, results)
+        known.update(x, results)
         assert 0 < barrier.n_elements < 200 * len(x)
-        assert 0.01 < known.searched_fraction(x, results) < 0.5
+        assert 0.01 < known.fraction_covered(x, results) < 0.5
 
 
 @pytest.mark.parallel(alone=False)
@@ -369,8 +369,8 @@ def test_springs_of_parts_at_rest_do_not_depend_on_the_ranks(comm: MPI.Comm) -> 
             system.begin_step(0.0, 0.01)
             increment = np.zeros((points.n_owned, 3))
             increment[points.mesh_vertices >= 8, 2] = gap / system.stage.c
-            springs = springs_along(system, system.stationary_velocity(), increment)
-            numbers.append(points.global_sum(*[float(each.counted.sum()) for each in springs.values()])[0])
+            springs = ContactModel(*system.contact_at(system.stationary_velocity())).springs_along(increment)
+            numbers.append(points.global_sum(float(springs.counted.sum()))[0])
     assert numbers[1] == numbers[0] > 0.0
 
 

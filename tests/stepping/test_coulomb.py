@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import CLOTH, grid, obj_file, scene_of
 
-from lyra_petsc.stepping import impacts
+from lyra_petsc.contact import impacts
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from physics import CLOTH, direct_solver, gathered, grid, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.failure.failure_diagnosis import describe_worst
+from lyra_petsc.mesh.points import describe_worst
 from lyra_petsc.stepping.failure.failure_report import Failure
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics import equilibrium

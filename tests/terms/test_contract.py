@@ -36,7 +36,7 @@ pytestmark = pytest.mark.quick
 ANCHORED = {"clamp", "spring"}
 
 #: all but terms with changing stencils, which have no elements at rest (test_contact_pairs.py and others)
-FIXED = [entry for entry in REGISTRY if not entry.neighbours]
+FIXED = [entry for entry in REGISTRY if not entry.of_contact]
 
 #: step of finite differences [m], small where the force of friction has a kink: in shear after 0.1°
 STEPS = {"shear_friction": 3e-6}

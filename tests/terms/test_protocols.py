@@ -43,14 +43,13 @@ from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
-IDENTITY = {"name", "needed", "role", "module_name"}
+IDENTITY = {"name", "needed", "role", "module_name", "of_contact"}
 
 FLAGS: dict[str, Any] = {
     "energy": "idle_energy",
     "columns": {"idle_number": "max"},
     "damped": True,
     "bends": True,
-    "neighbours": True,
     "coarse": "bending",
 }
 """A value of each property of a registration besides those by which a term is found."""
@@ -64,7 +63,7 @@ COLUMNS = {"energy": {"idle_energy": 0.0}, "columns": {"idle_number": 7.0}}
 
 def having(interface: type[Elastic]) -> Any:
     """Parametrises a test with the registered terms that have an interface and fixed stencils."""
-    names = [entry.name for entry in REGISTRY if not entry.neighbours and issubclass(entry.kind, interface)]
+    names = [entry.name for entry in REGISTRY if not entry.of_contact and issubclass(entry.kind, interface)]
     return pytest.mark.parametrize("name", names)
 
 
@@ -196,10 +195,6 @@ class Idle(Elastic):
         self.calls.add("history")
         return {"idle_number": 7.0}
 
-    def neighbours(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
-        self.calls.add("neighbours")
-        return np.empty((0, 2), dtype=np.int64), np.empty((0, 0), dtype=np.int64)
-
 
 class IdleTargets(Idle, MovingTargets):
     """The same with targets that stay."""
@@ -264,7 +259,7 @@ INTERFACES: dict[str, tuple[type[Idle], set[str]]] = {
 }
 """A term with each interface, and the methods that the program must call with every integrator."""
 
-METHODS = {"columns": {"history"}, "neighbours": {"neighbours"}}
+METHODS = {"columns": {"history"}}
 """The same for properties."""
 
 
@@ -287,14 +282,9 @@ class IdleRegistration(Registration):
 
     def _make(self, elements: Elements | None, scene: Scene, mass: Array) -> Idle:
         nothing = Elements(np.empty((0, 2), dtype=np.int32))
-        term = self.kind(nothing if elements is None else elements, len(mass))
-        if self.neighbours:
-            term.search_distance, term.skin = 0.01, 0.005
-        return term
+        return self.kind(nothing if elements is None else elements, len(mass))
 
-    def _elements(self, rest: RestShape) -> Elements | None:
-        if self.neighbours:
-            return None
+    def _elements(self, rest: RestShape) -> Elements:
         triangles = rest.mesh.triangles.astype(np.int64)
         damping = {"damping": np.full(len(triangles), 0.01)} if self.damped else {}
         edges = edge_numbers(rest, rest.mesh.triangles)[0] if self.flag == "Stateful" else None

@@ -34,8 +34,8 @@ from lyra_petsc.experiments.fit.estimate import (
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
 from lyra_petsc.experiments.fit.readings import HangingAngle, Reading, readings_of, readings_without_values
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.mesh.patches import connected_pieces
 from lyra_petsc.mesh.select import select_triangles
+from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose_folder, existing_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene

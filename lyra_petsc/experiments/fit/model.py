@@ -99,7 +99,7 @@ class Model:
         shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
         entries = needed_terms(scene, shells)
         self._needs_differences = any(
-            entry.neighbours or issubclass(entry.kind, Dissipates) for entry in entries
+            entry.of_contact or issubclass(entry.kind, Dissipates) for entry in entries
         )
 
         def check_vertices() -> None:

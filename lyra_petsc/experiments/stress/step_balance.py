@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -40,6 +40,9 @@ from lyra_petsc.terms.bending.midedge import MidEdge
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.protocols import MovingTargets
 from lyra_petsc.terms.term import Elastic, UpcomingStep
+
+if TYPE_CHECKING:
+    from lyra_petsc.contact.barrier import ContactBarrier
 
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
@@ -93,7 +96,7 @@ def force_work(
     from scipy.integrate import fixed_quad, quad_vec
 
     membrane: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
-    contact = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
+    contact = {term: frozen for term, frozen in terms.items() if term.registration.of_contact}
     hinges = {term: frozen for term, frozen in terms.items() if term not in membrane and term not in contact}
 
     def power(part: Terms, s: float) -> float:
@@ -120,7 +123,10 @@ def force_work(
     value, by_energies = float(along_membrane), False
     turn = math.inf if start_frames else _largest_turn(hinges, x0, dx)
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
-    largest_dx, skin = largest(comm, dx[:n]), min((term.skin for term in contact), default=0.0)
+    largest_dx, skin = (
+        largest(comm, dx[:n]),
+        min((cast("ContactBarrier", term).skin for term in contact), default=0.0),
+    )
     panels = max(CONTACT_PANELS, math.ceil(largest_dx / skin) if skin > 0.0 else 0)
     for part, refine, first in ((hinges, smooth, 1), (contact, True, panels)):
         if part:
@@ -211,7 +217,7 @@ class BalanceRecorder:
         self._sheet_terms = [term for term in system.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
         moving = [term for term in self._sheet_terms if term.moving]
-        self._turning = [term for term in moving if term.pushes or not self._identity]
+        self._turning = [term for term in moving if term.registration.of_contact or not self._identity]
         self.record_state()
 
     def record_state(self) -> None:
@@ -304,7 +310,10 @@ class BalanceRecorder:
         step = UpcomingStep(system.t0, system.t1, system.t0 + stage.offset, y, system.reference.at)
         frozen = dict(self._frozen(system.active.elastic))
         if stage.offset < dt:  # moving targets are at the end of the step by now
-            moved = (*system.active.moving, *(t for t in system.active.constraints if not t.slips))
+            moved = (
+                *system.active.moving,
+                *(t for t in system.active.constraints if not t.registration.of_contact),
+            )
             frozen |= {term: term.freeze(step) for term in moved}
         force, wind = np.zeros_like(x), np.zeros_like(x)
         for load in system.active.loads:
@@ -320,7 +329,7 @@ class BalanceRecorder:
         inner = {
             t: data
             for t, data in sheet.items()
-            if not (isinstance(t, MovingTargets) or t.registration.neighbours)
+            if not (isinstance(t, MovingTargets) or t.registration.of_contact)
         }
         parts = {
             "inertia": system.mass[:, None] * rate,

@@ -7,24 +7,17 @@ result does not depend on the number of ranks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.mesh.points import Layout
+from lyra_petsc.arrays import Array
+from lyra_petsc.mesh.points import Layout, describe_worst
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 
-Result = TypeVar("Result")
-
 SNES = PETSc.SNES.ConvergedReason
-
-TIE = 1e-6
-"""Relative difference up to which two residuals count as equally large."""
 
 
 @dataclass(frozen=True)
@@ -140,27 +133,3 @@ def _norms(rows: Array) -> Array:
     scale = np.where(usable, largest, 1.0)[..., None]
     sizes = scale[..., 0] * np.sqrt(np.sum(np.where(np.isfinite(rows), rows / scale, 0.0) ** 2, axis=-1))
     return np.where(np.isfinite(largest), sizes, np.inf)
-
-
-def describe_worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
-    """Describe the row with the largest size, among equals that with the smallest number; collective.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    sizes : (n,)
-        Sizes of this rank's rows; not NaN, may be infinite. At least one rank has a row.
-    numbers : (n,) int64
-        Numbers of the rows, unique over all ranks.
-    describe : callable
-        Returns the description of a row; called on the rank that has the row, and broadcast.
-    """
-    largest = comm.allreduce(float(sizes.max(initial=-np.inf)), MPI.MAX)
-    bad = np.flatnonzero(sizes >= largest * (1.0 - TIE)) if len(sizes) else np.empty(0, np.int64)
-    none = np.iinfo(np.int64).max
-    first = int(numbers[bad].min()) if len(bad) else none
-    number, rank = comm.allreduce((first, comm.rank), MPI.MIN)
-    mine = describe(int(bad[np.argmin(numbers[bad])])) if rank == comm.rank and number != none else None
-    result: Result | None = comm.bcast(mine, root=rank)
-    assert result is not None
-    return result

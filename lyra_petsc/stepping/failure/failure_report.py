@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lyra_petsc.mesh.mesh import Source
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure.failure_diagnosis import SNES, Diagnosis, diagnose
-from lyra_petsc.stepping.failure.near_pairs import NearPair, nearest_obstacle, worst_pair
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.stepping.stepper import Attempt, Stepper
+
+if TYPE_CHECKING:
+    from lyra_petsc.contact.nearest_pair import NearPair
 
 MAX_SHOWN = 8
 """Largest number of iterations, or of attempts, that the few lines show without abridging them."""
@@ -229,7 +231,13 @@ def explain_failure(
     """
     system = problem.system
     diagnosis = diagnose(problem.points, solve, system.x, problem.tags)
-    near = worst_pair(system)
+    near = obstacle = None
+    if (contact := system.contact) is not None:
+        from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
+
+        x, frozen = system.evaluated[0], system.active.frozen[contact.barrier]
+        near = blocking_pair(contact, x, frozen)
+        obstacle = nearest_obstacle(contact, x, frozen) if near is not None and not near.obstacle else None
     static, kind = not system.integrator.dynamic, diagnosis.kind
     shorter = (
         "a smaller time.step (first increment of the load), or a damped motion instead"
@@ -269,7 +277,7 @@ def explain_failure(
         sources=problem.whole.sources,
         failed_solve=solve,
         near=near,
-        obstacle=nearest_obstacle(system) if near is not None and not near.obstacle else None,
+        obstacle=obstacle,
     )
 
 

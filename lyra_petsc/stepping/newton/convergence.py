@@ -170,7 +170,7 @@ class Convergence:
 
     def _raise_floor(self) -> None:
         """Include the round-off of contact at the positions last evaluated in the floor; collective."""
-        if self._system.discretisation.has_near_elements:
+        if self._system.near:
             self._floor = max(self._minimum_floor, contact_roundoff(self._system))
 
     def _needs_finer_solve(self, tolerance: float) -> bool:
@@ -180,11 +180,11 @@ class Convergence:
         """
         system, was_good = self._system, self._met_tolerances
         self._met_tolerances = True
-        if was_good or not (system.discretisation.limits_motion and system.integrator.dynamic):
+        if was_good or not (system.contact is not None and system.integrator.dynamic):
             return False
         enough, part = self.force_tolerance(), FINER_IN_CONTACT
         coarse = self.norm > part * enough or self.remaining > part * tolerance
-        return coarse and system.collisions.may_impact
+        return coarse and system.may_impact
 
     def force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""

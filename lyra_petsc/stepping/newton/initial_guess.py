@@ -20,23 +20,23 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     """
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
-        out[:] = system.collisions.start_velocity()
+        out[:] = system.start_velocity()
         if not isinstance(integrator, Static) or integrator.predicted is None:
             return False
         guess = integrator.predicted / integrator.pseudo_dt
         system.prescribe(guess)
-        if system.discretisation.has_near_elements or not system.collisions.moves_freely(out, guess - out):
+        if system.near or not system.moves_freely(out, guess - out):
             return False
         out[:] = guess
         system.predicted_stress.take_state(system.x)
         return True
     moving = system.v[:n].copy()
     system.prescribe(moving)
-    still = system.collisions.start_velocity()
-    if system.collisions.limits_steps:
-        fraction = system.collisions.largest_step(still, moving - still)
+    still = system.start_velocity()
+    if system.limits_steps:
+        fraction = system.largest_step(still, moving - still)
         moving = moving if fraction == 1.0 else still + fraction * (moving - still)
-    if integrator.order > 1 and not system.discretisation.limits_motion:
+    if integrator.order > 1 and system.contact is None:
         out[:] = moving
         return False
     use_still = system.objective(still)[0] < system.objective(moving)[0]

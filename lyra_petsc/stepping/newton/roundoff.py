@@ -24,9 +24,10 @@ def contact_roundoff(system: StageEquations) -> float:
     """The same for contact at the positions last evaluated; its stiffness grows without bound; collective."""
     points, (x, _) = system.points, system.evaluated
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
-    for term in system.active.separating:
+    if system.contact is not None:
+        term = system.contact.barrier
         amount = term.stiffness(x, system.active.frozen[term]) * term.coordinate_scale(size)
-        scale += np.bincount(term.stencil.ravel(), np.repeat(amount, term.stencil.shape[1]), points.n_local)
+        scale += np.bincount(term.stencil.ravel(), np.repeat(amount, 4), points.n_local)
     return _norm(system, scale[: points.n_owned])
 
 

@@ -24,7 +24,6 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.newton.arcs import Arcs
-    from lyra_petsc.stepping.newton.contact_model import ContactModel
 
 
 SMALL_GAP = 0.005
@@ -104,12 +103,10 @@ class Newton:
         self._linear, self._blend, self._iterates = linear, blend, iterates
         self.convergence, self.globalisation = convergence, Globalisation(snes, system, convergence)
         self._shape = (system.points.n_owned, 3)
-        skin = min((term.skin for term in system.active.separating), default=np.inf)
-        self._contact: ContactModel | None = None
-        if iterates and skin < SMALL_GAP * convergence.spacing:
-            from lyra_petsc.stepping.newton.contact_model import ContactModel  # needed with small gaps only
-
-            self._contact = ContactModel(self._ksp, system, linear, follow)
+        self._follow, contact = follow, system.contact
+        self._models_contact = (
+            iterates and contact is not None and contact.skin < SMALL_GAP * convergence.spacing
+        )
         self._last_iterate: PETSc.Vec | None = None
         self._last_c = 0.0
         self._convex_at_start = False
@@ -123,7 +120,7 @@ class Newton:
             self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not system.integrator.dynamic
         self.forcing = Forcing(
-            self._ksp, fixed=fixed, cycles=linear.cycles, contact=system.discretisation.limits_motion
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=system.contact is not None
         )
 
     def begin_solve(self) -> None:
@@ -133,18 +130,18 @@ class Newton:
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
         approach = COLLISION * self.convergence.spacing
-        collides = self._iterates and self._system.collisions.may_collide(approach)
+        collides = self._iterates and self._system.may_collide(approach)
         self._linear.begin_solve()
         self._linear.shift.decrease()
         self.convergence.begin_solve()
         self.globalisation.begin_solve()
-        near = self._system.discretisation.has_near_elements
+        near = self._system.near
         self.forcing.begin_solve(near=near, collides=collides, buckles=not self._convex_at_start)
 
     @property
     def _corrects(self) -> bool:
         """Whether steps follow arcs and are corrected: in equilibria of shells, while no parts are near."""
-        return self._can_correct and not self._system.discretisation.has_near_elements
+        return self._can_correct and not self._system.near
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
@@ -201,13 +198,13 @@ class Newton:
             self.extra_iterations += self._ksp.getIterationNumber()
             changed = True
             failed = self._lacks_descent(residual, y)
-        if self._contact is not None and not failed:
+        if self._models_contact and not failed:
             changed |= self._apply_contact_model(x, residual, y)
         full = self.globalisation.takes_full_steps
         curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
         if self._system.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
-        if self._system.collisions.limits_steps and not curved:
+        if self._system.limits_steps and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if full and self._corrects:
@@ -233,18 +230,23 @@ class Newton:
 
     def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Replace a step y by that of `ContactModel`, which sees contacts along it; whether it changed."""
-        assert self._contact is not None
+        from lyra_petsc.contact.contact_model import ContactModel  # needed with small gaps only
+        from lyra_petsc.stepping.newton.repeated_solves import RepeatedSolves
+
         v = self._array(x)
 
-        def assemble() -> None:
-            self._linear.assemble(v, self._blend.value, keep=False, convex=self._convex)
+        def renew() -> None:
+            if self._follow():
+                self._linear.assemble(v, self._blend.value, keep=False, convex=self._convex)
 
         def ease() -> bool:
             self._linear.reassemble_operator(v, self._blend.value)
             return self._ease_linear_solve(v)
 
-        changed = self._contact.improve(v, residual, y, assemble, ease, self.forcing.effective_tolerance)
-        self.contact_iterations += self._contact.linear_iterations
+        solves = RepeatedSolves(self._ksp, self._system, self._linear, v, renew, ease)
+        model = ContactModel(*self._system.contact_at(v))
+        changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
+        self.contact_iterations += solves.iterations
         return changed
 
     def _apply_corrections(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
@@ -269,7 +271,7 @@ class Newton:
             if exact:
                 _apply_broyden(correction, steps)
             before, increment = size, -self._array(y) - self._array(correction)
-            if not self._system.collisions.moves_freely(v, increment):
+            if not self._system.moves_freely(v, increment):
                 break
             size, force = self._residual(v + increment)
             if not size < MAX_REMAINING * before:
@@ -301,11 +303,11 @@ class Newton:
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
-        lowest, start = np.inf, self._system.collisions.start_velocity()
+        lowest, start = np.inf, self._system.start_velocity()
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
             self._system.prescribe(end)
-            if not self._system.collisions.moves_freely(start, end - start):
+            if not self._system.moves_freely(start, end - start):
                 continue
             energy = self._system.objective(end)[0] if others else 0.0
             if energy < lowest:
@@ -335,7 +337,7 @@ class Newton:
         before = y.copy()
         curved, increment = self._arcs.curve(v, -self._array(y))
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and self._system.collisions.moves_freely(v, curved)
+        descends = bool(residual.dot(y) > 0.0) and self._system.moves_freely(v, curved)
         if descends:
             self._system.predicted_stress.take_uncorrected(self._system.evaluate_at(v + increment)[0])
             self.step_fraction = 1.0
@@ -369,15 +371,14 @@ class Newton:
         """
         system, v = self._system, self._array(x)
         shortened = self._limit_displacement(y)
-        collisions = system.collisions
-        fraction = collisions.largest_step(v, -self._array(y))
+        fraction = system.largest_step(v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
         correct = fraction < 1.0 or slow
-        separated = collisions.second_order_correction(v, -self._array(y)) if correct else None
+        separated = system.separated(v, -self._array(y)) if correct else None
         if separated is not None:
             before = y.copy()
             y.setArray(-separated.ravel())
-            farther = collisions.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
+            farther = system.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:
@@ -391,7 +392,7 @@ class Newton:
     def _limit_displacement(self, y: PETSc.Vec) -> bool:
         """Shorten a step y to `MAX_INCREMENT` in equilibria in contact; whether y changed."""
         system = self._system
-        if system.integrator.dynamic or not system.discretisation.has_near_elements:
+        if system.integrator.dynamic or not system.near:
             return False
         vertices = self._array(y)[: system.points.n_vertices]
         (largest,) = system.points.global_max(float(np.abs(vertices).max(initial=0.0)))

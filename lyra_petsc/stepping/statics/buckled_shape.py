@@ -117,8 +117,8 @@ class BuckledShape:
             largest = self._largest(change) / self._size
             if not largest < max(2.0 * before, 10.0 * step):
                 return None
-            if system.collisions.limits_steps:
-                change *= system.collisions.largest_step(np.zeros_like(change), change / system.stage.c)
+            if system.limits_steps:
+                change *= system.largest_step(np.zeros_like(change), change / system.stage.c)
             self._set_positions(system.x[:n] + change)
             if largest <= CONVERGED * step and abs(holding - last) <= CONVERGED * abs(holding):
                 return holding

@@ -136,7 +136,7 @@ class Equilibrium:
             self._integrator,
             spacing,
             leaps=not system.active.viscous,
-            contact=system.discretisation.limits_motion,
+            contact=system.contact is not None,
             factors=stepper.linear.factors,
         )
         self._extrapolation = Extrapolation(system.points.comm)
@@ -146,7 +146,7 @@ class Equilibrium:
         force = system.out_of_balance()
         self._scale = self._norm(force)
         # if the sheet slides, forces that hold its start shape would push it along
-        held = not system.discretisation.has_near_elements
+        held = not system.near
         if held and self._scale > floor and not self._unstable():
             system.applied.unbalanced = -force
 
@@ -199,7 +199,7 @@ class Equilibrium:
         system.applied.factor = factor
         newton = linear = solves = resumed = 0
         moving_energy, last, solved_once = 0.0, np.inf, False
-        contact = system.discretisation.limits_motion
+        contact = system.contact is not None
         judges_energy = contact and self._is_held()
         contacts = system.active.contact_state()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
@@ -309,7 +309,7 @@ class Equilibrium:
         moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
         (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
         rate = self._load_rate
-        if system.discretisation.has_near_elements:
+        if system.near:
             self._tangent = None  # the first guess is another
             return 0
         if largest > 0.0:
@@ -356,14 +356,15 @@ class Equilibrium:
     def _is_held(self) -> bool:
         """Whether handles hold vertices, and loads have a potential: it is then bounded below; collective."""
         system = self._system
-        springs = any(not term.slips for term in system.active.constraints)
+        springs = any(not term.registration.of_contact for term in system.active.constraints)
         holds = springs or len(system.prescribed.indices) > 0
         return not self._follows and any(system.points.global_max(float(holds)))
 
     def _potential_energy(self, start: Array) -> float:
         """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
         system, frozen = self._system, self._system.active.frozen
-        terms = [term for term in system.active.elastic if not term.slips]
+        friction = None if system.contact is None else system.contact.friction
+        terms = [term for term in system.active.elastic if term is not friction]
         energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
         energy -= float(np.vdot(system.applied.force, system.x[: len(start)] - start))
         return float(system.points.global_sum(energy)[0])

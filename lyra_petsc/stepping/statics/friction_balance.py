@@ -40,7 +40,7 @@ class FrictionBalance:
 
     def __init__(self, system: StageEquations, spacing: float) -> None:
         self._system, self._spacing = system, spacing
-        self._acts = any(term.slips for term in system.active.changing)
+        self._acts = system.contact is not None and system.contact.friction is not None
         self.lag = 0.0
         self._rounds = self._sliding_steps = 0
         self._sliding_increment = 0.0  # the last increment of the load factor in which all slid
@@ -54,7 +54,7 @@ class FrictionBalance:
 
         Friction may have been far from what the normal forces allow.
         """
-        if not (self._acts and self._system.discretisation.has_near_elements):
+        if not (self._acts and self._system.near):
             return False
         x, points = self._system.x, self._system.points
         displacement = x.copy()

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask
-from lyra_petsc.mesh.patches import connected_components
 from lyra_petsc.mesh.points import Layout
+from lyra_petsc.mesh.topology import connected_components
 
 PREVENTED = 1e-10
 """Mean square displacement of prescribed unknowns, relative to that of the piece, above which a motion is

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.contact.near import near_pairs
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.mesh.near import near_pairs
-from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.mesh.topology import connected_components, edge_table
 
 MAX_TRIANGLES = 24
 """Triangles in a patch, at most."""
@@ -49,16 +49,6 @@ def split_into_patches(centres: Array, piece: Ints | None = None) -> Ints:
         patch[order] = 2 * patch[order] + (upper & np.repeat(sizes > MAX_TRIANGLES, sizes))
         patch = np.unique(patch, return_inverse=True)[1]
     return patch.astype(np.int64)
-
-
-def connected_pieces(triangles: Ints, patch: Ints | None = None) -> Ints:
-    """Number of the piece (F,) of each triangle (F, 3): triangles of a patch connected by vertices."""
-    node = triangles
-    if patch is not None:
-        patch_corners = np.column_stack([np.repeat(patch, 3), triangles.ravel()])
-        node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    links = np.concatenate([node[:, :2], node[:, 1:]])
-    return connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
 
 
 class FlatPatches(NamedTuple):
@@ -177,18 +167,6 @@ def _add_second_neighbours(pairs: Ints, boxes: tuple[Array, Array], radius: floa
     others = np.concatenate([pairs[:, 0], between[first]])
     order = np.lexsort(every.T[::-1])
     return every[order], others[order]
-
-
-def connected_components(n: int, pairs: Ints) -> Ints:
-    """Lowest number (n,) of the component of each of n nodes that are connected by pairs (m, 2)."""
-    component: Ints = np.arange(n)
-    while len(pairs):
-        low, high = np.sort(component[pairs], axis=1).T
-        np.minimum.at(component, high, low)  # joins whole components, as these are their lowest numbers
-        while not np.array_equal(component, shorter := component[component]):
-            component = shorter
-        pairs = pairs[component[pairs[:, 0]] != component[pairs[:, 1]]]
-    return component
 
 
 def _cross_interior(a: Array, b: Array, low: Array, high: Array) -> Mask:

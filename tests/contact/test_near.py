@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.mesh.near import near_pairs, near_pairs_by_tree, swept_boxes
+from lyra_petsc.contact.near import near_pairs, near_pairs_by_tree, swept_boxes
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,

@@ -1,0 +1,315 @@
+"""Impulses on velocities at the end of a step with contact: dashpots, and friction by the normal forces of
+the step.
+
+**Impacts.** A barrier stores the energy of an impact and would return it as a bounce. Dashpots of critical
+damping of barrier and mass damp the rates of change of the distances in contact, along the lines
+between the nearest points. Parts that lie, slide or roll at a constant distance are not damped. A dashpot
+reduces the normal force of a step at most to 0: contact never pulls.
+
+**Friction.** The equations of a step have normal forces from before the solve. Its own normal force N,
+dashpots included, is known at its end, where the friction f of each pair becomes that of Coulomb's law: with
+the friction f_0 in the equations, the relative tangential velocity v_t and the mass m of the pair,
+
+    f = projection of f_0 − m v_t / Δt on the disc |f| ≤ μ N,
+
+which stops the pair if it can, and else opposes the motion (the proximal form of Coulomb's law; Jean,
+Computer Methods in Applied Mechanics and Engineering 177 (1999) 235-257).
+
+Functions with a `StepEnd` are collective.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.contact.barrier import ContactBarrier, Contacts
+from lyra_petsc.contact.friction import CoulombFriction, EndFriction, ObstacleMotion
+from lyra_petsc.contact.obstacle_points import ObstaclePositions
+from lyra_petsc.mesh.points import Layout
+
+END = 1e-3
+"""Last part of a step of second order by whose motion the velocities of obstacles at its end are measured."""
+
+MAX_SWEEPS, SETTLED = 30, 1e-7
+"""Largest number of sweeps over the friction at the start or the end of a step, and change of it in a sweep
+over the largest one below which they end."""
+
+
+class StepEnd(NamedTuple):
+    """The end of a step, or with ``v`` alone its start.
+
+    Attributes
+    ----------
+    layout : Layout
+    mass : (n_owned,)
+        Of each row [kg].
+    free : (n_owned, 3)
+        Unknowns that are not prescribed.
+    held : (m,)
+        Prescribed unknowns, in flattened owned rows.
+    x, v : (n_local, 3)
+        Positions [m] and velocities [m/s], ghosts up to date.
+    start, end : float
+        Times [s].
+    order : int
+        Of the integrator.
+    """
+
+    layout: Layout
+    mass: Array
+    free: Mask
+    held: Ints
+    x: Array
+    v: Array
+    start: float
+    end: float
+    order: int
+
+    @property
+    def dt(self) -> float:
+        """Length of the step [s]."""
+        return self.end - self.start
+
+    @property
+    def last_times(self) -> tuple[float, float]:
+        """Times [s] between which the mean velocity of obstacles is comparable with velocities after the
+        step, which are means of the step under backward Euler.
+        """
+        return self.end - (END if self.order > 1 else 1.0) * self.dt, self.end
+
+    def accelerations(self, force: Array) -> Array:
+        """Forces (n_local, 3) [N], or impulses, over the masses of free unknowns, (n_owned, 3).
+
+        ``force`` gets the sums over ranks in its owned rows.
+        """
+        self.layout.add_to_owners(force)
+        own, mass = force[: self.layout.n_owned], self.mass[:, None]
+        return np.divide(own, mass, out=np.zeros_like(own), where=self.free & (mass > 0.0))
+
+    def handle_force(self, impulse: Array) -> Array:
+        """Mean reaction forces (m,) [N] of handles by impulses [N s], whose owned rows come first."""
+        return -impulse.take(self.held) / self.dt
+
+
+class ContactImpulses(NamedTuple):
+    """Effects of the impulses at the end of a step, on this rank.
+
+    Attributes
+    ----------
+    change : (n_owned, 3)
+        Of the velocities [m/s].
+    handle_force : (m,)
+        Mean reaction forces [N] of handles, at the prescribed unknowns.
+    work, heat : float
+        Work of the obstacles by the impulses, and energy that became heat [J].
+    obstacle, loads : (m,), (m, 8)
+        Numbers of obstacles, and loads on them as in `ContactBarrier.obstacle_forces`.
+    """
+
+    change: Array
+    handle_force: Array
+    work: float
+    heat: float
+    obstacle: Ints
+    loads: Array
+
+
+def end_step(
+    step: StepEnd,
+    barrier: ContactBarrier,
+    obstacles: ObstaclePositions,
+    friction: CoulombFriction | None,
+    motion: ObstacleMotion | None,
+) -> ContactImpulses:
+    """All impulses at the end of a step that something may touch in."""
+    contacts = barrier.contacts(step.x, step.v, obstacles, step.last_times)
+    damped, push = _damp(step, contacts)
+    if friction is None or motion is None:
+        return damped
+    damped_v = step.v + step.layout.extended(damped.change)
+    slid = _slide(step._replace(v=damped_v), friction, motion, contacts, contacts.force + push)
+    return ContactImpulses(
+        damped.change + slid.change,
+        damped.handle_force + slid.handle_force,
+        damped.work + slid.work,
+        damped.heat + slid.heat,
+        np.concatenate([damped.obstacle, slid.obstacle]),
+        np.concatenate([damped.loads, slid.loads]),
+    )
+
+
+def _damp(step: StepEnd, contacts: Contacts) -> tuple[ContactImpulses, Array]:
+    """Damp the rates at which distances in contact change; returns also the forces (m,) [N].
+
+    A pair with the rate r gets the impulse −w r of a dashpot, which keeps second order, with
+    w/m = 1 − e^−q, q = 2 √(Δt² b″/m), m of `_pair_masses`.
+    """
+    points, beta, dt = contacts.points, contacts.sheet_beta, step.dt
+    mass = _pair_masses(step, points, np.abs(beta), contacts.stiffness)
+    rate = np.einsum("ei,eik,ek->e", beta, step.v[points], contacts.normal)
+    approach = np.einsum("ek,ek->e", contacts.velocity, contacts.normal)
+    q = 2.0 * dt * np.sqrt(contacts.stiffness / np.maximum(mass, np.finfo(float).tiny))
+    push = np.maximum(mass * np.expm1(-q) * (rate - approach) / dt, -contacts.force)
+    along = push[:, None] * contacts.normal
+    impulse = _sums(points, dt * beta[:, :, None] * along[:, None, :], len(step.x))
+    change, heat = _applied(step, impulse, work := dt * float(push @ approach))
+    loads = _loads(step, points, beta, contacts.obstacle, along, push)
+    return ContactImpulses(change, step.handle_force(impulse), work, heat, *loads), push
+
+
+def _slide(
+    step: StepEnd, term: CoulombFriction, motion: ObstacleMotion, contacts: Contacts, normal_force: Array
+) -> ContactImpulses:
+    """Change the friction of the step to that of Coulomb's law with the ``normal_force`` (m,) [N] of the
+    step.
+    """
+    dt = step.dt
+    friction = term.end_friction(step.x, step.v, motion, contacts, normal_force, step.last_times)
+    points, gradients = friction.points, friction.gradients
+    of_obstacles = np.einsum("eck,ek->ec", friction.tangents, friction.velocity)
+    mass = _pair_masses(step, points, _sizes(gradients, friction.beta), friction.normal_force) / dt
+
+    def rates(v: Array) -> Array:
+        relative: Array = np.einsum("ecik,eik->ec", gradients, v[points]) - of_obstacles
+        return relative
+
+    def after(force: Array) -> tuple[Array, Array]:
+        """Impulses (n_local, 3) of a friction (m, 2), and the velocities (n_local, 3) after them."""
+        pull = np.einsum("ec,ecik->eik", force - friction.applied, gradients)
+        impulse = _sums(points, dt * pull, len(step.x))
+        return impulse, step.v + step.layout.extended(step.accelerations(impulse))
+
+    force, before = friction.force - friction.applied, rates(step.v)
+    impulse, v = after(force)
+    largest = step.layout.global_max(float(friction.static.max(initial=0.0)))[0]
+    for _ in range(MAX_SWEEPS):
+        tried, (force, sticks) = force, _coulomb(friction, force, rates(v), mass, dt)
+        impulse, v = after(force)
+        moved = float(np.abs(force - tried).max(initial=0.0))
+        if step.layout.global_max(moved)[0] <= SETTLED * largest:
+            break
+    changed, relative = force - friction.applied, rates(v)
+    work = dt * float(np.vdot(changed, of_obstacles))
+    own = impulse[: step.layout.n_owned]
+    heat = work - 0.5 * float(np.vdot(own, (step.v + v)[: len(own)]))
+    # of the change, with the mean of the velocities before and after, as external work
+    of_change = -0.5 * dt * float(np.vdot(changed, before + relative))
+    sliding = np.where(sticks, 0.0, -dt * np.einsum("ec,ec->e", force, relative))
+    term.set_end_friction(friction, force, sticks, sliding)
+    along = np.einsum("ec,eck->ek", changed, friction.tangents)
+    loads = _loads(step, points, friction.beta, friction.obstacle, along, np.zeros(len(along)))
+    handle_force, change = step.handle_force(impulse), (v - step.v)[: len(own)]
+    return ContactImpulses(change, handle_force, work - of_change, heat - of_change, *loads)
+
+
+def _coulomb(
+    friction: EndFriction, force: Array, velocity: Array, mass: Array, dt: float
+) -> tuple[Array, Mask]:
+    """Friction (m, 2) [N] of pairs with relative velocities (m, 2) [m/s] under the friction ``force`` (m, 2)
+    [N], and which of them stick; ``mass`` (m,) [kg/s] is the mass over Δt.
+    """
+    moves = friction.slides | (dt * np.linalg.norm(velocity, axis=1) > friction.still)
+    stopping = force - np.where(moves, mass, 0.0)[:, None] * velocity
+    size = np.linalg.norm(stopping, axis=1)
+    # a spring that still yields less than its limit need not stop the pair within the step
+    holds = friction.held & (np.linalg.norm(friction.force, axis=1) <= friction.static)
+    sticks = holds | (size <= np.where(friction.slides, friction.kinetic, friction.static))
+    limit = np.where(sticks, friction.static, friction.kinetic)
+    return stopping * np.minimum(limit / np.maximum(size, 1e-300), 1.0)[:, None], sticks
+
+
+def hold_by_friction(
+    step: StepEnd, term: CoulombFriction, motion: ObstacleMotion, acceleration: Array
+) -> Array:
+    """The accelerations (n_owned, 3) [m/s²] at the start of a step with the friction that opposes motion.
+
+    ``acceleration`` has the friction of the elastic slip, which the forces that begin to act have not yet
+    changed; the slip becomes that of the friction found, as the springs of sticking pairs would otherwise
+    overshoot and yield. Friction as a constraint stops the relative displacements in a step with the
+    velocities of ``step``, as far as its limit allows. (Projected gradients with momentum: Nesterov, Soviet
+    Mathematics Doklady 27 (1983) 372-376.)
+    """
+    points, gradients, size, weight, limit, elastic, moved = term.starting_friction(motion)
+    layout, dt, n = step.layout, step.dt, len(step.v)
+    largest = layout.global_max(float(limit.max(initial=0.0)))[0]
+    if not largest > 0.0:
+        return acceleration
+    stopped = _pair_masses(step, points, size, weight)
+
+    def with_friction(friction: Array) -> Array:
+        pull = _sums(points, np.einsum("ec,ecik->eik", friction - elastic, gradients), n)
+        return acceleration + step.accelerations(pull)
+
+    friction = tried = elastic
+    for sweep in range(MAX_SWEEPS):
+        a = layout.extended(with_friction(tried))
+        rate = np.einsum("ecik,eik->ec", gradients, (step.v + 0.5 * dt * a)[points]) + moved / dt
+        after = tried - 2.0 / dt * stopped[:, None] * rate
+        after *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(after, axis=1), 1e-300))[:, None]
+        change = float(np.abs(after - tried).max(initial=0.0))
+        friction, tried = after, after + sweep / (sweep + 3.0) * (after - friction)
+        if layout.global_max(change)[0] <= SETTLED * largest:
+            break
+    term.set_starting_friction(friction)
+    return with_friction(friction)
+
+
+def _sizes(gradients: Array, beta: Array) -> Array:
+    """Largest norms (m, 4) of ``gradients`` (m, 2, 4, 3) over all tangential directions.
+
+    A gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d.
+    """
+    return np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
+
+
+def _sums(points: Ints, values: Array, n: int) -> Array:
+    """Sums (n, 3) of ``values`` (m, 4, 3) over the rows ``points`` (m, 4)."""
+    rows = points.reshape(-1)
+    columns = [np.bincount(rows, column, n) for column in values.reshape(-1, 3).T]
+    return np.stack(columns, axis=1).astype(np.float64)
+
+
+def _pair_masses(step: StepEnd, points: Ints, size: Array, weight: Array) -> Array:
+    """Masses m (m,) [kg] that pairs of this rank may stop, whose gradients have the norms ``size`` (m, 4).
+
+    The masses of vertices are divided in proportion to ``weight`` (m,), so that a pair that hardly touches
+    takes no mass from others, and two halves of a pair are damped as the whole. With m_e = c_e times the
+    least over the vertices i of a pair of mass over Σ_e c_e s_ei Σ_j s_ej, summed over all pairs e, the sum
+    Σ_e w_e a_e a_eᵀ with w_e ≤ m_e does not exceed the mass matrix. All impulses together then reverse no
+    motion, however many pairs a vertex has. It is 0 for pairs with prescribed unknowns.
+    """
+    shares = weight[:, None] * size * size.sum(axis=1, keepdims=True)
+    shared = np.zeros_like(step.x)
+    shared[:, 0] = np.bincount(points.reshape(-1), shares.reshape(-1), len(shared))
+    step.layout.add_to_owners(shared)
+    own, mass = shared[: step.layout.n_owned, :1], step.mass[:, None]
+    inverse = np.divide(own, mass, out=np.zeros(step.free.shape), where=step.free & (mass > 0.0))
+    inverse = step.layout.extended(inverse)
+    largest = np.where((size != 0.0)[:, :, None], inverse[points], 0.0).max(axis=(1, 2), initial=0.0)
+    return np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0.0)
+
+
+def _loads(
+    step: StepEnd, points: Ints, beta: Array, obstacle: Ints, force: Array, normal_force: Array
+) -> tuple[Ints, Array]:
+    """Numbers of obstacles and loads (m, 8) on them by forces β times ``force`` (m, 3) [N] on the points of
+    sheets, of which ``normal_force`` (m,) [N] are the normal forces.
+    """
+    on = np.flatnonzero(obstacle >= 0)
+    side = beta[on].sum(axis=1, keepdims=True)
+    at = np.einsum("ei,eik->ek", beta[on], step.x[points[on]]) / side
+    on_obstacle = -side * force[on]
+    magnitudes = np.column_stack([normal_force[on], np.zeros(len(on))])
+    return obstacle[on], np.hstack([on_obstacle, np.cross(at, on_obstacle), magnitudes])
+
+
+def _applied(step: StepEnd, impulse: Array, work: float) -> tuple[Array, float]:
+    """Change (n_owned, 3) [m/s] of the velocities by impulses (n_local, 3) [N s], and the heat [J]: ``work``
+    of obstacles minus the change of kinetic energy.
+    """
+    change = step.accelerations(impulse)
+    n = len(change)
+    return change, work - float(np.vdot(impulse[:n], step.v[:n] + 0.5 * change))
