@@ -97,16 +97,8 @@ class TerminalProgress(ProgressCallbacks):
         self._noted_cache = False
         if comm.rank == 0:
             COMPILATION.first = self._announce_compilation
+        self._served = served if comm.rank == 0 else None
         self._page: LivePage | None = None
-        if served is not None and comm.rank == 0:
-            from lyra_petsc.show.view.live import LivePage
-
-            self._page = LivePage(
-                served.host,
-                served.port,
-                ready=lambda url: served.announce(url, self._say),
-                failed=lambda why: self._say(f"note: no page: {why}"),
-            )
 
     def _say(self, text: str) -> None:
         if self._progress is not None:
@@ -136,8 +128,8 @@ class TerminalProgress(ProgressCallbacks):
         )
         if self._usual is not None and folder != self._usual:
             self.note(f"{self._usual} exists: the results go to {folder} (--force would replace it)")
-        if self._page is not None:
-            self._page.show(folder)
+        if self._served is not None:
+            self._page = self._served.live_page(folder, self._say)
 
     def note(self, text: str) -> None:
         """Print a line above the bar."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -16,6 +16,9 @@ from lyra_petsc.cli.options import Session, results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import raise_on_all_ranks
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.view.live import LivePage
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -76,6 +79,15 @@ class Served:
 
         check_address(self.host, self.port)
 
+    def live_page(self, folder: Path, say: Callable[[str], Any]) -> LivePage:
+        """Start the page of a run whose first state has been written; to be called on one rank."""
+        from lyra_petsc.show.view.live import LivePage
+
+        def failed(why: str) -> None:
+            say(f"note: no page: {why}")
+
+        return LivePage(folder, self.host, self.port, lambda url: self.announce(url, say), failed)
+
     def announce(self, url: str, say: Callable[[str], Any]) -> None:
         """Print the address of the page, warn if others can reach it, and open it."""
         from lyra_petsc.show.view.server import is_loopback, open_browser
@@ -113,12 +125,12 @@ def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser
 def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:
     """Serve the page until a signal."""
     served.check("view")
-    from lyra_petsc.show.view.server import find_run, serve
+    from lyra_petsc.show.view.server import serve
 
     def ready(url: str) -> None:
         served.announce(url, click.echo)
         click.echo("Ctrl-C ends")
 
-    number = asyncio.run(serve(find_run(folder), served.host, served.port, ready, **look))
+    number = asyncio.run(serve(folder, served.host, served.port, ready, **look))
     if number not in (0, signal.SIGINT):  # Ctrl-C is the normal end
         raise Interrupted("", number, "ended by")

@@ -93,9 +93,8 @@ class ViewedPage(Media):
 
         answers: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
         self._process = LivePage(
-            "127.0.0.1", 0, lambda url: answers.put((url, "")), lambda why: answers.put(("", why))
+            folder, "127.0.0.1", 0, lambda url: answers.put((url, "")), lambda why: answers.put(("", why))
         )
-        self._process.show(folder)
         self.url, problem = answers.get()
         if problem:
             raise InputError(problem)

@@ -172,12 +172,11 @@ def quantity(run: StoredRun, name: str) -> ColourQuantity:
             file=run.folder,
             key="--field",
         )
-    stored = run.field(name)
     principal = name in TENSORS
     reduce = _largest_principal if principal else _magnitude
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
     on_triangles = run.field_on(name) == "triangle"
-    values: Callable[[int], Array] = lambda i: reduce(np.asarray(stored[i]))  # noqa: E731
+    values: Callable[[int], Array] = lambda i: reduce(np.asarray(run.field(name)[i]))  # noqa: E731
     return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NOT_AVERAGED)
 
 
@@ -193,8 +192,7 @@ def _speed(run: StoredRun, name: str) -> ColourQuantity:
             file=run.folder,
             key="--field",
         )
-    stored = run.field("velocity")
-    return ColourQuantity(_label("speed", "m/s"), lambda i: _magnitude(stored[i]))
+    return ColourQuantity(_label("speed", "m/s"), lambda i: _magnitude(run.velocities[i]))
 
 
 def _displacement(run: StoredRun, name: str) -> ColourQuantity:
@@ -221,6 +219,12 @@ DERIVED: dict[str, Callable[[StoredRun, str], ColourQuantity]] = {
     "strain": _strain,
 }
 """Quantities that are computed from positions and velocities; further ones are the run's fields."""
+
+
+def quantity_names(run: StoredRun) -> list[str]:
+    """Names of the quantities by which a run's states can be coloured."""
+    derived = [name for name in DERIVED if name != "speed" or "velocity" in run.fields]
+    return derived + [name for name in run.fields if name not in {"velocity", *derived}]
 
 
 def material_coordinates(run: StoredRun) -> Array:

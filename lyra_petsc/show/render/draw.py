@@ -60,7 +60,7 @@ def draw(comm: MPI.Comm, plan: RenderPlan, show_progress: Callable[[int, int], N
     """
     states, size = plan.states, comm.size
     with ExitStack() as opened:
-        drawing = _fitted_drawing(comm, plan)
+        drawing = fitted_drawing(comm, plan)
         opened.callback(drawing.close)
         files = on_every_rank(comm, lambda: PictureFiles(plan, opened) if comm.rank == 0 else None)
         for first in range(0, len(states), size):
@@ -80,9 +80,9 @@ def _write(files: PictureFiles | None, states: list[int], images: list[list[Imag
             files.write(state, image)
 
 
-def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
+def fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
     """The drawing, with a camera that fits most of the states drawn, and colours the motion; collective."""
-    shown = on_every_rank(comm, lambda: _colour_quantity(plan))
+    shown = on_every_rank(comm, lambda: colour_quantity(plan))
     sight = on_every_rank(comm, lambda: run_line_of_sight(plan.run, plan.scene))
     axes = Bounds.axes_of(up_direction(plan.scene))
     fit = CameraFit(plan.scene, sight, axes[2], plan.size[0] / plan.size[1], bar=shown is not None)
@@ -123,7 +123,7 @@ def _obstacles(plan: RenderPlan, bounds: Bounds) -> list[ObstacleSurface]:
     return obstacle_surfaces(plan.run, bounds.middle, bounds.size)
 
 
-def _colour_quantity(plan: RenderPlan) -> ColourQuantity | None:
+def colour_quantity(plan: RenderPlan) -> ColourQuantity | None:
     if plan.options.field is None:
         return None
     field = quantity(plan.run, plan.options.field)

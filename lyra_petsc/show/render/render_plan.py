@@ -43,8 +43,6 @@ SHEET_COLORS = (
 """Front and back of each of several sheets, in turn."""
 FILM, SHEET = "film.mp4", "sheet.png"
 MAX_PICTURES = 1000
-MOTION_STATES = 500
-"""Number of states, besides those drawn, to which floor and colours are fitted."""
 SIGHT_STATES = 9
 """Number of states from which the direction of the camera is chosen."""
 
@@ -81,6 +79,8 @@ class RenderOptions:
     ground: bool = True
     label: bool = True
     settings: tuple[str, ...] = ()
+    fitted_states: int = 500
+    """Number of states, besides those drawn, to which floor and colours are fitted."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class RenderPlan:
     @property
     def motion(self) -> list[int]:
         """States to which floor and colours are fitted: of the whole run, so that all its pictures agree."""
-        return sorted({*self.states, *spread_states(self.run.times, MOTION_STATES)})
+        return sorted({*self.states, *spread_states(self.run.times, self.options.fitted_states)})
 
 
 def make_plan(options: RenderOptions) -> RenderPlan:

@@ -127,6 +127,10 @@ class SceneDrawing:
     obstacles : list of ObstacleSurface
     floor : float
         Height of the floor [m].
+
+    Attributes
+    ----------
+    plotter : pyvista.Plotter
     """
 
     def __init__(
@@ -140,21 +144,22 @@ class SceneDrawing:
         obstacles: list[ObstacleSurface],
         floor: float,
     ) -> None:
-        self._plan, self._bounds, self._quantity = plan, bounds, quantity
+        self._plan, self._bounds = plan, bounds
         self._triangles = plan.run.triangles
         self._pyvista = pyvista = import_pyvista()
-        self._plotter = plotter = off_screen_plotter(plan.size)
+        self.plotter = plotter = off_screen_plotter(plan.size)
         plotter.set_background(HORIZON, top=SKY)
         plotter.renderer.SetDitherGradient(False)  # pictures would be twice as large
         # FXAA is as smooth as multisampling, with which a software renderer takes 1.5 times as long
         plotter.disable_anti_aliasing()
         plotter.renderer.SetUseFXAA(True)
-        plotter.camera.position, plotter.camera.focal_point = tuple(view.position), tuple(view.target)
-        plotter.camera.up, plotter.camera.view_angle = tuple(view.up), view.angle
+        plotter.camera_position = [tuple(view.position), tuple(view.target), tuple(view.up)]
+        plotter.camera.view_angle = view.angle
         plotter.camera.SetWindowCenter(0.0, -view.raised)
         self._scale = plan.size[1] / 720.0
         key_light = self._add_lights(view)
-        self._add_sheets(limits)
+        self._sheet_actors: list[Any] = []
+        self.colour_by(quantity, limits)
         self._obstacles = [(each, self._add_obstacle(each)) for each in obstacles]
         self._ground = None
         has_floor = plan.options.ground and not any(obstacle.infinite for obstacle in obstacles)
@@ -171,10 +176,20 @@ class SceneDrawing:
         digits = f"{{:.{decimals(plan.run.times)}f}}"
         static = plan.scene.time.static
         self._label = f"load = {digits}" if static else f"t = {digits} s"
-        self._first = True
+        self._first, self._placed = True, False
 
     def image(self, state: int) -> Image:
         """(height, width, 3) picture of a state, given by its number."""
+        self.show(state)
+        if self._first:
+            self.plotter.show(auto_close=False)
+            self._first = False
+        self.plotter.reset_camera_clipping_range()
+        self.plotter.render()
+        return np.ascontiguousarray(self.plotter.image)
+
+    def show(self, state: int) -> None:
+        """Move and colour what is drawn to a state, given by its number, without drawing it."""
         run = self._plan.run
         time, x = float(run.times[state]), run.positions[state]
         normals = vertex_normals(x, self._triangles)[self._source].astype(np.float32)
@@ -188,11 +203,12 @@ class SceneDrawing:
             else:
                 self._sheets[0].point_data["colour"] = values[self._source]
         for obstacle, mesh in self._obstacles:
-            if self._first or not obstacle.fixed:
+            if not (obstacle.fixed and self._placed):
                 mesh.points = obstacle.positions(time)
                 if obstacle.smooth:
                     normals = vertex_normals(np.asarray(mesh.points), obstacle.triangles)
                     mesh.point_data.active_normals = normals.astype(np.float32)
+        self._placed = True
         if self._ground is not None:
             floor = self._pyvista.Texture(self._ground.picture(x))
             floor.interpolate = True
@@ -204,22 +220,23 @@ class SceneDrawing:
             self._handles.verts = np.column_stack([np.ones_like(single), single]).ravel()
             self._rods.lines = np.column_stack([np.full(len(edges), 2), edges]).ravel()
         self._time.input = self._label.format(time) if self._plan.options.label else ""
-        if self._first:
-            self._plotter.show(auto_close=False)
-            self._first = False
-        self._plotter.reset_camera_clipping_range()
-        self._plotter.render()
-        return np.ascontiguousarray(self._plotter.image)
 
     def close(self) -> None:
         """Close the windows."""
-        self._plotter.close()
+        self.plotter.close()
         if self._ground is not None:
             self._ground.close()
 
-    def _add_sheets(self, limits: tuple[float, float]) -> None:
-        """Add all triangles as one mesh or, if each sheet has its colours, one for each pair of colours."""
-        plan, quantity, triangles = self._plan, self._quantity, self._triangles
+    def colour_by(self, quantity: ColourQuantity | None, limits: tuple[float, float]) -> None:
+        """Draw the sheets anew, in the colours of a quantity, of the texture, or of their own.
+
+        All triangles are one mesh or, if each sheet has its colours, one for each pair of colours.
+        """
+        for actor in self._sheet_actors:
+            self.plotter.remove_actor(actor, reset_camera=False, render=False)
+        for title in list(self.plotter.scalar_bars.keys()):
+            self.plotter.remove_scalar_bar(title, render=False)
+        self._quantity, plan, triangles = quantity, self._plan, self._triangles
         self._source, corners, uv = np.arange(len(plan.run.rest)), triangles, None
         if plan.texture is not None:
             uv = plan.run.corner_uv
@@ -254,32 +271,36 @@ class SceneDrawing:
         else:
             shown = [plan.colors[number] for number in pairs]
             looks = [{"color": front, "backface_params": {**light, "color": back}} for front, back in shown]
-        for sheet, look in zip(self._sheets, looks, strict=True):
-            self._plotter.add_mesh(sheet, reset_camera=False, **light, **look)
+        self._sheet_actors = [
+            self.plotter.add_mesh(sheet, reset_camera=False, render=False, **light, **look)
+            for sheet, look in zip(self._sheets, looks, strict=True)
+        ]
         if quantity is not None:
-            self._add_bar(quantity, limits)
+            self._sheet_actors.append(self._add_bar(quantity, limits))
 
     def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
         """Add an obstacle and return its mesh, whose points `image` moves."""
         points = obstacle.positions(0.0)
         mesh = self._pyvista.PolyData.from_regular_faces(points, obstacle.triangles)
         look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.smooth else "flat"}
-        self._plotter.add_mesh(
+        self.plotter.add_mesh(
             mesh, color=OBSTACLE_COLOR, opacity=obstacle.opacity, reset_camera=False, **look
         )
         return mesh
 
-    def _add_bar(self, quantity: ColourQuantity, limits: tuple[float, float]) -> None:
+    def _add_bar(self, quantity: ColourQuantity, limits: tuple[float, float]) -> Any:
+        """Add the colour bar and its title, which is returned."""
         left = 0.64
         place = {"width": 0.32, "height": 0.07, "position_x": left, "position_y": 0.04}
         font = {"color": INK, "font_family": "arial", "label_font_size": round(20 * self._scale)}
-        self._add_text(quantity.label, (left, 0.125), viewport=True)
-        bar = self._plotter.add_scalar_bar(title="", vertical=False, fmt="%g", **place, **font)
+        title = self._add_text(quantity.label, (left, 0.125), viewport=True)
+        bar = self.plotter.add_scalar_bar(title="", vertical=False, fmt="%g", **place, **font)
         bar.SetCustomLabels(self._pyvista.convert_array(round_numbers(*limits)))
         bar.SetUseCustomLabels(True)
+        return title
 
     def _add_text(self, text: str, position: tuple[float, float], **options: Any) -> Any:
-        added = self._plotter.add_text(text, position=position, font_size=1, color=INK, **options)
+        added = self.plotter.add_text(text, position=position, font_size=1, color=INK, **options)
         added.prop.font_size = round(25 * self._scale)
         return added
 
@@ -295,7 +316,7 @@ class SceneDrawing:
         for azimuth, elevation, intensity in lights:
             a, e = math.radians(azimuth), math.radians(elevation)
             towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
-            self._plotter.add_light(self._pyvista.Light(position=tuple(towards), intensity=intensity))
+            self.plotter.add_light(self._pyvista.Light(position=tuple(towards), intensity=intensity))
             directions.append(towards)
         return directions[0]
 
@@ -308,7 +329,7 @@ class SceneDrawing:
         spheres = {"style": "points", "point_size": 1.8 * width, "render_points_as_spheres": True}
         tubes = {"style": "wireframe", "line_width": width, "render_lines_as_tubes": True}
         for mesh, style in ((self._handles, spheres), (self._rods, tubes)):
-            self._plotter.add_mesh(mesh, color=HANDLE_COLOR, reset_camera=False, **style)
+            self.plotter.add_mesh(mesh, color=HANDLE_COLOR, reset_camera=False, **style)
 
 
 class Ground:

@@ -1,8 +1,8 @@
 """The page of ``run --live`` and of notebooks: a separate process, which reads the run's folder.
 
-``python -m lyra_petsc.show.view.live HOST PORT`` reads the folder from its standard input and writes one line
-to its standard output: the address of the page, or the reason for its failure. The end of the standard input
-means that the run has ended; the process then ends when no page is open any more.
+``python -m lyra_petsc.show.view.live FOLDER HOST PORT`` writes one line to its standard output: the address
+of the page, or the reason why there is none. The end of its standard input means that the run has ended; the
+process then ends when no page is open any more.
 """
 
 from __future__ import annotations
@@ -20,24 +20,23 @@ from lyra_petsc.api.mpirun import environment
 from lyra_petsc.errors import LyraError
 from lyra_petsc.startup import module_command
 
-PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
+PACKAGES = ("pyvista", "trame", "trame_pyvista", "trame_vtk", "trame_vuetify", "vtkmodules", "matplotlib")
 """Packages of the extra ``view`` that the page needs."""
 
-READY, FAILED = "ready ", "failed "
-"""Prefixes of the line on standard output."""
+FAILED = "failed "
+"""Beginning of the line on standard output if there is no page."""
 
-NICENESS = 10
-"""With a busy rank on the same processor, Linux gives the process 110 / (1024 + 110) = 10 % of its time.
-
-The process needs it only while a page is loaded; with less, loading the page's megabytes takes minutes.
-"""
+NICENESS = 5
+"""With a busy rank on the same processor, Linux gives the process 335 / (1024 + 335) = 25 % of its time."""
 
 
 class LivePage:
-    """The page's process; a run starts it before its set-up and never waits for it. For one rank.
+    """The page's process; the run never waits for it. For one rank.
 
     Parameters
     ----------
+    folder : Path
+        The run's folder, with one state at least.
     host : str
     port : int
     ready : callable
@@ -47,96 +46,72 @@ class LivePage:
     """
 
     def __init__(
-        self, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
+        self,
+        folder: Path,
+        host: str,
+        port: int,
+        ready: Callable[[str], object],
+        failed: Callable[[str], object],
     ) -> None:
-        self._process: subprocess.Popen[str] | None = None
-        self._ready, self._failed, self._announced = ready, failed, False
-        try:
-            self._process = subprocess.Popen(
-                [*module_command("lyra_petsc.show.view.live"), host, str(port)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env=environment(),  # the process is not a rank of the run
-                start_new_session=True,  # Ctrl-C must reach the run only
-                text=True,
-            )
-        except OSError as error:
-            failed(str(error))
-        else:
-            threading.Thread(target=self._listen, args=[self._process], daemon=True).start()
+        self._process = subprocess.Popen(
+            [*module_command("lyra_petsc.show.view.live"), str(folder.absolute()), host, str(port)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment(),  # the process is not a rank of the run
+            start_new_session=True,  # Ctrl-C must reach the run only
+            text=True,
+        )
+        self._announced = self._ended = False
 
-    def _listen(self, process: subprocess.Popen[str]) -> None:
-        assert process.stdout is not None
-        line = process.stdout.readline().strip()
-        if line.startswith(READY):
-            self._announced = True
-            self._ready(line.removeprefix(READY))
-        elif process.stdin is not None and not process.stdin.closed:  # closed: the run has ended already
-            self._failed(line.removeprefix(FAILED) or "its process ended")
+        def listen() -> None:
+            assert self._process.stdout is not None
+            line = self._process.stdout.readline().strip()
+            if line and not line.startswith(FAILED):
+                self._announced = True
+                ready(line)
+            elif not self._ended:
+                failed(line.removeprefix(FAILED) or "its process ended")
 
-    def show(self, folder: Path) -> None:
-        """Serve the page of a run whose first state has been written."""
-        if self._process is not None and self._process.stdin is not None:
-            with suppress(OSError):  # `failed` reports it
-                self._process.stdin.write(f"{folder.absolute()}\n")
-                self._process.stdin.flush()
+        threading.Thread(target=listen, daemon=True).start()
 
     def end(self) -> None:
-        """Notify the process that the run has ended; it shows the last state until no page is open.
-
-        If nobody has got the address of the page yet, the process ends at once.
-        """
-        if self._process is not None and self._process.stdin is not None:
-            with suppress(OSError):
-                self._process.stdin.close()
-            if not self._announced:
-                self._process.terminate()
+        """Notify the process that the run has ended; if nobody has got its address yet, it ends at once."""
+        self._ended = True
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        if not self._announced:
+            self._process.terminate()
 
 
-def main(host: str, port: int) -> None:
-    """Serve the page of the run whose folder is the first line of the standard input."""
-    _lower_priority(NICENESS)
-    # the imports take a second, during the run's set-up
-    from lyra_petsc.show.view.server import MAX_STAY, find_run, serve
-
-    line = sys.stdin.readline()
-    if not line:
-        return
-    folder = Path(line.removesuffix("\n"))
+def main(folder: str, host: str, port: str) -> None:
+    """Serve the page of a run until the standard input has ended and nobody has the page open."""
+    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+    with suppress(OSError):  # Linux may share the time out among sessions first, and this is one of its own
+        Path("/proc/self/autogroup").write_text(str(NICENESS), encoding="ascii")
+    with suppress(AttributeError, OSError):  # the process inherits the binding of rank 0 to a processor
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    from lyra_petsc.show.view.server import MAX_STAY_SECONDS, serve
 
     def report(line: str) -> None:
         with suppress(OSError):  # the run's process has ended
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 
-    def ended() -> str:
-        sys.stdin.read()
-        return (
-            "The run has ended, or the notebook that shows it. This page stays for as long as it is open, at "
-            f"most {MAX_STAY / 60:.0f} minutes; later: lyra-petsc view {folder}"
-        )
-
-    def ready(url: str) -> None:
-        report(READY + url)
+    async def ended() -> str:
+        loop, closed = asyncio.get_running_loop(), asyncio.Event()
+        loop.add_reader(sys.stdin, closed.set)
+        await closed.wait()
+        loop.remove_reader(sys.stdin)
+        stay = f"at most {MAX_STAY_SECONDS // 60} minutes"
+        return f"The run has ended. This page stays while it is open, {stay}; later: lyra-petsc view {folder}"
 
     try:
-        asyncio.run(serve(find_run(folder), host, port, ready, ended))
+        asyncio.run(serve(Path(folder), host, int(port), report, ended))
     except LyraError as error:
         report(FAILED + str(error))
 
 
-def _lower_priority(niceness: int) -> None:
-    """Lower this process's priority, and remove the binding to processors inherited from rank 0."""
-    os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
-    if os.getsid(0) == os.getpid():
-        # Linux may divide processor time among sessions first, and this process has a session of its own
-        with suppress(OSError):
-            Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
-    if hasattr(os, "sched_setaffinity"):
-        with suppress(OSError):
-            os.sched_setaffinity(0, range(os.cpu_count() or 1))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(*sys.argv[1:])

@@ -15,8 +15,6 @@ import secrets
 import signal
 import socket
 import sys
-import threading
-import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -24,16 +22,14 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from aiohttp import web
-from aiohttp.http_exceptions import HttpProcessingError
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.file_operations import reason
-from lyra_petsc.output.read_run import StoredRun, read_history
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+LOCAL = "127.0.0.1"
 WEB_SOCKET = "/ws"
-
 HEADERS = {
     # nothing may be loaded from other hosts; unsafe-eval: Vue compiles the page's template in the browser
     "Content-Security-Policy": (
@@ -47,6 +43,10 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address contains the token
     "X-Content-Type-Options": "nosniff",
 }
+
+LEAVE_SECONDS, MAX_STAY_SECONDS = 30, 1800
+"""After its run has ended a page is served until nobody has had it open for the first time [s], at most for
+the second one: a browser starts slowly, and a forgotten page must not keep a process for ever."""
 
 
 class Access:
@@ -65,94 +65,68 @@ class Access:
     ----------
     n_open : int
         Number of open pages (web sockets).
-    was_opened : bool
-        Whether a page has ever been opened.
     """
 
     def __init__(self, token: str, host: str) -> None:
         self._token = token.encode()
         # browsers send cookies to all ports of a host, so each server needs a cookie name of its own
         self._cookie = f"lyra-view-{hashlib.sha256(self._token).hexdigest()[:12]}"
-        self._names = {"localhost", host.lower().strip("[]")}
-        if not is_loopback(host):
+        self._names, self._local = {"localhost", host.lower().strip("[]")}, is_loopback(host)
+        if not self._local:
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-        self._local = is_loopback(host)
-        self.n_open, self.was_opened = 0, False
+        self.n_open = 0
 
     def middleware(self) -> Any:
         """The check as aiohttp's middleware."""
 
         @web.middleware
         async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-            problem = self._problem(request)
-            if problem:
+            if problem := self._problem(request):
                 return web.Response(status=403, text=f"403: {problem}\n", headers=HEADERS)
+            if request.path == "/paraview/":  # trame's page asks for the web socket's address
+                return web.json_response({"sessionURL": f"ws://{request.host}{WEB_SOCKET}"})
+            opens = request.path == WEB_SOCKET
+            # wslink would keep a web socket that it cannot open, and then could not stop
+            if opens and not web.WebSocketResponse().can_prepare(request).ok:
+                return web.Response(status=426, headers={"Upgrade": "websocket"})
+            self.n_open += opens
             try:
-                response = await self._answer(request, handler)
-            except web.HTTPException as error:
-                error.headers.update(HEADERS)
-                self._set_cookie(request, error)
+                response = await handler(request)
+            except web.HTTPException as answer:
+                self._complete(request, answer)
                 raise
+            finally:
+                self.n_open -= opens
             if not response.prepared:
-                response.headers.update(HEADERS)
-                self._set_cookie(request, response)
+                self._complete(request, response)
             return response
 
         return check
 
-    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        if request.path == "/paraview/":  # trame's page asks for the web socket's address
-            return web.json_response({"sessionURL": f"ws://{request.host}{WEB_SOCKET}"})
-        opens = request.headers.get("Upgrade", "").lower() == "websocket"
-        if request.path != WEB_SOCKET and not opens:
-            return await handler(request)
-        # wslink would keep a web socket that it cannot open, and then could not stop
-        if not web.WebSocketResponse().can_prepare(request).ok:
-            text = f"426: {WEB_SOCKET} is for the page's web socket\n"
-            return web.Response(status=426, text=text, headers={"Upgrade": "websocket"})
-        self.n_open, self.was_opened = self.n_open + 1, True
-        try:
-            return await handler(request)
-        except (ValueError, TypeError, KeyError, ConnectionError) as error:
-            raise web.HTTPBadRequest from error  # a message that the page does not send
-        finally:
-            self.n_open -= 1
-
     def _problem(self, request: web.Request) -> str:
         """The reason for refusing a request; empty if it is accepted."""
-        if not self._is_this_machine(_host_name(f"//{request.headers.get('Host', '')}")):
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        if not self._is_this_machine(host):
             return "this server does not go by that name"
         given = request.query.get("token") or request.cookies.get(self._cookie) or ""
         if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
             return "the address needs the token that was printed at the start"
-        origin = request.headers.get("Origin")
-        if origin is not None and origin.partition("://")[2] != request.headers.get("Host"):
+        if origin is not None and origin.partition("://")[2] != host:
             return "a page from elsewhere may not ask"
         return ""
 
-    def _is_this_machine(self, name: str) -> bool:
-        """Whether a host name means this machine, without asking a name server."""
-        if name in self._names:
-            return True
+    def _is_this_machine(self, host: str) -> bool:
+        """Whether the host of a request means this machine, without asking a name server."""
         with suppress(ValueError):
-            return ipaddress.ip_address(name).is_loopback or not self._local
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+            return name in self._names or ipaddress.ip_address(name).is_loopback or not self._local
         return False
 
-    def _set_cookie(self, request: web.Request, response: web.StreamResponse) -> None:
+    def _complete(self, request: web.Request, response: web.StreamResponse) -> None:
+        response.headers.update(HEADERS)
         if "token" in request.query:
-            response.set_cookie(
-                self._cookie, self._token.decode(), httponly=True, samesite="Strict", path="/"
-            )
-
-
-def silence_bad_requests() -> None:
-    """Keep aiohttp from logging a traceback for each invalid HTTP request, which it answers with 400."""
-
-    def is_logged(record: logging.LogRecord) -> bool:
-        error = record.exc_info[1] if record.exc_info else None
-        return not isinstance(error, HttpProcessingError)
-
-    logging.getLogger("aiohttp.server").addFilter(is_logged)
+            token = self._token.decode()
+            response.set_cookie(self._cookie, token, httponly=True, samesite="Strict", path="/")
 
 
 def is_loopback(host: str) -> bool:
@@ -160,27 +134,6 @@ def is_loopback(host: str) -> bool:
     with suppress(ValueError):
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     return host.lower() == "localhost"
-
-
-def _host_name(address: str) -> str:
-    try:
-        return (urlsplit(address).hostname or "").lower()
-    except ValueError:
-        return ""
-
-
-LOCAL = "127.0.0.1"
-
-CLOSING_SECONDS = 1.0
-
-RELOAD_SECONDS = 3.0
-"""Time [s] for which the server runs after the last page is closed, as a page may only be reloading."""
-
-FIRST_PAGE_SECONDS = 30.0
-"""Time [s] for which the server waits after the end of a run for a first page: a browser starts slowly."""
-
-MAX_STAY = 1800.0
-"""Time [s] after the end of the run for which open pages are served."""
 
 
 def check_address(host: str, port: int) -> None:
@@ -200,28 +153,28 @@ def check_address(host: str, port: int) -> None:
 
 
 def _refusal(host: str, port: int, error: BaseException) -> InputError:
-    if isinstance(error, socket.gaierror):
+    number = getattr(error, "errno", None)
+    if isinstance(error, socket.gaierror) or (number and "assign" in os.strerror(number)):
         return InputError(f"{host!r} is no address of this machine; leave it out for {LOCAL}", key="--host")
-    if isinstance(error, OSError) and error.errno is not None and "assign" in os.strerror(error.errno):
-        return InputError(f"{host} is no address of this machine; leave it out for {LOCAL}", key="--host")
     return InputError(
         f"{host}:{port} cannot be used: {reason(error)}; leave it out for a free port", key="--port"
     )
 
 
 async def serve(
-    run: StoredRun,
+    folder: Path,
     host: str,
     port: int,
     ready: Callable[[str], None],
-    ended: Callable[[], str] | None = None,
+    ended: Callable[[], Awaitable[str]] | None = None,
     **look: Any,
 ) -> int:
     """Serve the page of a run until a signal, or until the run has ended and no page is open.
 
     Parameters
     ----------
-    run : StoredRun
+    folder : Path
+        The run's folder.
     host : str
         The address to listen on.
     port : int
@@ -229,9 +182,9 @@ async def serve(
     ready : callable
         Called with the page's address once it can be opened.
     ended : callable, optional
-        Called in a thread; returns a text for the page when the run has ended.
+        Waits for the end of the run, and returns a text for the page.
     **look
-        Arguments of `Look`: the page's initial settings.
+        Arguments of `RunPage`: the page's initial settings.
 
     Returns
     -------
@@ -244,20 +197,17 @@ async def serve(
         If the server cannot listen on the address, or the run cannot be shown with these settings.
     """
     os.environ["WSLINK_READY_MSG"] = ""  # else wslink writes to standard output
-    from lyra_petsc.show.view.page import Look, Page
+    logging.getLogger("aiohttp").setLevel(logging.CRITICAL)  # it logs each invalid request with a traceback
+    from lyra_petsc.show.view.page import RunPage
 
-    settings = Look(**look)
-    settings.check(run)
+    page = RunPage(folder, **look)
     token = secrets.token_urlsafe(24)
-    access = Access(token, host)
-    silence_bad_requests()
-    page = Page(run, access, settings)
-    server = page.server
-    web: list[Any] = []
+    access, server = Access(token, host), page.server
+    sites: list[Any] = []
 
-    def bind(web_server: Any) -> None:
-        web.append(web_server)
-        web_server.app.middlewares.append(access.middleware())
+    def bind(site: Any) -> None:
+        sites.append(site)
+        site.app.middlewares.append(access.middleware())
 
     def announce(**_: Any) -> None:
         ready(f"http://{_in_address(host)}:{server.port}/?token={token}")
@@ -267,27 +217,20 @@ async def serve(
     loop = asyncio.get_running_loop()
     over: asyncio.Future[int] = loop.create_future()
     nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+    def end(number: int) -> None:
+        if not over.done():
+            over.set_result(number)
+
     for number in (signal.SIGINT, signal.SIGTERM, *([] if nohup else [signal.SIGHUP])):
-        loop.add_signal_handler(number, _finish, over, int(number))
-    arguments, sys.argv[1:] = sys.argv[1:], []  # trame would parse them
-    try:
-        listening = asyncio.create_task(
-            server.start(
-                host=host,
-                port=port,
-                timeout=0,
-                thread=True,
-                open_browser=False,
-                show_connection_info=False,
-                disable_logging=True,
-                exec_mode="coroutine",
-            )
-        )
-    finally:
-        sys.argv[1:] = arguments
-    tasks = [asyncio.create_task(page.animate()), asyncio.create_task(page.follow())]
+        loop.add_signal_handler(number, end, int(number))
+    sys.argv[1:] = []  # trame would parse them
+    options = {"open_browser": False, "show_connection_info": False, "disable_logging": True, "thread": True}
+    started = server.start(host=host, port=port, timeout=0, exec_mode="coroutine", **options)
+    listening = asyncio.create_task(started)
+    tasks = [asyncio.create_task(work) for work in (page.play(), page.follow())]
     if ended is not None:
-        tasks.append(asyncio.create_task(_await_end(ended, page, access, over)))
+        tasks.append(asyncio.create_task(_await_end(ended(), page, access)))
     await asyncio.wait({listening, over, *tasks}, return_when=asyncio.FIRST_COMPLETED)
     failed = [task for task in tasks if task.done() and task.exception()]
     for task in tasks:
@@ -301,35 +244,21 @@ async def serve(
             raise _refusal(host, port, error) from None
     else:
         with suppress(RuntimeError, ConnectionError):  # a page that is just opening, or has been closed
-            await web[0].stop()
+            await sites[0].stop()
         with suppress(asyncio.CancelledError):
             await listening
     return over.result() if over.done() else 0
 
 
-async def _await_end(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
-    """After the run has ended, show its end, and set ``over`` when all pages are closed."""
-    loop = asyncio.get_running_loop()
-    text: asyncio.Future[str] = loop.create_future()
-    # a daemon thread, as it may wait forever
-    wait = threading.Thread(target=lambda: loop.call_soon_threadsafe(text.set_result, ended()), daemon=True)
-    wait.start()
-    farewell = await text
-    await asyncio.sleep(CLOSING_SECONDS)  # the run is still completing its files
-    page.refresh()
-    page.show_end(farewell)
-    deadline, closed = time.monotonic() + MAX_STAY, 0.0
-    while closed < (RELOAD_SECONDS if access.was_opened else FIRST_PAGE_SECONDS):
-        if time.monotonic() > deadline:
-            break
-        await asyncio.sleep(CLOSING_SECONDS)
-        closed = 0.0 if access.n_open else closed + CLOSING_SECONDS
-    _finish(over, 0)
-
-
-def _finish(over: asyncio.Future[int], number: int) -> None:
-    if not over.done():
-        over.set_result(number)
+async def _await_end(ended: Awaitable[str], page: Any, access: Access) -> None:
+    """Show the end of the run once it has come, and return when nobody has the page open any more."""
+    page.show_end(await ended)
+    unused = 0
+    for _ in range(MAX_STAY_SECONDS):
+        await asyncio.sleep(1.0)
+        unused = 0 if access.n_open else unused + 1
+        if unused == LEAVE_SECONDS:
+            return
 
 
 def _in_address(host: str) -> str:
@@ -345,18 +274,3 @@ def open_browser(address: str) -> bool:
 
     known = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     return (known or sys.platform == "darwin") and webbrowser.open(address)
-
-
-def find_run(folder: Path) -> StoredRun:
-    """The run in a folder, after checking that all data of the page can be read.
-
-    Raises
-    ------
-    InputError
-    """
-    run = StoredRun(folder)
-    for needed in ("triangles", "rest", "scene"):
-        getattr(run, needed)
-    run.positions[0]
-    read_history(run.folder)
-    return run

@@ -4,12 +4,9 @@ import asyncio
 import signal
 import socket
 
-import pytest
 from launch import finish
 from patience import SECONDS
 from written_run import written
-
-from lyra_petsc.show.view.server import Access, is_loopback
 
 SOCKET = {
     "Upgrade": "websocket",
@@ -137,15 +134,6 @@ def test_another_address_is_used_on_request_only(serve, tmp_path):
     assert "other machines" in all_.process.stdout.readline()
     assert all_.get("/index.html?token=" + all_.token, Host="192.168.7.8")[0] == 200
     assert all_.get("/index.html?token=" + all_.token, Host="evil.example")[0] == 403
-
-
-@pytest.mark.parametrize(
-    ("host", "local"),
-    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("127.9.9.9", True), ("0.0.0.0", False)],
-)
-def test_local_addresses(host, local):
-    assert is_loopback(host) is local
-    assert Access("token", host).n_open == 0
 
 
 def test_a_given_port_is_used_and_refused_if_taken(serve, tmp_path):

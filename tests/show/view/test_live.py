@@ -14,6 +14,7 @@ from patience import Patience
 from written_run import Writer
 
 from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.show.view import server
 from lyra_petsc.show.view.live import NICENESS, LivePage
 
 SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
@@ -143,21 +144,18 @@ def test_a_port_in_use_is_refused_before_files_are_written(tmp_path):
 
 def test_a_page_that_cannot_be_served_is_reported(tmp_path):
     messages = []
-    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
-    page.show(tmp_path / "nowhere")
+    page = LivePage(tmp_path / "nowhere", "127.0.0.1", 0, messages.append, messages.append)
     until(lambda: messages, "nothing is said")
     page.end()
     assert "nowhere: no such folder" in messages[0]
 
 
 @pytest.mark.slow
-def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_path):
-    """Also if the run ends before the browser has started."""
+def test_the_page_stays_after_the_run_until_the_last_browser_leaves(tmp_path):
     writer = Writer(tmp_path / "run")
     writer.write()
     messages = []
-    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
-    page.show(tmp_path / "run")
+    page = LivePage(tmp_path / "run", "127.0.0.1", 0, messages.append, messages.append)
     until(lambda: messages, "nothing is said")
     (process,) = pages(tmp_path)
     assert os.getpriority(os.PRIO_PROCESS, process) >= NICENESS
@@ -165,10 +163,9 @@ def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_
     if group.exists() and group.read_text().strip():
         assert group.read_text().endswith(f"nice {NICENESS}\n")
 
-    page.end()
-    time.sleep(5.0)
     connection = opened(messages[0])
-    time.sleep(5.0)
+    page.end()
+    time.sleep(server.LEAVE_SECONDS + 3.0)
     assert pages(tmp_path), "the page left those who look"
     connection.close()
     connection.sock = None
@@ -179,8 +176,7 @@ def test_the_page_waits_for_a_first_browser_and_stays_until_the_last_leaves(tmp_
 def test_a_page_whose_address_nobody_has_ends_with_the_run(tmp_path):
     Writer(tmp_path / "run").write()
     messages = []
-    page = LivePage("127.0.0.1", 0, messages.append, messages.append)
-    page.show(tmp_path / "run")
+    page = LivePage(tmp_path / "run", "127.0.0.1", 0, messages.append, messages.append)
     page.end()
     until(lambda: not pages(tmp_path), "the page outlives its run")
     assert messages == []

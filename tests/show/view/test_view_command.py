@@ -13,7 +13,7 @@ from written_run import Writer, written
         (["nowhere"], "nowhere: no such folder"),
         (["."], ".: is not the folder of a run"),
         (["file"], "file: is a file"),
-        (["run", "--host", "192.0.2.1"], "--host: 192.0.2.1 is no address of this machine"),
+        (["run", "--host", "192.0.2.1"], "--host: '192.0.2.1' is no address of this machine"),
         (["run", "--host", ""], "--host: '' is no address of this machine"),
         (["run", "--port", "70000"], "--port"),
         (["run", "--port", "x"], "--port"),
@@ -62,23 +62,3 @@ def test_under_mpirun_one_rank_serves_and_all_end_alike(serve, tmp_path):
 def test_options_of_the_page_without_live_are_refused(tmp_path, option):
     refused(["run", *option], tmp_path, f"{option[0]}: says where the page of --live is")
     assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.parametrize(
-    ("variables", "opened"),
-    [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "b"}, True)],
-)
-def test_a_browser_is_opened_on_desktops(monkeypatch, variables, opened):
-    import webbrowser
-
-    from lyra_petsc.show.view import server
-
-    asked = []
-    monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
-    monkeypatch.setattr(server.sys, "platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    assert server.open_browser("http://127.0.0.1:1/") is opened
-    assert asked == ["http://127.0.0.1:1/"] * opened
