@@ -89,9 +89,9 @@ def _file_line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
     return f"{'film':<8} {path}  ({count / timing.fps:.3g} s, {count} frames, {timing.fps:g} a second)"
 
 
-@verb("lyra-petsc export runs/flag --to gltf", start=Session.without_petsc)
+@verb("lyra-petsc export runs/flag --to usd", start=Session.without_petsc)
 @results
-@click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")
+@click.option("--to", required=True, metavar="FORMAT", help="obj, ply, usd or npz.")
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the files (RUN/FORMAT)."
 )

@@ -1,11 +1,10 @@
-"""Export of a run's states to formats of other programs: OBJ, PLY, npz, vtkhdf, glTF, USD.
+"""Export of a run's states to formats of other programs: OBJ, PLY, USD and NumPy's npz.
 
 In: a run's folder. Out: a folder of files, which appears when it is complete.
 
 Positions are exactly those of the states; vertices and triangles are in the order of the mesh file. OBJ and
 PLY have one file per state; OBJ is written here, as meshio writes neither all digits nor texture coordinates
-with seams. The other formats hold all states in one file: NumPy's .npz and VTK's .vtkhdf as arrays; glTF 2.0
-as the first state, a morph target for each further state and an animation; USD as a mesh whose points and
+with seams. The other formats hold all states in one file: npz as arrays; USD as a mesh whose points and
 fields are sampled over time.
 """
 
@@ -20,7 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,50 +30,17 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError, suggest
 from lyra_petsc.extras import require_packages
-from lyra_petsc.output.file_operations import HDF5_ERRORS, reason
+from lyra_petsc.output.file_operations import reason
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
-from lyra_petsc.output.stored import hdf5_properties, import_h5py
-from lyra_petsc.output.tensors import in_vtk_order, is_tensor
-from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, create_metadata
+from lyra_petsc.output.tensors import is_tensor
 from lyra_petsc.show.render.render_plan import parse_numbers, pick_state
-from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-EXPORTED_FILE = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
+EXPORTED_FILE = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(usdc|npz))|times\.csv")
 """Names of the files that an export writes; --force removes no folder with other files."""
-
-
-@dataclass(frozen=True)
-class ExportFormat:
-    """A format that the function ``write_<name>`` writes.
-
-    Attributes
-    ----------
-    packages : tuple of str
-        Packages of the extra ``export`` that it needs.
-    fields : bool
-        Whether it can hold fields besides positions.
-    sequence : bool
-        Whether each state has a file of its own, without its time.
-    """
-
-    packages: tuple[str, ...] = ()
-    fields: bool = True
-    sequence: bool = False
-
-
-FORMATS = {
-    "obj": ExportFormat(fields=False, sequence=True),
-    "ply": ExportFormat(("meshio",), sequence=True),
-    "gltf": ExportFormat(("pygltflib",), fields=False),
-    "usd": ExportFormat(("pxr",)),
-    "vtkhdf": ExportFormat(),
-    "npz": ExportFormat(),
-}
-"""Formats by their names in ``--to``."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +111,7 @@ def export_run(
     name = re.sub(r"[^\w.+-]", "_", stored.name).strip(".") or "run"
 
     def work(part: Path) -> None:
-        globals()[f"write_{to}"](states, part, name)
+        FORMATS[to].write(states, part, name)
         if FORMATS[to].sequence and len(states) > 1:
             with open(part / "times.csv", "w", encoding="utf-8", newline="") as file:
                 table = csv.writer(file, lineterminator="\n")
@@ -348,19 +314,6 @@ def select_states(run: StoredRun, times: str | None, every: int | None) -> Expor
     return ExportedStates(run, tuple(sorted(indices)))
 
 
-def rotation_to_up(up: tuple[int, int], target: int) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of the rotation from the axis ``up`` (axis, sign) to the axis ``target``."""
-    start, end = np.zeros(3), np.zeros(3)
-    start[up[0]], end[target] = up[1], 1.0
-    if start @ end < -0.5:  # opposite: half a turn about one of the other axes
-        axis = np.zeros(3)
-        axis[(target + 1) % 3] = 1.0
-        return (*axis.tolist(), 0.0)
-    quaternion = np.append(np.cross(start, end), 1.0 + start @ end)
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion)).tolist()
-    return x, y, z, w
-
-
 def write_obj(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>_0000.obj``, …, with the mesh's texture coordinates if it has any.
 
@@ -431,10 +384,6 @@ def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
             meshio.write(folder / f"{name}-{label}_{number:04d}.ply", meshio.Mesh(x, cells), binary=True)
 
 
-OVERHEAD = 1 << 17
-"""Bytes that an HDF5 file needs beyond its data."""
-
-
 def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>.npz``, one state in memory at a time.
 
@@ -478,258 +427,6 @@ def _write_array(
             file.write(np.ascontiguousarray(array, dtype=first.dtype).data.cast("B"))
 
 
-def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>.vtkhdf``: times, positions, rest shape and all fields, in double precision.
-
-    Obstacles have files of their own, ``<name>-<obstacle>.vtkhdf``.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
-    run = states.run
-    fields = {field: (states.field_on(field), states.field(field)) for field in states.fields}
-    moving = {"Points": ("vertex", states.positions), **fields}
-    _write_series(folder / f"{name}.vtkhdf", states.times, run.triangles, {"rest": run.rest}, moving)
-    for label, obstacle in states.obstacles.items():
-        path, points = folder / f"{name}-{label}.vtkhdf", states.obstacle_points(obstacle)
-        _write_series(path, states.times, obstacle.triangles, {}, {"Points": ("vertex", points)})
-
-
-def _write_series(
-    path: Path,
-    times: Array,
-    triangles: Ints,
-    fixed: dict[str, Array],
-    moving: dict[str, tuple[str, Iterator[NDArray[Any]]]],
-) -> None:
-    """Write a time series of triangles to a VTKHDF file.
-
-    Parameters
-    ----------
-    path : Path
-    times : (T,)
-        Times of the states [s].
-    triangles : (F, 3)
-    fixed : dict of arrays
-        Arrays on vertices that all states share.
-    moving : dict of (str, iterator)
-        ``vertex`` or ``triangle``, and an array for each state; ``Points`` are the positions [m].
-    """
-    n, arrays, samples = len(times), {}, {}
-    for field, (_, each) in moving.items():
-        samples[field] = next(each)
-        arrays[field] = chain([samples[field]], each)
-    size = n * sum(array.nbytes for array in samples.values()) + 2 * triangles.nbytes + 64 * n + OVERHEAD
-    try:
-        _reserve_bytes(path, size + 2 * sum(array.nbytes for array in fixed.values()))
-        datasets = {}
-        with import_h5py().File(path, "w") as file:
-            root = create_metadata(file, times.tolist(), len(samples["Points"]), len(triangles))
-            for key, array in cells(triangles).items():
-                root[key] = array
-            for key, array in fixed.items():
-                root[f"PointData/{key}"] = array
-                add_offsets(root, "vertex", key, n, 0)
-            for field, first in samples.items():
-                on = moving[field][0]
-                datasets[field] = field if field == "Points" else f"{GROUPS[on]}/{field}"
-                _create_dataset(root, datasets[field], (n * len(first), *first.shape[1:]), first.dtype)
-                if field != "Points":
-                    add_offsets(root, on, field, n, len(first))
-        _reserve_bytes(path, path.stat().st_size)
-        with import_h5py().File(path, "r+") as file:
-            for field, each in arrays.items():
-                stored = file[f"VTKHDF/{datasets[field]}"]
-                for i, array in enumerate(each):
-                    stored[i * len(array) : (i + 1) * len(array)] = in_vtk_order(array)
-    except InputError:
-        raise
-    except HDF5_ERRORS as error:
-        raise OutputError(f"{path.name}: cannot be written: {reason(error)}") from error
-
-
-def _reserve_bytes(path: Path, size: int) -> None:
-    """Allocate a file's bytes in advance: HDF5 crashes if the disk is full when a file is closed."""
-    with open(path, "r+b" if path.exists() else "wb") as raw:
-        os.posix_fallocate(raw.fileno(), 0, size)
-
-
-def _create_dataset(root: Any, name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
-    """Create a dataset whose space in the file is allocated at once; its values are written later."""
-    h5py = import_h5py()
-    space, stored = h5py.h5s.create_simple(shape), h5py.h5t.py_create(kind, logical=True)
-    h5py.h5d.create(root.id, name.encode(), stored, space, hdf5_properties()[0])
-
-
-MAX_FILE_BYTES = 2**32
-"""Maximum size of a file [bytes], as the format counts them in 32 bits."""
-
-CLOTH = {"baseColorFactor": [0.75, 0.72, 0.66, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
-OBSTACLE = [0.35, 0.37, 0.4]
-"""Materials of glTF, which are visible from both sides."""
-
-VERTICES, INDICES, UNSIGNED_INT, FLOAT = 34962, 34963, 5125, 5126
-"""glTF's codes of the targets ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER, and of component types."""
-
-
-def write_gltf(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>.glb`` in single precision.
-
-    Vertices on a texture seam are stored once for each side; ``extras.vertex`` of the mesh then holds the
-    vertex numbers of the mesh file. Obstacles are meshes and nodes of their own.
-
-    Raises
-    ------
-    InputError
-        If the states are too large for the format.
-    """
-    from pygltflib import GLTF2
-
-    run, n = states.run, len(states)
-    source, triangles, uv = np.arange(len(run.rest)), run.triangles, run.uv
-    if uv is None and run.corner_uv is not None:
-        source, triangles, uv = split_at_seams(triangles, run.corner_uv)
-    # positions stay unchanged: a rotation makes y, the format's upward axis, point up
-    document = _GltfDocument(states.times, rotation_to_up(states.up, 1))
-    document.check_size(n * len(source) + sum(len(s.positions(0.0)) * n for s in states.obstacles.values()))
-    title = run.scene.title or run.name
-    cloth = document.add(title, 0, triangles, (position[source] for position in states.positions))
-    if uv is not None:  # glTF's v points downwards
-        texture = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
-        cloth["primitives"][0]["attributes"]["TEXCOORD_0"] = document.buffer.add(texture, target=VERTICES)
-    if len(source) != len(run.rest):
-        cloth["extras"] = {"vertex": source.tolist()}
-    for obstacle in states.obstacles.values():
-        points = islice(states.obstacle_points(obstacle), 1 if obstacle.fixed else n)
-        material = 1 if obstacle.opacity == 1.0 else 2
-        document.add(obstacle.name, material, obstacle.triangles, points)
-    gltf = GLTF2.from_dict(document.content(title, obstacles=bool(states.obstacles)))
-    gltf.set_binary_blob(bytes(document.buffer.data))
-    gltf.save_binary(str(folder / f"{name}.glb"))
-
-
-class _GltfDocument:
-    """A glTF document of moving meshes, each with a node of its own; see `write_gltf`.
-
-    Parameters
-    ----------
-    times : (n,) float64
-        Times of the states [s].
-    rotation : (4,) float
-        Quaternion of all nodes.
-    """
-
-    def __init__(self, times: Array, rotation: tuple[float, ...]) -> None:
-        self.buffer = _GltfBuffer()
-        self._times, self._rotation = times, rotation
-        self._meshes: list[dict[str, Any]] = []
-        self._nodes: list[dict[str, Any]] = []
-        self._moving: list[int] = []
-
-    def check_size(self, points: int) -> None:
-        """Check that the format can hold this number of points of all states together."""
-        if (size := points * 24) >= MAX_FILE_BYTES:
-            raise InputError(
-                f"{len(self._times)} states take {size / 2**30:.0f} GiB, 4 are the most; choose fewer by "
-                "--every, or another format",
-                key="gltf",
-            )
-
-    def add(
-        self,
-        name: str,
-        material: int,
-        triangles: Ints,
-        positions: Iterator[Array],
-    ) -> dict[str, Any]:
-        """Add a mesh: positions and normals of the first state, and differences from them for the others.
-
-        ``positions`` yields an array (V, 3) [m] for each state, or a single one of a mesh that does not move.
-        Returns the mesh's entry, to which attributes can be added.
-        """
-        start = next(positions)
-        position, normal = start.astype(np.float32), _normals(start, triangles).astype(np.float32)
-
-        def stored(x: NDArray[Any], normals: NDArray[Any]) -> dict[str, int]:
-            return {
-                "POSITION": self.buffer.add(x, target=VERTICES, bounds=True),
-                "NORMAL": self.buffer.add(normals, target=VERTICES),
-            }
-
-        primitive: dict[str, Any] = {"attributes": stored(position, normal), "material": material}
-        targets = [stored(moved - position, _normals(moved, triangles) - normal) for moved in positions]
-        primitive["indices"] = self.buffer.add(triangles.astype(np.uint32).ravel(), target=INDICES)
-        mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
-        if targets:
-            primitive["targets"] = targets
-            mesh["weights"] = [0.0] * len(targets)
-            self._moving.append(len(self._nodes))
-        self._nodes.append({"name": name, "mesh": len(self._meshes), "rotation": self._rotation})
-        self._meshes.append(mesh)
-        return mesh
-
-    def content(self, title: str, *, obstacles: bool) -> dict[str, Any]:
-        """The complete document; no mesh may be added afterwards."""
-        materials = [{"name": "cloth", "pbrMetallicRoughness": CLOTH, "doubleSided": True}]
-        for name, opacity in (("obstacle", 1.0), ("see-through obstacle", 0.3)) if obstacles else ():
-            look = {**CLOTH, "baseColorFactor": [*OBSTACLE, opacity]}
-            blend = {} if opacity == 1.0 else {"alphaMode": "BLEND"}
-            materials.append({"name": name, "pbrMetallicRoughness": look, "doubleSided": True, **blend})
-        document: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": "lyra_petsc"},
-            "materials": materials,
-            "meshes": self._meshes,
-            "nodes": self._nodes,
-            "scenes": [{"name": title, "nodes": list(range(len(self._nodes)))}],
-            "scene": 0,
-        }
-        n = len(self._times)
-        if self._moving:
-            times = self.buffer.add(self._times.astype(np.float32), bounds=True)
-            weights = self.buffer.add(np.eye(n, dtype=np.float32)[:, 1:].ravel())
-            sampler = {"input": times, "output": weights, "interpolation": "LINEAR"}
-            channels = [{"sampler": 0, "target": {"node": i, "path": "weights"}} for i in self._moving]
-            document["animations"] = [{"name": "run", "samplers": [sampler], "channels": channels}]
-        document |= {"bufferViews": self.buffer.views, "accessors": self.buffer.accessors}
-        return document | {"buffers": [{"byteLength": len(self.buffer.data)}]}
-
-
-def _normals(x: Array, triangles: Ints) -> Array:
-    """(V, 3) unit normals of vertices; z if a vertex's triangles have no area."""
-    normals = vertex_normals(x, triangles)
-    normals[~normals.any(axis=1)] = 0.0, 0.0, 1.0
-    return normals
-
-
-class _GltfBuffer:
-    """The binary part of a glTF file, with the views and accessors that describe its arrays."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(self, array: NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (n,), (n, 2) or (n, 3); returns the index of its accessor."""
-        rows = array if array.dtype == np.uint32 else array.astype(np.float32)
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": rows.nbytes, "target": target}
-        accessor = {
-            "bufferView": len(self.views),
-            "componentType": UNSIGNED_INT if rows.dtype == np.uint32 else FLOAT,
-            "count": len(rows),
-            "type": "SCALAR" if rows.ndim == 1 else f"VEC{rows.shape[1]}",
-        }
-        if bounds:
-            accessor["min"] = np.atleast_1d(rows.min(axis=0)).tolist()
-            accessor["max"] = np.atleast_1d(rows.max(axis=0)).tolist()
-        self.data += rows.tobytes()
-        self.views.append(view)
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-
 ROOT = "/run"
 MESH = f"{ROOT}/cloth"
 OBSTACLE_COLOUR = (0.6, 0.63, 0.66)
@@ -769,8 +466,8 @@ def _fill_stage(stage: Any, states: ExportedStates) -> None:
         UsdGeom.SetStageUpAxis(stage, "XYZ"[states.up[0]])
     else:
         UsdGeom.SetStageUpAxis(stage, "Z")
-        x, y, z, w = rotation_to_up(states.up, 2)
-        root.AddOrientOp().Set(Gf.Quatf(w, x, y, z))
+        upwards = Gf.Vec3d(*(states.up[1] * np.eye(3)[states.up[0]]))
+        root.AddOrientOp().Set(Gf.Quatf(Gf.Rotation(upwards, Gf.Vec3d(0.0, 0.0, 1.0)).GetQuat()))
 
     rate = states.rate
     codes = states.times * rate
@@ -849,3 +546,34 @@ def _set_field(mesh: Any, primvars: Any, states: ExportedStates, field: str, cod
         attribute.Set(
             Vt.Vec3fArray.FromNumpy(values) if vector else Vt.FloatArray.FromNumpy(values.ravel()), code
         )
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format of ``--to``.
+
+    Attributes
+    ----------
+    write : callable
+        Writes states into a folder, to files that begin with a name.
+    packages : tuple of str
+        Packages of the extra ``export`` that it needs.
+    fields : bool
+        Whether it can hold fields besides positions.
+    sequence : bool
+        Whether each state has a file of its own, without its time.
+    """
+
+    write: Callable[[ExportedStates, Path, str], None]
+    packages: tuple[str, ...] = ()
+    fields: bool = True
+    sequence: bool = False
+
+
+FORMATS = {
+    "obj": ExportFormat(write_obj, fields=False, sequence=True),
+    "ply": ExportFormat(write_ply, ("meshio",), sequence=True),
+    "usd": ExportFormat(write_usd, ("pxr",)),
+    "npz": ExportFormat(write_npz),
+}
+"""Formats by their names in ``--to``."""

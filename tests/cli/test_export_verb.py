@@ -23,16 +23,17 @@ def test_states_are_exported_and_files_named(tmp_path: Path, ranks: int) -> None
 
 SLOW = """
 import sys, time
-from lyra_petsc.show import export
+from dataclasses import replace
+from lyra_petsc.show.export import FORMATS
 from lyra_petsc.cli.app import run_command_line
 
-write = export.write_obj
+form = FORMATS["obj"]
 
 def slowly(states, folder, name):
-    write(states, folder, name)
+    form.write(states, folder, name)
     time.sleep(60)
 
-export.write_obj = slowly
+FORMATS["obj"] = replace(form, write=slowly)
 sys.exit(run_command_line(sys.argv))
 """
 

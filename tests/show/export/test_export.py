@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from written_run import position, written, written_with_obstacles
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.show import export
-from lyra_petsc.show.export import FORMATS, ExportFormat, export_run
+from lyra_petsc.show.export import FORMATS, export_run
 
 
 def states(folder):
@@ -64,7 +64,7 @@ def test_mistakes_leave_no_files(tmp_path, asked, words):
 
 
 def test_a_missing_extra_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setitem(FORMATS, "usd", ExportFormat(("no_such_package",)))
+    monkeypatch.setitem(FORMATS, "usd", replace(FORMATS["usd"], packages=("no_such_package",)))
     with pytest.raises(InputError, match=r"no_such_package is not installed; .*lyra-petsc\[export\]'"):
         export_run(written(tmp_path / "run"), "usd")
 
@@ -92,13 +92,13 @@ def test_a_failure_keeps_the_existing_folder(tmp_path, monkeypatch):
     run, out = written(tmp_path / "run"), tmp_path / "out"
     export_run(run, "obj", out)
 
-    write_obj = export.write_obj
+    form = FORMATS["obj"]
 
     def fails(states, folder, name):
-        write_obj(states, folder, name)
+        form.write(states, folder, name)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export, "write_obj", fails)
+    monkeypatch.setitem(FORMATS, "obj", replace(form, write=fails))
     with pytest.raises(OutputError, match=r"out: cannot be written: No space left on device"):
         export_run(run, "obj", out, force=True, every=2)
     assert states(out) == [0, 1, 2]

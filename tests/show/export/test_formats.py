@@ -1,8 +1,5 @@
 """Exported files of each format, read back, equal the states within the format's precision."""
 
-import json
-import shutil
-
 import numpy as np
 import pytest
 from written_run import (
@@ -22,7 +19,7 @@ from lyra_petsc.mesh.obj_file import read_obj
 from lyra_petsc.output.file_operations import replace_text
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.show.export import export_run, rotation_to_up
+from lyra_petsc.show.export import export_run
 
 pytestmark = pytest.mark.quick
 
@@ -73,7 +70,7 @@ def test_ply(tmp_path):
         np.testing.assert_array_equal(found, velocity(state))
 
 
-@pytest.mark.parametrize("to", ["npz", "vtkhdf", "ply", "usd"])
+@pytest.mark.parametrize("to", ["npz", "ply", "usd"])
 def test_displacement_is_added_on_request(tmp_path, to):
     """From the run's first state, whichever states are chosen."""
     run = written(tmp_path / "run", states=4)
@@ -84,9 +81,6 @@ def test_displacement_is_added_on_request(tmp_path, to):
         if to == "npz":
             found = dict(np.load(file))
             found = found.get("displacement", [None])[0]
-        elif to == "vtkhdf":
-            ((*_, arrays),) = pytest.importorskip("vtkhdf_reader").read(file)
-            found = arrays["vertex"].get("displacement")
         elif to == "ply":
             data = pytest.importorskip("meshio").read(file).point_data
             found = np.stack([data[f"displacement_{i}"] for i in "xyz"], 1) if asked else None
@@ -104,86 +98,9 @@ def test_displacement_is_added_on_request(tmp_path, to):
             assert found is None
 
 
-@pytest.mark.parametrize("to", ["obj", "gltf"])
-def test_formats_of_positions_alone_refuse_displacement(tmp_path, to):
-    run = written(tmp_path / "run")
-    with pytest.raises(InputError, match=r"--displacement: .*positions alone; take --to ply, usd, vtkhdf"):
-        export_run(run, to, displacement=True)
-
-
-def read_glb(path):
-    """The JSON document, and a function that reads an accessor by the rules of the format."""
-    pygltflib = pytest.importorskip("pygltflib")
-    gltf = pygltflib.GLTF2().load(str(path))
-    blob = gltf.binary_blob()
-
-    def read(number):
-        accessor = gltf.accessors[number]
-        view = gltf.bufferViews[accessor.bufferView]
-        kind = {pygltflib.FLOAT: np.float32, pygltflib.UNSIGNED_INT: np.uint32}[accessor.componentType]
-        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor.type]
-        rows = np.frombuffer(blob, kind, accessor.count * width, view.byteOffset).reshape(-1, width)
-        assert view.byteLength == rows.nbytes
-        if accessor.min:
-            np.testing.assert_array_equal(rows.min(axis=0), single(accessor.min))
-            np.testing.assert_array_equal(rows.max(axis=0), single(accessor.max))
-        return rows[:, 0] if width == 1 else rows
-
-    return gltf, read
-
-
-@pytest.mark.parametrize("vt", VT)
-def test_gltf(tmp_path, vt):
-    done = export_run(written(tmp_path / "run", states=4, vt=vt), "gltf")
-    gltf, read = read_glb(done.folder / "run.glb")
-    (mesh,) = gltf.meshes
-    (primitive,) = mesh.primitives
-    split = np.array(mesh.extras["vertex"]) if vt == "seam" else np.arange(len(REST))
-
-    base = read(primitive.attributes.POSITION)
-    moved = [read(target["POSITION"]) for target in primitive.targets]
-    sampler = gltf.animations[0].samplers[0]
-    np.testing.assert_array_equal(read(sampler.input), single([0.0, 0.1, 0.2, 0.1 * 3]))
-    weights = read(sampler.output).reshape(4, 3)
-    for state in range(4):
-        shown = base + sum(weight * target for weight, target in zip(weights[state], moved, strict=True))
-        np.testing.assert_allclose(shown, position(state)[split], rtol=0, atol=5e-7)
-        normals = read(primitive.attributes.NORMAL) + sum(
-            weight * read(target["NORMAL"])
-            for weight, target in zip(weights[state], primitive.targets, strict=True)
-        )
-        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
-    triangles = read(primitive.indices).reshape(-1, 3)
-    np.testing.assert_array_equal(split[triangles], TRIANGLES)
-    if vt == "none":
-        assert primitive.attributes.TEXCOORD_0 is None
-    else:
-        uv = read(primitive.attributes.TEXCOORD_0)[triangles]
-        uv = np.stack([uv[..., 0], 1.0 - uv[..., 1]], axis=-1)
-        np.testing.assert_allclose(uv, SEAM_UV if vt == "seam" else UV, atol=1e-6)
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(gltf.nodes[0].rotation, [-half, 0, 0, half])  # z, against gravity, up
-
-
-@pytest.mark.parametrize("vt", ["none", "each vertex"])
-def test_gltf_animated_by_the_rules_of_the_format(tmp_path, vt):
-    geometry = pytest.importorskip("vtkmodules.vtkIOGeometry")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    done = export_run(written(tmp_path / "run", states=4, vt=vt), "gltf")
-    reader = geometry.vtkGLTFReader()
-    reader.SetFileName(str(done.folder / "run.glb"))
-    reader.SetFrameRate(1000)
-    reader.UpdateInformation()
-    reader.EnableAnimation(0)
-    for state in range(4):
-        reader.UpdateTimeStep(0.1 * state)
-        block = reader.GetOutputDataObject(0)
-        while block.IsA("vtkMultiBlockDataSet"):
-            block = block.GetBlock(0)
-        x, y, z = position(state).T
-        shown = vtk_to_numpy(block.GetPoints().GetData())
-        np.testing.assert_allclose(shown, np.stack([x, z, -y], axis=1), rtol=0, atol=1e-6)
+def test_obj_holds_positions_alone(tmp_path):
+    with pytest.raises(InputError, match=r"--displacement: .*positions alone; take --to ply, usd, npz"):
+        export_run(written(tmp_path / "run"), "obj", displacement=True)
 
 
 def usd_errors(stage):
@@ -247,35 +164,14 @@ def test_npz(tmp_path, vt):
     assert (units["time"], units["position"], units["velocity"], units["stress"]) == ("s", "m", "m/s", "N/m")
 
 
-def test_vtkhdf(tmp_path):
-    reader = pytest.importorskip("vtkhdf_reader")
-    done = export_run(written(tmp_path / "run", states=4), "vtkhdf", tmp_path / "out", every=2)
-    shutil.rmtree(tmp_path / "run")  # the export is self-contained
-    for i, (time, points, triangles, arrays) in zip(
-        (0, 2), reader.read(done.folder / "run.vtkhdf"), strict=True
-    ):
-        assert time == 0.1 * i
-        np.testing.assert_array_equal(points, position(i))
-        np.testing.assert_array_equal(triangles, TRIANGLES)
-        np.testing.assert_array_equal(arrays["vertex"]["rest"], REST)
-        np.testing.assert_array_equal(arrays["vertex"]["velocity"], velocity(i))
-        np.testing.assert_array_equal(arrays["triangle"]["stress"], stress(i))
-
-
-@pytest.mark.parametrize("to", ["obj", "ply", "gltf", "usd", "npz", "vtkhdf"])
+@pytest.mark.parametrize("to", ["obj", "ply", "usd", "npz"])
 def test_a_single_state_of_a_named_run(tmp_path, to):
     folder = tmp_path / "Fähnchen 旗 (1)"
     done = export_run(written(folder, states=1, fields=False), to)
     assert done.states == 1
     (name,) = done.files
     assert name.startswith("Fähnchen_旗__1_")
-    if to == "gltf":
-        gltf, read = read_glb(done.folder / name)
-        assert not gltf.animations
-        np.testing.assert_array_equal(
-            read(gltf.meshes[0].primitives[0].attributes.POSITION), single(position(0))
-        )
-    elif to == "usd":
+    if to == "usd":
         from pxr import Usd, UsdGeom
 
         stage = Usd.Stage.Open(str(done.folder / name))
@@ -284,7 +180,9 @@ def test_a_single_state_of_a_named_run(tmp_path, to):
         assert stage.GetDefaultPrim().GetDisplayName() == folder.name
 
 
-@pytest.mark.parametrize(("gravity", "axis"), [([0, -9.81, 0], "Y"), ([9.81, 0, 0], "Z"), (None, "Z")])
+@pytest.mark.parametrize(
+    ("gravity", "axis"), [([0, -9.81, 0], "Y"), ([9.81, 0, 0], "Z"), ([0, 0, 9.81], "Z"), (None, "Z")]
+)
 def test_the_vertical_axis_is_against_gravity(tmp_path, gravity, axis):
     pytest.importorskip("pxr")
     from pxr import Gf, Usd, UsdGeom
@@ -297,26 +195,6 @@ def test_the_vertical_axis_is_against_gravity(tmp_path, gravity, axis):
     against = Gf.Vec3d(*(-np.array(gravity or [0, 0, -1.0]))).GetNormalized()
     up = Gf.Vec3d(*("XYZ".index(axis) == np.arange(3)).astype(float))
     np.testing.assert_allclose(matrix.TransformDir(against), up, atol=1e-6)
-
-
-@pytest.mark.parametrize("target", [0, 1, 2])
-@pytest.mark.parametrize("up", [(axis, sign) for axis in range(3) for sign in (-1, 1)])
-def test_rotations_that_make_an_axis_vertical(up, target):
-    x, y, z, w = rotation_to_up(up, target)
-    assert x * x + y * y + z * z + w * w == pytest.approx(1.0)
-    vector, q = np.zeros(3), np.array([x, y, z])
-    vector[up[0]] = up[1]
-    turned = vector + 2 * np.cross(q, np.cross(q, vector) + w * vector)
-    np.testing.assert_allclose(turned, np.arange(3) == target, atol=1e-12)
-
-
-def test_json_of_a_glb_holds_no_empty_values(tmp_path):
-    done = export_run(written(tmp_path / "run"), "gltf")
-    raw = (done.folder / "run.glb").read_bytes()
-    length = int.from_bytes(raw[12:16], "little")
-    text = json.dumps(json.loads(raw[20 : 20 + length]))
-    assert "null" not in text
-    assert "[]" not in text
 
 
 def read_objects(to, folder):
@@ -347,22 +225,6 @@ def read_objects(to, folder):
             name = file.stem.removeprefix("run-")[:-5]
             found.setdefault(name, ([], mesh.cells_dict["triangle"]))[0].append(mesh.points)
         return {name: (np.array(x), faces) for name, (x, faces) in found.items()}
-    if to == "vtkhdf":
-        read = pytest.importorskip("vtkhdf_reader").read
-        steps = {file.stem.removeprefix("run-"): read(file) for file in folder.glob("run-*")}
-        return {name: (np.array([x for _, x, _, _ in each]), each[0][2]) for name, each in steps.items()}
-    if to == "gltf":
-        gltf, read = read_glb(folder / "run.glb")
-        found, moving = {}, {channel.target.node for channel in gltf.animations[0].channels}
-        assert 0 in moving
-        for number, node in enumerate(gltf.nodes[1:], 1):
-            (primitive,) = gltf.meshes[node.mesh].primitives
-            assert gltf.materials[primitive.material].name.endswith("obstacle")
-            x = [read(primitive.attributes.POSITION)]
-            assert (number in moving) == bool(primitive.targets)
-            x.append(x[0] + (read(primitive.targets[0]["POSITION"]) if primitive.targets else 0))
-            found[node.name] = np.array(x), read(primitive.indices).reshape(-1, 3)
-        return found
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
@@ -375,7 +237,7 @@ def read_objects(to, folder):
     return found
 
 
-@pytest.mark.parametrize("to", ["obj", "ply", "npz", "vtkhdf", "gltf", "usd"])
+@pytest.mark.parametrize("to", ["obj", "ply", "npz", "usd"])
 def test_obstacles_are_separate_objects(tmp_path, to):
     """A ball that moves by 1.5 m along x and a triangle at rest; the cloth is as without them."""
     export_run(written_with_obstacles(tmp_path / "run"), to, tmp_path / "out", times="0,0.5")
