@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import os
 import signal
 import sys
@@ -68,40 +67,36 @@ def in_notebook() -> bool:
 
 
 class NotebookProgress(ProgressCallbacks):
-    """Calls a function after each step, and shows a bar below the cell."""
+    """Calls a function after each step, and shows rich's bar below the cell."""
 
     def __init__(self, on_step: OnStep | None, *, shown: bool) -> None:
-        self._on_step, self._text, self._fraction = on_step, "set-up and first step", 0.0
-        self._drawn, self._handle = -REDRAW_SECONDS, None
+        self._on_step, self._drawn, self._handle = on_step, -REDRAW_SECONDS, None
         if shown:
             from IPython.display import display
+            from rich.progress import BarColumn, Progress, TextColumn
 
-            self._handle = display(self, display_id=True)
+            self._bar = Progress(BarColumn(), TextColumn("{task.description}", markup=False))
+            self._task = self._bar.add_task("set-up and first step", total=1.0)
+            self._handle = display(self._bar, display_id=True)
 
     def step(self, simulation: SteppedScene, report: StepReport) -> None:
         end = simulation.control.end
-        self._fraction = min(report.time / end, 1.0)
-        self._text = f"step {report.step}, t = {report.time:.4g} of {end:.4g}"
-        if time.monotonic() - self._drawn >= REDRAW_SECONDS:
-            self._draw()
+        self._draw(f"step {report.step}, t = {report.time:.4g} of {end:.4g}", min(report.time / end, 1.0))
         if self._on_step is not None:
             self._on_step(report)
 
+    def _draw(self, text: str, fraction: float | None = None) -> None:
+        if self._handle is None:
+            return
+        self._bar.update(self._task, description=text, completed=fraction)
+        if fraction is None or time.monotonic() - self._drawn >= REDRAW_SECONDS:
+            self._drawn = time.monotonic()
+            self._handle.update(self._bar)
+
     def end(self, outcome: str) -> None:
         """Show how the run ended."""
-        self._text += f", {outcome}"
-        self._draw()
-
-    def _draw(self) -> None:
-        self._drawn = time.monotonic()
         if self._handle is not None:
-            self._handle.update(self)
-
-    def _repr_html_(self) -> str:
-        return f'<progress max="1" value="{self._fraction:.4f}"></progress> {html.escape(self._text)}'
-
-    def __repr__(self) -> str:
-        return f"{self._fraction:.0%} {self._text}"
+            self._draw(f"{self._bar.tasks[0].description}, {outcome}")
 
 
 @contextmanager

@@ -33,12 +33,12 @@ class FitProgress(ProgressBar, FitObserver):
         self._cost = ""
 
     def progress(self, number: int, part: float) -> None:
-        self._show(min(part, 0.999), f"evaluation {number}{self._cost}")
+        self.show(min(part, 0.999), f"evaluation {number}{self._cost}")
 
     def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
         self._cost = f"  sum of squares {2.0 * evaluation.cost:.5g}"
         source = " (from before)" if resumed else ""
-        self._print_line(f"evaluation {number}{self._cost}{source}")
+        self.say(f"evaluation {number}{self._cost}{source}")
 
 
 def fit(

@@ -15,14 +15,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from typing_extensions import Self
 
-MIN_STEPS = 3
-MIN_SECONDS, MIN_FRACTION = 2.0, 0.05
-"""Steps, and seconds or fraction of the run, after which the remaining time is estimated."""
+ESTIMATE_UPDATES, ESTIMATE_SECONDS, ESTIMATE_FRACTION = 3, 2.0, 0.05
+"""Updates, and seconds or part of the work, after which the remaining time is shown."""
 
 REDRAW_SECONDS = 0.1
-LINE_SECONDS = 2.0  # minimum time between plain lines;
-LINE_FRACTION = 0.05  # one is printed for each 5 % of the run
-MAX_LINE_SECONDS = 60.0  # or each minute, whichever comes first
+LINE_SECONDS, LINE_FRACTION = 2.0, 0.05
+MAX_LINE_SECONDS = 60.0
+"""A plain line is printed for each 5 % of the work, not more often than each two seconds, or each minute."""
 
 
 class ProgressBar:
@@ -51,9 +50,9 @@ class ProgressBar:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
         self._drawn = -math.inf  # clock time when the bar was last drawn
-        self._last_line, self._last_fraction = clock(), 0.0  # time and fraction of the last plain line
+        self._printed = -math.inf, -math.inf  # clock time and fraction of the last plain line
         self._pending = ""  # a line that is not printed yet
-        self._first: tuple[float, float] | None = None  # time and work done at the first estimate
+        self._first, self._updates, self._fraction = (0.0, 0.0), 0, 0.0
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
             self._bar = _bar(self._stream)
@@ -70,41 +69,48 @@ class ProgressBar:
             else:
                 print(text, file=self._stream, flush=True)
 
-    def _show(
-        self, fraction: float, state: str, *, seconds: float = MAX_LINE_SECONDS, part: float = math.inf
-    ) -> None:
-        """Update the bar, or print a line if the last one is ``seconds`` or the fraction ``part`` ago."""
+    def show(self, fraction: float, text: str) -> None:
+        """Show the fraction of the work that is done, a text, and after some updates the time left.
+
+        Cheap enough to be called after each step.
+        """
         now = self._clock()
+        if not self._updates or fraction < self._fraction:  # the work begins, also once more
+            self._first, self._updates = (now, fraction), 0
+        self._updates, self._fraction = self._updates + 1, fraction
+        text += self._time_left(now - self._first[0], fraction - self._first[1])
         if self._bar is not None:
             with suppress(OSError):
-                self._bar.update(self._task, completed=fraction, state=state)
+                self._bar.update(self._task, completed=fraction, state=text)
                 if fraction >= 1.0 or now - self._drawn >= REDRAW_SECONDS:
                     self._drawn = now
                     self._bar.refresh()
             return
-        self._pending, since = f"{fraction:4.0%}  {state}", now - self._last_line
-        if since >= seconds or (since >= LINE_SECONDS and fraction - self._last_fraction >= part - 1e-9):
-            self._last_fraction = fraction
-            self._print_line(self._pending)
+        self._pending, since = f"{fraction:4.0%}  {text}", now - self._printed[0]
+        due = fraction - self._printed[1] >= LINE_FRACTION - 1e-9
+        if since >= MAX_LINE_SECONDS or (since >= LINE_SECONDS and due):
+            self._print_pending()
 
-    def _print_line(self, text: str) -> None:
-        self.say(text)
-        self._last_line, self._pending = self._clock(), ""
+    def _time_left(self, seconds: float, done: float) -> str:
+        """Estimate by the mean speed since the first update, as the first step takes longest."""
+        enough = seconds >= ESTIMATE_SECONDS or done >= ESTIMATE_FRACTION
+        if self._updates <= ESTIMATE_UPDATES or not enough or done <= 0.0:
+            return ""
+        return f"  {duration(seconds * (1.0 - self._fraction) / done)} left"
 
-    def _remaining(self, done: float, whole: float = 1.0) -> float:
-        """Estimated remaining seconds, at the mean speed since the first call; NaN at the first call."""
-        began, before = self._first = self._first or (self._clock(), done)
-        if done <= before:
-            return 0.0 if done >= whole else math.nan
-        return (self._clock() - began) * (whole - done) / (done - before)
+    def _print_pending(self) -> None:
+        self.say(self._pending)
+        self._printed, self._pending = (self._clock(), self._fraction), ""
 
     def close(self) -> None:
-        """Remove the bar."""
+        """Show the last update and remove the bar."""
         if self._bar is not None:
             with suppress(OSError):
                 self._bar.refresh()
                 self._bar.stop()
             self._bar = None
+        elif self._pending:
+            self._print_pending()
 
     def __enter__(self) -> Self:
         return self
@@ -136,12 +142,11 @@ class Progress(ProgressBar):
         self._name = "t" if unit else "load"
         self._unit = f" {unit}" if unit else ""
         self._start, self._end = start, end
-        self._steps, self._last_line = 0, -math.inf  # the first step is shown at once
 
     def update(
         self, step: int, time: float, newton_iterations: int, linear_iterations: int, energy: float
     ) -> None:
-        """Show an accepted step; cheap enough to be called after each.
+        """Show an accepted step.
 
         Parameters
         ----------
@@ -154,37 +159,13 @@ class Progress(ProgressBar):
         energy : float
             Kinetic and potential energy [J].
         """
-        now = self._clock()
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
-        # the estimate begins after the first step, which takes longer than later ones
-        remaining, self._steps = self._remaining(fraction), self._steps + 1
-        began, done = self._first or (now, fraction)
-        enough = now - began >= MIN_SECONDS or fraction - done >= MIN_FRACTION
-        state = (
+        self.show(
+            fraction,
             f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
-            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"
+            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J",
         )
-        if self._steps > MIN_STEPS and enough and math.isfinite(remaining):
-            state += f"  {duration(remaining)} left"
-        self._show(fraction, state, part=LINE_FRACTION)
-
-    def close(self) -> None:
-        """Show the last step and remove the bar."""
-        super().close()
-        if self._pending:
-            self._print_line(self._pending)
-
-
-class FrameProgress(ProgressBar):
-    """The progress of drawing."""
-
-    LINE_SECONDS = 10.0
-
-    def update(self, done: int, count: int) -> None:
-        """Show the number of states that are drawn."""
-        text = f"{done} of {count} states drawn  {duration(self._remaining(done, count))} left"
-        self._show(done / count, text, seconds=self.LINE_SECONDS)
 
 
 class StudyProgress(ProgressBar):
@@ -204,7 +185,7 @@ class StudyProgress(ProgressBar):
     def __init__(self, comm: MPI.Comm, stop: Callable[[], None], combinations: int, **options: Any) -> None:
         super().__init__(comm, **options)
         self._stop, self._combinations = stop, combinations
-        self._label, self._number, self._last_line = "", 0, -math.inf
+        self._label, self._number = "", 0
 
     def case(self, label: str, *, resumed: bool) -> None:
         """A case begins, or was finished before."""
@@ -212,17 +193,17 @@ class StudyProgress(ProgressBar):
         self._number += not reference
         self._label = label if reference else f"{self._number}/{self._combinations} {label}"
         if self._bar is None:
-            self._print_line(f"{self._label}: finished before" if resumed else self._label)
+            self.say(f"{self._label}: finished before" if resumed else self._label)
 
     def progress(self, done: float, whole: float) -> None:
         """Show the work done of the whole work; may raise, see ``stop``."""
         self._stop()
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
-        self._show(fraction, f"{self._label}  {duration(self._remaining(done, whole))} left")
+        self.show(fraction, self._label)
 
     def note(self, text: str) -> None:
         """Print a line for the user, above the bar."""
-        self._print_line(f"note: {text}")
+        self.say(f"note: {text}")
 
 
 def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | str, outcome: str) -> None:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 )
 def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: Any) -> None:
     """Draw pictures and films of RUN; without options a film and a contact sheet."""
-    from lyra_petsc.cli.progress import FrameProgress
+    from lyra_petsc.cli.progress import ProgressBar
     from lyra_petsc.cli.signals import StopRequest
     from lyra_petsc.errors import Interrupted
     from lyra_petsc.extras import require_packages
@@ -68,10 +68,10 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
 
     plan = on_root(comm, lambda: make_plan(options))
     stop = StopRequest(comm)
-    with FrameProgress(comm) as progress:
+    with ProgressBar(comm) as progress:
 
         def show_progress(done: int, count: int) -> None:
-            progress.update(done, count)
+            progress.show(done / count, f"{done} of {count} states drawn")
             if number := stop.signal_number():
                 raise Interrupted(f" after {done} of {count} states; a film is not kept in part", number)
 

@@ -45,7 +45,7 @@ MISTAKES = [
     ({"out": Path("text.png")}, "--out: cannot be made"),
     ({"settings": ("time.end=3",)}, "--set: 'time.end=3': the run is done, only render"),
     ({"settings": ("render.camera.angel=3",)}, "render.camera.angel: unknown key, did you mean 'angle'"),
-    ({"settings": ("render.camera.angle=0",)}, "render.camera.angle: must be from 1 to 120 degrees"),
+    ({"settings": ("render.camera.angle=0",)}, "render.camera.angle: must be >= 1, not 0"),
     ({"run": Path("nowhere")}, "nowhere: no such folder"),
     ({"run": Path("text.png")}, "text.png: is a file"),
 ]
