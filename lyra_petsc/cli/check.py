@@ -15,7 +15,7 @@ from rich.table import Table
 from lyra_petsc.arrays import Ints
 from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
-from lyra_petsc.mesh.weld import piece_of_triangles
+from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.load import default_scene
@@ -118,7 +118,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
 def _pieces(problem: Problem) -> str:
     """Number of pieces of the mesh, if there are several."""
     assert problem.mesh is not None
-    pieces = piece_of_triangles(problem.mesh.triangles).max() + 1
+    pieces = connected_pieces(problem.mesh.triangles).max() + 1
     return f", {pieces} pieces" if pieces > 1 else ""
 
 

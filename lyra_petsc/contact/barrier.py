@@ -694,7 +694,7 @@ def area_factors(triangles: Ints, area: Array) -> Ints:
     mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
     and friction would oscillate.
     """
-    sheet = np.unique(connected_pieces(triangles), return_inverse=True)[1]
+    sheet = connected_pieces(triangles)
     mean = np.bincount(sheet, area) / np.bincount(sheet)
     of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
     factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)

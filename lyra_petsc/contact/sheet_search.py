@@ -57,7 +57,7 @@ class SheetSearch:
 
     def __init__(self, surface: Ints, uv: Array) -> None:
         patch = patches.split_into_patches(uv.mean(axis=1), connected_pieces(surface))
-        patch = np.unique(connected_pieces(surface, patch), return_inverse=True)[1].astype(np.int64)
+        patch = connected_pieces(surface, patch)
         self._patch, self._flat = patch, patches.flat_patches(surface, uv, patch)
         self._n = len(self._flat.first) - 1
         # the vertices of each patch once, as places among the corners of all triangles

@@ -7,21 +7,20 @@ Triangles are oriented consistently: neighbours traverse their common edge in op
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
 from lyra_petsc.mesh.measures import plane_coordinates
 from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
-from lyra_petsc.mesh.topology import edge_table
-from lyra_petsc.mesh.weld import coincident_with, piece_of_triangles, weld
+from lyra_petsc.mesh.topology import connected_components, connected_pieces, edge_table
+from lyra_petsc.mesh.weld import coincident_with, weld
 from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
 
 # A triangle is degenerate if twice its area is below this fraction of its longest side squared. Slivers of
@@ -122,17 +121,23 @@ def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None
     disagree = corner[first] == corner[second]
     if not disagree.any():
         return
-    pairs = np.stack([first // 3, second // 3], axis=1)
-    turned = _triangles_to_reverse(len(sheet.triangles), pairs, disagree)
-    contradiction = pairs[(turned[pairs[:, 0]] != turned[pairs[:, 1]]) != disagree]
-    if contradiction.size:
-        shown = first_few(f"{one}-{other}" for one, other in contradiction.tolist())
+    n, one, other = len(sheet.triangles), first // 3, second // 3
+    # a triangle is two nodes, t as it is and n + t reversed; links join those of equal orientation
+    swap = np.where(disagree, n, 0)
+    links = [np.stack([one, other + swap], axis=1), np.stack([one + n, other + n - swap], axis=1)]
+    as_is, reversed_ = connected_components(2 * n, np.concatenate(links)).reshape(2, n)
+    if (cut := disagree & (as_is == reversed_)[one]).any():
+        shown = first_few(f"{a}-{b}" for a, b in zip(one[cut], other[cut], strict=True))
         raise InputError(
             f"the surface has one side only (a Möbius strip): cut it where triangles {shown} meet "
             "(counted from 0)",
             file=file,
             key=key,
         )
+    # each component has the lowest number of its nodes: that of the first triangle, as it is
+    turned = as_is > reversed_
+    component = np.minimum(as_is, reversed_)
+    turned ^= (2 * np.bincount(component, turned) > np.bincount(component))[component]
     sheet.triangles = sheet.triangles.copy()
     sheet.triangles[turned] = sheet.triangles[turned][:, [0, 2, 1]]
     if sheet.uv is not None:
@@ -141,34 +146,6 @@ def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None
     sheet.notes.append(
         f"{int(turned.sum())} of {len(turned)} triangles reversed for a consistent orientation"
     )
-
-
-def _triangles_to_reverse(n_triangles: int, pairs: Ints, disagree: Mask) -> Mask:
-    """Whether to reverse each triangle (F,), by breadth-first search in each connected component.
-
-    ``pairs`` (n, 2) are neighbours, ``disagree`` (n,) whether their orientations are opposite.
-    """
-    neighbours: list[list[tuple[int, bool]]] = [[] for _ in range(n_triangles)]
-    for (one, other), differs in zip(pairs.tolist(), disagree.tolist(), strict=True):
-        neighbours[one].append((other, differs))
-        neighbours[other].append((one, differs))
-    turned: list[bool | None] = [None] * n_triangles
-    for seed in range(n_triangles):
-        if turned[seed] is not None:
-            continue
-        turned[seed] = False
-        component, queue = [seed], deque([seed])
-        while queue:
-            triangle = queue.popleft()
-            for other, differs in neighbours[triangle]:
-                if turned[other] is None:
-                    turned[other] = bool(turned[triangle]) != differs
-                    component.append(other)
-                    queue.append(other)
-        if 2 * sum(bool(turned[t]) for t in component) > len(component):
-            for t in component:
-                turned[t] = not turned[t]
-    return np.array(turned, dtype=np.bool_)
 
 
 def grid_sheet(grid: Grid) -> Sheet:
@@ -474,7 +451,7 @@ def _coincident(mesh: Mesh) -> tuple[Ints, str]:
     same_source = source[pairs[:, 0]] == source[pairs[:, 1]]
     if not same_source.all():
         remedy += " within one file; put sheets that belong together into one, or move them apart"
-    pieces, n = int(piece_of_triangles(mesh.triangles).max()) + 1, len(pairs)
+    pieces, n = int(connected_pieces(mesh.triangles).max()) + 1, len(pairs)
     verb = "vertex coincides with another one" if n == 1 else "vertices coincide with others"
     return pairs[same_source], (
         f"the mesh is in {pieces} piece{'s' * (pieces > 1)}; {n} {verb} without being connected "

@@ -77,7 +77,7 @@ def symmetry_walls(scene: Scene, mesh: Mesh) -> list[Wall]:
     if not planes:
         return []
     sheet = np.zeros(len(x), dtype=np.int64)
-    sheet[triangles] = np.unique(connected_pieces(triangles), return_inverse=True)[1].reshape(-1, 1)
+    sheet[triangles] = connected_pieces(triangles)[:, None]
     walls = []
     for number, axis, position, held in planes:
         above = x[:, axis] - position

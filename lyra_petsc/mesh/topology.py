@@ -131,13 +131,16 @@ def unique_edges(triangles: Ints) -> Ints:
 
 
 def connected_pieces(triangles: Ints, patch: Ints | None = None) -> Ints:
-    """Number of the piece (F,) of each triangle (F, 3): triangles of a patch connected by vertices."""
+    """Number (F,), from 0 on, of the piece of each of triangles (F, 3): those that common vertices join,
+    within each ``patch`` (F,) if patches are given.
+    """
     node = triangles
     if patch is not None:
         patch_corners = np.column_stack([np.repeat(patch, 3), triangles.ravel()])
         node = np.unique(patch_corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([node[:, :2], node[:, 1:]])
-    return connected_components(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
+    component = connected_components(int(node.max(initial=-1)) + 1, links)
+    return np.unique(component[node[:, 0]], return_inverse=True)[1].astype(np.int64)
 
 
 def connected_components(n: int, pairs: Ints) -> Ints:

@@ -52,16 +52,3 @@ def weld(sheet: Sheet, points: Array, distance: float) -> int:
         ]
         drop_loose_vertices(sheet, noted=False)
     return dropped
-
-
-def piece_of_triangles(triangles: Ints) -> Ints:
-    """Number (F,), from 0 on, of the piece of each of triangles (F, 3): those that common vertices join."""
-    lowest: Ints = np.arange(int(triangles.max(initial=-1)) + 1)
-    while True:
-        before = lowest.copy()
-        of_triangle = lowest[triangles].min(axis=1)
-        for corner in triangles.T:
-            np.minimum.at(lowest, corner, of_triangle)
-        lowest = lowest[lowest]
-        if np.array_equal(before, lowest):
-            return np.unique(lowest[triangles[:, 0]], return_inverse=True)[1]

@@ -72,7 +72,7 @@ def nothing_holds(
     if not scene.time.static or scene.contact is not None or not loads:
         return []
     piece = np.empty(mesh.n_vertices, dtype=np.int64)
-    piece[mesh.triangles] = np.unique(connected_pieces(mesh.triangles), return_inverse=True)[1][:, None]
+    piece[mesh.triangles] = connected_pieces(mesh.triangles)[:, None]
     force: Array = np.zeros((mesh.n_vertices, 3))
     for entry in loads:
         term = make_term(entry, elements.get(entry.name), scene, rest.mass)

@@ -12,7 +12,8 @@ from physics import scene_of
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
-from lyra_petsc.mesh.weld import coincident_with, piece_of_triangles
+from lyra_petsc.mesh.topology import connected_pieces
+from lyra_petsc.mesh.weld import coincident_with
 from lyra_petsc.phases import Phases
 from lyra_petsc.stepping.problem import build_problem
 
@@ -54,8 +55,8 @@ def test_a_soup_is_noted_and_welded(tmp_path: Path) -> None:
     welded = mesh_of(file, weld=1e-9)
     assert welded.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
     assert welded.groups["b"].vertices.tolist() == [0, 2, 3]
-    assert piece_of_triangles(welded.triangles).tolist() == [0, 0]
-    assert piece_of_triangles(mesh.triangles).tolist() == [0, 1]
+    assert connected_pieces(welded.triangles).tolist() == [0, 0]
+    assert connected_pieces(mesh.triangles).tolist() == [0, 1]
     assert welded.notes == ["mesh.obj: 2 vertices welded to others; vertices are numbered anew"]
 
 

@@ -13,8 +13,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vector3 import area_normal, scaled
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_triangles
-from lyra_petsc.mesh.topology import enclosed_volumes
-from lyra_petsc.mesh.weld import piece_of_triangles
+from lyra_petsc.mesh.topology import connected_pieces, enclosed_volumes
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.handles.motion import Window
 from lyra_petsc.terms.rest import RestShape
@@ -51,7 +50,7 @@ def elements(rest: RestShape) -> Elements:
                 rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
             )
             triangles = rest.mesh.triangles[chosen]
-            volumes = enclosed_volumes(rest.mesh.positions, triangles, piece_of_triangles(triangles))
+            volumes = enclosed_volumes(rest.mesh.positions, triangles, connected_pieces(triangles))
             if load.pressure and volumes.min(initial=0.0) < 0.0:
                 effect = "compress" if load.pressure > 0.0 else "inflate"
                 rest.notes.append(
