@@ -10,7 +10,6 @@ import socket
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,66 +19,8 @@ from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
 OLDEST_PETSC = (3, 18)
 
 
-@dataclass
-class Installation:
-    """Facts about the installation and the MPI job; ``None`` for a missing part."""
-
-    ranks: int = 1
-    launched: int = 1
-    """Ranks that the launcher started, by its environment variables."""
-    ranks_per_host: dict[str, int] = field(default_factory=dict)
-    cores: int = 1
-    """Cores of the host of rank 0."""
-    threads: str = ""
-    """Value of OMP_NUM_THREADS; empty if unset."""
-    petsc: tuple[int, ...] | None = None
-    complex_scalars: bool = False
-    mpi_libraries: tuple[str, ...] = ()
-    """Files of the loaded MPI libraries."""
-    missing: list[str] = field(default_factory=list)
-    broken: dict[str, str] = field(default_factory=dict)
-
-
-def incompatibilities(found: Installation) -> list[str]:
-    """One line for each problem, with its remedy."""
-    lines = [f"{name} is missing: {_source(name)}." for name in found.missing]
-    lines += [f"{name} is there but fails: {error}." for name, error in found.broken.items()]
-    if found.ranks < found.launched:
-        lines.append(
-            f"The launcher started {found.launched} ranks but each of them sees {found.ranks}: mpi4py was "
-            "built with another MPI. Use the mpirun (or srun --mpi=…) of the MPI named above, or rebuild "
-            "mpi4py and petsc4py with the launcher's."
-        )
-    if len(found.mpi_libraries) > 1:
-        lines.append(
-            f"Two MPI libraries are loaded at once ({', '.join(found.mpi_libraries)}): mpi4py, petsc4py and "
-            "h5py must be built with the same one."
-        )
-    if found.petsc is not None and found.petsc[:2] < OLDEST_PETSC:
-        version, oldest = ".".join(map(str, found.petsc)), ".".join(map(str, OLDEST_PETSC))
-        lines.append(f"PETSc {version} is too old: {oldest} or newer is needed.")
-    if found.complex_scalars:
-        lines.append(
-            "PETSc was built with complex scalars: use a real build (Debian: python3-petsc4py-real; "
-            'conda-forge: "petsc=*=real*").'
-        )
-    threads = int(found.threads) if found.threads.isdigit() else 1
-    ranks = max(found.ranks_per_host.values(), default=1)
-    if threads > 1 and threads * ranks > found.cores:
-        lines.append(
-            f"OMP_NUM_THREADS={threads} on {ranks} ranks asks for more than the {found.cores} cores of a "
-            "host: set OMP_NUM_THREADS=1, the ranks are the parallelism."
-        )
-    return lines
-
-
-def _source(name: str) -> str:
-    if name in ("mpi4py", "PETSc", "h5py", "gmsh"):
-        return "install it from the distribution, conda-forge or the cluster's modules (see README.md)"
-    if name.startswith("PETSc "):
-        return "it comes with petsc4py"
-    return f"pip install {name}"
-
+Problems = list[str]
+"""One line for each part that does not fit, with its remedy."""
 
 EXTERNAL = ("ptscotch", "parmetis", "hypre", "ml", "mumps", "superlu_dist", "suitesparse", "hdf5")
 """Optional packages of PETSc that are relevant here (suitesparse contains CHOLMOD)."""
@@ -93,37 +34,59 @@ def info(comm: Any) -> str:
     str
         Several lines, the same on every rank, in which missing and broken parts are marked.
     """
-    hosts = comm.allgather(socket.gethostname())
-    facts = Installation(
-        ranks=comm.size,
-        launched=launched_ranks(os.environ),
-        ranks_per_host=dict(Counter(hosts)),
-        cores=os.cpu_count() or 1,
-        threads=os.environ.get("OMP_NUM_THREADS", ""),
-    )
+    hosts = Counter(comm.allgather(socket.gethostname()))
+    cores, problems = os.cpu_count() or 1, Problems()
     lines = [
         ("lyra_petsc", f"{__version__} in {Path(__file__).resolve().parents[1]}"),
         ("Python", f"{platform.python_version()} at {sys.executable}"),
-        ("system", f"{platform.system()} {platform.release()}, {platform.machine()}, {facts.cores} cores"),
+        ("system", f"{platform.system()} {platform.release()}, {platform.machine()}, {cores} cores"),
     ]
     for name, describe in PARTS.items():
-        lines.append((name, _described(name, describe, facts)))
+        lines.append((name, _described(name, describe, problems)))
     if comm.rank == 0:
         lines.append(("gmsh's sandbox", describe_sandbox(supported_layers())))
-    facts.mpi_libraries = loaded_mpi_libraries()
-    ranks = ", ".join(f"{count} on {host}" for host, count in facts.ranks_per_host.items())
-    lines.append(("ranks", ranks))
+    lines.append(("ranks", ", ".join(f"{count} on {host}" for host, count in hosts.items())))
+    check_ranks(problems, os.environ, comm.size, max(hosts.values()), cores)
+    libraries = loaded_mpi_libraries()
+    if len(libraries) > 1:
+        problems.append(
+            f"Two MPI libraries are loaded at once ({', '.join(libraries)}): mpi4py, petsc4py and h5py must "
+            "be built with the same one."
+        )
     width = max(len(name) for name, _ in lines)
-    text = [f"{name:<{width}}  {value}" for name, value in lines]
-    problems = incompatibilities(facts)
-    text.append("")
-    text += (
-        ["What does not fit together:", *(f"- {problem}" for problem in problems)]
-        if problems
-        else ["All fits together."]
-    )
+    text = [*(f"{name:<{width}}  {value}" for name, value in lines), ""]
+    text += ["What does not fit together:", *(f"- {problem}" for problem in problems)] if problems else []
     # rank 0 decides: h5py and the libraries are the same files on every rank
-    return comm.bcast("\n".join(text), root=0)
+    return comm.bcast("\n".join(text if problems else [*text, "All fits together."]), root=0)
+
+
+def check_ranks(
+    problems: Problems, environment: Mapping[str, str], ranks: int, ranks_here: int, cores: int
+) -> None:
+    """Check the ranks against the launcher's, and their threads against the cores of a machine.
+
+    Parameters
+    ----------
+    problems : list of str
+        Gets a line for each problem.
+    environment : mapping
+    ranks, ranks_here : int
+        Ranks of the job, and most ranks of a machine.
+    cores : int
+        Cores of a machine.
+    """
+    launched, threads = launched_ranks(environment), environment.get("OMP_NUM_THREADS", "")
+    if ranks < launched:
+        problems.append(
+            f"The launcher started {launched} ranks but each of them sees {ranks}: mpi4py was built with "
+            "another MPI. Use the mpirun (or srun --mpi=…) of the MPI named above, or rebuild mpi4py and "
+            "petsc4py with the launcher's."
+        )
+    if threads.isdigit() and int(threads) > 1 and int(threads) * ranks_here > cores:
+        problems.append(
+            f"OMP_NUM_THREADS={threads} on {ranks_here} ranks asks for more than the {cores} cores of a "
+            "host: set OMP_NUM_THREADS=1, the ranks are the parallelism."
+        )
 
 
 def launched_ranks(environment: Mapping[str, str]) -> int:
@@ -148,26 +111,26 @@ def loaded_mpi_libraries() -> tuple[str, ...]:
     return tuple(sorted(file for file in files if Path(file).name.startswith(names)))
 
 
-def _described(name: str, describe: Callable[[Installation], str], facts: Installation) -> str:
+def _described(name: str, describe: Callable[[Problems], str], problems: Problems) -> str:
     try:
-        return describe(facts)
+        return describe(problems)
     except ModuleNotFoundError:
-        facts.missing.append(name)
+        problems.append(f"{name} is missing: {SOURCES.get(name, f'pip install {name}')}.")
         return "missing"
     except Exception as error:  # a broken library may raise anything, and this verb must report it
-        facts.broken[name] = " ".join(str(error).split()) or type(error).__name__
+        problems.append(f"{name} is there but fails: {' '.join(str(error).split()) or type(error).__name__}.")
         return "broken"
 
 
-def _module_version(name: str) -> Callable[[Installation], str]:
-    def describe(facts: Installation) -> str:
+def _module_version(name: str) -> Callable[[Problems], str]:
+    def describe(problems: Problems) -> str:
         module = importlib.import_module(name)
         return str(getattr(module, "__version__", None) or importlib.metadata.version(name))
 
     return describe
 
 
-def _mpi(facts: Installation) -> str:
+def _mpi(problems: Problems) -> str:
     import mpi4py
     from mpi4py import MPI
 
@@ -176,15 +139,22 @@ def _mpi(facts: Installation) -> str:
     return f"{mpi4py.__version__} with {library} (MPI {standard})"
 
 
-def _petsc(facts: Installation) -> str:
+def _petsc(problems: Problems) -> str:
     import petsc4py
     from petsc4py import PETSc
 
-    facts.petsc = PETSc.Sys.getVersion()
-    facts.complex_scalars = PETSc.ScalarType().dtype.kind == "c"
-    scalar, index = PETSc.ScalarType().dtype.name, PETSc.IntType().dtype.name
-    version = ".".join(map(str, facts.petsc))
-    text = f"{version} (petsc4py {petsc4py.__version__}), {scalar} scalars, {index} indices"
+    version = PETSc.Sys.getVersion()
+    text = ".".join(map(str, version))
+    if version[:2] < OLDEST_PETSC:
+        oldest = ".".join(map(str, OLDEST_PETSC))
+        problems.append(f"PETSc {text} is too old: {oldest} or newer is needed.")
+    scalar, index = PETSc.ScalarType().dtype, PETSc.IntType().dtype
+    if scalar.kind == "c":
+        problems.append(
+            "PETSc was built with complex scalars: use a real build (Debian: python3-petsc4py-real; "
+            'conda-forge: "petsc=*=real*").'
+        )
+    text += f" (petsc4py {petsc4py.__version__}), {scalar.name} scalars, {index.name} indices"
     debugging = _petsc_debugging(petsc4py.get_config())
     if debugging is not None:
         text += ", with debugging (slow)" if debugging else ", optimised"
@@ -200,14 +170,14 @@ def _petsc_debugging(config: Mapping[str, str]) -> bool | None:
         return None
 
 
-def _petsc_folder(facts: Installation) -> str:
+def _petsc_folder(problems: Problems) -> str:
     import petsc4py
 
     config = petsc4py.get_config()
     return os.path.join(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", "")).rstrip("/") or "not known"
 
 
-def _petsc_packages(facts: Installation) -> str:
+def _petsc_packages(problems: Problems) -> str:
     from petsc4py import PETSc
 
     present = [name for name in EXTERNAL if PETSc.Sys.hasExternalPackage(name)]
@@ -215,14 +185,19 @@ def _petsc_packages(facts: Installation) -> str:
     return f"{', '.join(present) or 'none'}; not: {', '.join(absent) or 'none'}"
 
 
-def _h5py(facts: Installation) -> str:
+def _h5py(problems: Problems) -> str:
     import h5py
 
     kind = "parallel" if h5py.get_config().mpi else "serial"
     return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
 
 
-PARTS: dict[str, Callable[[Installation], str]] = {
+SOURCES = dict.fromkeys(
+    ("mpi4py", "PETSc", "h5py", "gmsh"),
+    "install it from the distribution, conda-forge or the cluster's modules (see README.md)",
+) | dict.fromkeys(("PETSc folder", "PETSc packages"), "it comes with petsc4py")
+
+PARTS: dict[str, Callable[[Problems], str]] = {
     "mpi4py": _mpi,
     "PETSc": _petsc,
     "PETSc folder": _petsc_folder,
@@ -234,4 +209,4 @@ PARTS: dict[str, Callable[[Installation], str]] = {
     "pydantic": _module_version("pydantic"),
     "ruamel.yaml": _module_version("ruamel.yaml"),
 }
-"""The parts to describe, in this order; each function may also set facts."""
+"""The parts to describe, in this order; each function may also add problems."""

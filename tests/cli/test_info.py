@@ -6,17 +6,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lyra_petsc import startup
 from lyra_petsc.cli import info as module
-from lyra_petsc.cli.info import Installation, incompatibilities, info, launched_ranks
+from lyra_petsc.cli.info import check_ranks, info, launched_ranks
 from lyra_petsc.errors import InputError
 
 
 def test_info_lists_the_versions_in_use(comm):
     import numba
-    import numpy as np
     from petsc4py import PETSc
 
     lines = dict(line.split(None, 1) for line in info(comm).splitlines() if "  " in line)
@@ -52,33 +52,41 @@ def test_a_missing_part_is_named_with_its_remedy(comm, monkeypatch):
 
 
 def test_a_broken_part_is_one_line(comm, monkeypatch):
-    def describe(facts):
+    def describe(problems):
         raise ImportError("libhdf5.so.103: cannot open\nshared object file")
 
     monkeypatch.setitem(module.PARTS, "h5py", describe)
     assert "- h5py is there but fails: libhdf5.so.103: cannot open shared object file." in info(comm)
 
 
-def test_a_correct_installation_fits():
-    facts = Installation(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
-    assert incompatibilities(facts) == []
+def test_an_unsuitable_petsc_is_named(comm, monkeypatch):
+    from petsc4py import PETSc
+
+    monkeypatch.setattr(module, "OLDEST_PETSC", (99, 0))
+    monkeypatch.setattr(PETSc, "ScalarType", np.complex128)
+    text = info(comm)
+    assert "is too old: 99.0 or newer is needed" in text
+    assert "- PETSc was built with complex scalars" in text
+
+
+def test_two_mpi_libraries_are_named(comm, monkeypatch):
+    monkeypatch.setattr(module, "loaded_mpi_libraries", lambda: ("/a/libmpi.so.12", "/b/libmpi.so.40"))
+    assert "- Two MPI libraries are loaded at once (/a/libmpi.so.12, /b/libmpi.so.40)" in info(comm)
 
 
 @pytest.mark.parametrize(
-    ("facts", "words"),
+    ("environment", "words"),
     [
-        (Installation(ranks=1, launched=4), "started 4 ranks but each of them sees 1"),
-        (Installation(mpi_libraries=("/a/libmpi.so.12", "/b/libmpi.so.40")), "Two MPI libraries"),
-        (Installation(petsc=(3, 17, 4)), "PETSc 3.17.4 is too old: 3.18"),
-        (Installation(petsc=(3, 20, 0), complex_scalars=True), "complex scalars"),
-        (Installation(ranks_per_host={"a": 2}, cores=4, threads="4"), "OMP_NUM_THREADS=4"),
-        (Installation(missing=["numba"]), "numba is missing: pip install numba"),
+        ({"OMPI_COMM_WORLD_SIZE": "4"}, ["started 4 ranks but each of them sees 2"]),
+        ({"OMP_NUM_THREADS": "4"}, ["OMP_NUM_THREADS=4 on 2 ranks asks for more than the 4 cores"]),
+        ({"OMPI_COMM_WORLD_SIZE": "2", "OMP_NUM_THREADS": "2"}, []),
     ],
 )
-def test_each_misfit_is_one_line(facts, words):
-    (line,) = incompatibilities(facts)
-    assert words in line
-    assert "\n" not in line
+def test_ranks_that_do_not_fit_are_one_line(environment, words):
+    problems = []
+    check_ranks(problems, environment, 2, 2, 4)
+    assert len(problems) == len(words)
+    assert all(one in line for one, line in zip(words, problems, strict=True))
 
 
 @pytest.mark.parametrize(

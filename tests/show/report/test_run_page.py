@@ -25,7 +25,8 @@ from launch import PICTURES, SCENE, done, finish, lyra, read_json, start, wait_u
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.show.report.run_page import OPTIONS, Facts, advice, run_page, write_page
+from lyra_petsc.show.report.run_facts import OPTIONS, Facts, advice
+from lyra_petsc.show.report.run_page import run_page, write_page
 
 FAILING = SCENE.replace("c11: 800, c22: 800", "c11: 8.0e+9, c22: 8.0e+9") + "solver: {max_iterations: 2}\n"
 
