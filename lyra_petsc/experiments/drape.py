@@ -25,11 +25,6 @@ STARTS, NOISE = 5, 2e-4
 STEP, STEPS = 0.04, 40
 """Δt [s] and number of steps; backward Euler with these long steps damps the motion."""
 
-SPEED = 0.01
-"""Speed [m/s] of the fastest vertex below which the cloth counts as at rest and the simulation ends early"""
-
-MINIMUM_FOLD = 1e-3
-"""Amplitude [m] of the rim below which it has no folds"""
 
 MARGIN = 1.05
 """Half the side of the picture of a shadow, over the radius of the cloth"""
@@ -84,7 +79,8 @@ def drape_scene(
     }
 
 
-def drape_cloth(bench: Bench, scene: dict[str, Any], speed: float = SPEED) -> Array:
+# speed [m/s] of the fastest vertex below which the cloth counts as at rest and the simulation ends early
+def drape_cloth(bench: Bench, scene: dict[str, Any], speed: float = 0.01) -> Array:
     """Simulate a `drape_scene` until the cloth is at rest; returns positions (V, 3) [m]; collective.
 
     It is if its fastest vertex is slower than ``speed`` [m/s].
@@ -132,7 +128,8 @@ def count_folds(dark: Picture) -> int:
     waves = np.fft.rfft(rim - rim.mean())
     waves[13:] = 0.0  # waves shorter than 30°
     smooth = np.fft.irfft(waves, len(rim))
-    threshold = max(MINIMUM_FOLD, 0.1 * float(np.abs(smooth).max()))
+    # amplitude [m] of the rim below which it has no folds
+    threshold = max(1e-3, 0.1 * float(np.abs(smooth).max()))
     signs = np.where(smooth > threshold, 1, np.where(smooth < -threshold, -1, 0))
     signs = signs[signs != 0]
     return int(np.sum((signs == 1) & (np.roll(signs, 1) == -1)))

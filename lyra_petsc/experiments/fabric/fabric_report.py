@@ -21,9 +21,6 @@ from lyra_petsc.show.render.scene_drawing import INK, OBSTACLE_COLOR, Image
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing, surface
 
-PICTURE = (1280, 720)
-"""Size of the picture of a drape [pixels]."""
-
 
 @dataclass(frozen=True)
 class FabricNumber:
@@ -238,7 +235,8 @@ def _drape(x: Array, triangles: Ints, name: str) -> Drawing:
 
 def _rendered(x: Array, triangles: Ints) -> Image:
     check_opengl()
-    pyvista, plotter = import_pyvista(), off_screen_plotter(PICTURE)
+    # size of the picture of a drape [pixels]
+    pyvista, plotter = import_pyvista(), off_screen_plotter((1280, 720))
     plotter.enable_lightkit()
     plotter.set_background("white")
     sheet = pyvista.PolyData(x, np.column_stack([np.full(len(triangles), 3), triangles]).ravel())

@@ -119,8 +119,9 @@ CLAMPED, GAUGE = 0.2, 0.05
 FULL_LOAD = 500.0 * GF_PER_CM
 """Largest force of a tensile test [N/m]"""
 
-LONGEST, PULLS = 1.0, 30
-"""Approximate upper bound of the strain of a tensile test, and number of its steps"""
+
+PULLS = 30
+"""Number of steps of a tensile test"""
 
 TENSION = 10.0 * GF_PER_CM
 """Tension in a shear test [N/m]"""
@@ -146,7 +147,7 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     """Tensile test: 20 cm × 5 cm between clamps, pulled to 500 gf/cm; EMT, WT, LT."""
     shell, record = fabric.shell(degrees), Record()
     strain = 0.01
-    while _tensile_force(shell, strain) < FULL_LOAD and strain < LONGEST:
+    while _tensile_force(shell, strain) < FULL_LOAD and strain < 1.0:
         strain *= 1.02
     path = [1.1 * strain * (k / PULLS) ** 1.5 for k in range(PULLS + 1)]
     frames = [{"time": k / PULLS, "translate": [e * GAUGE, 0.0, 0.0]} for k, e in enumerate(path)]
@@ -319,8 +320,6 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 
 # -- cantilever ------------------------------------------------------------------------------------------
 
-OVERHANG = 41.5
-"""Prescribed angle of the chord [°]"""
 
 CELLS = 60
 """Cells along the overhanging strip"""
@@ -342,6 +341,8 @@ def _cantilever(bench: Bench, fabric: Fabric, degrees: float, length: float) -> 
 
 def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     """Cantilever test: the overhang whose chord falls by 41.5°; bending length c, rigidity w c³."""
+    # prescribed angle of the chord [°]
+    overhang = 41.5
     shell, record = fabric.shell(degrees), Record()
     weight = G * shell.density
     known = fabric.rigidity(degrees)
@@ -351,10 +352,10 @@ def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     angles = [_cantilever(bench, fabric, degrees, trial)[0] for trial in lengths]
     line = np.empty((0, 2))
     for _ in range(8):
-        if abs(angles[-1] - OVERHANG) < 1e-3:
+        if abs(angles[-1] - overhang) < 1e-3:
             break
         slope = math.log(angles[-1] / angles[-2]) / math.log(lengths[-1] / lengths[-2])
-        lengths.append(lengths[-1] * (OVERHANG / angles[-1]) ** (1.0 / slope))
+        lengths.append(lengths[-1] * (overhang / angles[-1]) ** (1.0 / slope))
         angle, line = _cantilever(bench, fabric, degrees, lengths[-1])
         angles.append(angle)
     half = 0.5 * lengths[-1]
@@ -373,19 +374,14 @@ def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 
 # -- heart loop ------------------------------------------------------------------------------------------
 
-LOOP = 0.1337
-"""Height of a weightless loop over the length of its strip, in Peirce's formula"""
-
-SHOTS = 200
-"""Runge-Kutta steps along half a loop"""
-
 
 def loop_length(height: float, strip: float) -> float:
     """Bending length c of a heart loop by Peirce's formula, in the unit of ``height`` and ``strip``.
 
     NaN for loops that are not longer than one without weight, or longer than any: as friction holds them.
     """
-    first = LOOP * strip
+    # height of a weightless loop over the length of its strip, in Peirce's formula
+    first = 0.1337 * strip
     angle = math.radians(32.85 * (height - first) / first)
     if not 0.0 < angle < 0.5 * math.pi:
         return math.nan
@@ -401,13 +397,15 @@ def _shoot(slope: float, pull: float, weight: float) -> Ends:
 
     θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by the classical Runge-Kutta method.
     """
-    h, y = 1.0 / SHOTS, np.array([0.5 * math.pi, slope, 0.0, 0.0])
+    # Runge-Kutta steps along half a loop
+    shots = 200
+    h, y = 1.0 / shots, np.array([0.5 * math.pi, slope, 0.0, 0.0])
 
     def rates(at: float, y: Array) -> Array:
         cosine, sine = math.cos(y[0]), math.sin(y[0])
         return np.array([y[1], weight * (1.0 - at) * cosine + pull * sine, cosine, sine])
 
-    for s in h * np.arange(SHOTS):
+    for s in h * np.arange(shots):
         one = rates(s, y)
         two = rates(s + 0.5 * h, y + 0.5 * h * one)
         three = rates(s + 0.5 * h, y + 0.5 * h * two)
@@ -496,9 +494,6 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     return record
 
 
-ACROSS = 24
-"""Least number of cells along the diameter of the cloth"""
-
 PIXELS = 240
 
 
@@ -514,7 +509,8 @@ def cells_across(fabric: Fabric) -> int:
     """
     weight = G * fabric.shell().density
     shortest = min((fabric.rigidity(degrees) / weight) ** (1.0 / 3.0) for degrees in DIRECTIONS.values())
-    return max(ACROSS, math.ceil(2.0 * CLOTH / shortest))
+    # least number of cells along the diameter of the cloth
+    return max(24, math.ceil(2.0 * CLOTH / shortest))
 
 
 def cusick(bench: Bench, fabric: Fabric, degrees: float, folder: Path | None = None) -> Record:

@@ -27,30 +27,10 @@ from lyra_petsc.linear.reasons import error_message
 QUANTILE = 1.959963984540054
 """Half the width of a 95 % interval over the standard deviation."""
 
-CONVERGED = 0.05
-"""The search ends when the Gauss-Newton step is below this many standard deviations."""
 
 NEAR = 0.5
 """Gauss-Newton step [standard deviations] up to which convergence that TAO reports is accepted."""
 
-STALLED = 1e-7
-"""Relative change of all numbers below which the search ends as well."""
-
-STALL, DECREASE = 8, 5e-3
-"""A search whose step is below `NEAR` also ends if its cost decreases by less than this in so many
-evaluations: if a sheet may buckle to either side the cost is discontinuous, and a line search may fail."""
-
-MAX_ITERATIONS = 40
-
-NO_INFLUENCE, INVISIBLE = 1e-9, 1e-6
-"""A number has no influence if its largest scaled derivative is below this part of the others', or below this
-many uncertainties."""
-
-UNDETERMINED = 1.0
-"""Relative standard deviation of a combination from which on the data do not determine it."""
-
-CORRELATED = 0.98
-"""Correlation from which on two numbers are reported as not separable."""
 
 LEAST_SQUARES = ("brgn", "pounders")
 
@@ -160,6 +140,11 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
     SolverError
         If the search fails.
     """
+    # the search ends when the Gauss-Newton step is below this many standard deviations
+    converged = 0.05
+    # A search whose step is below `NEAR` also ends if its cost decreases by less than this in so many
+    # evaluations: if a sheet may buckle to either side the cost is discontinuous, and a line search may fail
+    stall, decrease = 8, 5e-3
     n = len(unknowns)
     size = np.array([unknown.size for unknown in unknowns])
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
@@ -168,7 +153,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
 
     def is_stalled() -> bool:
         costs = [evaluation.cost for evaluation in known.values()]
-        if len(costs) <= STALL or min(costs[:-STALL]) - min(costs) >= DECREASE:
+        if len(costs) <= stall or min(costs[:-stall]) - min(costs) >= decrease:
             return False
         return (
             _gauss_newton_step(min(known.values(), key=lambda evaluation: evaluation.cost), low, high) <= NEAR
@@ -224,10 +209,11 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
         y = tao.getSolution()
         evaluation = at(y)
         left = _gauss_newton_step(evaluation, low, high)
-        stalled = bool(before) and np.all(np.abs(evaluation.numbers - before[-1]) <= STALLED * size)
+        # relative change of all numbers below which the search ends as well
+        stalled = bool(before) and np.all(np.abs(evaluation.numbers - before[-1]) <= 1e-7 * size)
         if not before or not np.array_equal(before[-1], evaluation.numbers):
             before.append(evaluation.numbers)
-        if left <= CONVERGED or (stalled and len(before) > 1):
+        if left <= converged or (stalled and len(before) > 1):
             return int(PETSc.TAO.Reason.CONVERGED_USER)
         if tao.getIterationNumber() >= tao.getMaximumIterations():
             return int(PETSc.TAO.Reason.DIVERGED_MAXITS)
@@ -241,7 +227,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
         else:
             tao.setObjectiveGradient(cost, None)
         tao.setVariableBounds((lower, upper))
-        tao.setMaximumIterations(MAX_ITERATIONS)
+        tao.setMaximumIterations(40)
         tao.setFromOptions()
         tao.setSolution(start)
         if tao.getType() == PETSc.TAO.Type.BRGN:
@@ -266,7 +252,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
             each.destroy()
     best = min(known.values(), key=lambda evaluation: evaluation.cost)
     left = _gauss_newton_step(best, low, high)
-    if left <= CONVERGED or (reason > 0 and left <= NEAR):
+    if left <= converged or (reason > 0 and left <= NEAR):
         return (
             best,
             f"the search ended; where it tends to is {left:.2g} standard deviations away",
@@ -316,7 +302,9 @@ def refuse_insensitive(unknowns: Sequence[Unknown], evaluation: Evaluation, file
     size = np.array([unknown.size for unknown in unknowns])
     largest = np.abs(evaluation.jacobian * size).max(axis=0)
     for unknown, own in zip(unknowns, largest, strict=True):
-        if own <= max(NO_INFLUENCE * largest.max(), INVISIBLE):
+        # A number has no influence if its largest scaled derivative is below this part of the others', or
+        # below this many uncertainties
+        if own <= max(1e-9 * largest.max(), 1e-6):
             raise InputError(
                 "no measurement depends on it; leave it out, or measure something that does",
                 file=file,
@@ -374,7 +362,8 @@ def _notes(estimates: Sequence[Estimate], values: Array, directions: Array, corr
         if estimate.at_bound:
             notes.append(f"{estimate.key} is at its bound {estimate.value:.6g}: the data ask for more")
     for value, direction in zip(values, directions, strict=True):
-        if value > 0.0 and 1.0 / value < UNDETERMINED:
+        # relative standard deviation of a combination from which on the data do not determine it
+        if value > 0.0 and 1.0 / value < 1.0:
             continue
         share = [key for key, part in zip(keys, direction, strict=True) if abs(part) > 0.3]
         how = f"±{100.0 / value:.0f} %" if value > 1e-6 else "not at all"
@@ -386,7 +375,8 @@ def _notes(estimates: Sequence[Estimate], values: Array, directions: Array, corr
             )
     for i, one in enumerate(keys):
         for j in range(i):
-            if abs(correlation[i, j]) > CORRELATED:
+            # correlation from which on two numbers are reported as not separable
+            if abs(correlation[i, j]) > 0.98:
                 notes.append(
                     f"{keys[j]} and {one} go together (correlation {correlation[i, j]:.3f}): "
                     "another measurement would tell them apart"

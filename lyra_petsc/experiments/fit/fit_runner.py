@@ -48,12 +48,6 @@ from lyra_petsc.scene.values import shown
 
 TRIALS_FILE = "trials.json"
 
-LARGEST_RESIDUAL = 1e8
-"""Largest residual of the start in uncertainties; beyond it round-off of a simulation would matter."""
-
-STRIP = 2.0
-"""Length over width of a strip."""
-
 
 FIT = FolderKind(
     "fit",
@@ -331,7 +325,8 @@ def _has_strip(mesh: Mesh, group: str | None) -> bool:
         points = mesh.rest[np.unique(triangles[piece == number])]
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
         length, width = np.ptp(points @ axes[:2].T, axis=0)
-        if length >= STRIP * width:
+        # length over width of a strip
+        if length >= 2.0 * width:
             return True
     return False
 
@@ -340,7 +335,8 @@ def _refuse_large_residuals(readings: Sequence[Reading], evaluation: Evaluation,
     """Refuse measurements whose residuals at the start are not finite, or dominate all others."""
     keys = [reading.key for reading in readings for _ in reading.parts]
     worst = int(np.argmax(np.abs(evaluation.residuals)))
-    if not abs(evaluation.residuals[worst]) < LARGEST_RESIDUAL:
+    # largest residual of the start in uncertainties; beyond it round-off of a simulation would matter
+    if not abs(evaluation.residuals[worst]) < 1e8:
         raise InputError(
             f"is missed by {abs(evaluation.residuals[worst]):.2g} uncertainties; check value, uncertainty "
             "and their units",

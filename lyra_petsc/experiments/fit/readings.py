@@ -24,7 +24,6 @@ from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.problem import Problem
 
 AXES = ("x", "y", "z")
-LARGEST_TABLE = 2**26
 MAX_ROWS = 100_000
 
 SAME_TIME = 1e-9
@@ -315,7 +314,7 @@ class _Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        lines = [line.split("#")[0] for line in read_text(path, largest=LARGEST_TABLE).splitlines()]
+        lines = [line.split("#")[0] for line in read_text(path, largest=2**26).splitlines()]
         kept = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
         if len(kept) < 2:
             raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)

@@ -33,9 +33,6 @@ from lyra_petsc.show.report.plots import Series, over_time, surface
 TIME_LIMIT = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
 """CPU time [s], without the compilation of kernels, after which a case is stopped between two steps."""
 
-BASE_STEPS = 20
-"""Timed steps of the base scene: as many as most cases take, since later steps cost more."""
-
 
 @dataclass
 class SavedOutcome:
@@ -111,7 +108,8 @@ class BaseClock:
             If the base scene does not run.
         """
         content = self._setting.content()
-        content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
+        # timed steps of the base scene: as many as most cases take, since later steps cost more
+        content["time"] = {**content["time"], "end": 20 * self._setting.step}
         seconds: list[tuple[float, float]] = []
         with self._setting.bench(self._comm, self._watch) as bench, bench.simulation(content) as trial:
             self.size = trial.simulation.problem.whole.size

@@ -159,25 +159,24 @@ CELLS = {Scope.QUICK: 20, Scope.USUAL: 40, Scope.FULL: 40}
 STEP = 0.005
 """Δt [s]; also replaces the adaptive steps of a given scene."""
 
-DENSITY, STIFFNESS, BENDING, DAMPING = 0.15, 120.0, 1e-5, 0.005
-"""kg/m², N/m, N·m, s"""
-
 
 def hanging_sheet(cells: int) -> Content:
     """The default base scene: a square metre of cotton hung by two corners."""
+    # kg/m², N/m, N·m, s
+    density, stiffness, bending, damping = 0.15, 120.0, 1e-5, 0.005
     return {
         "title": "A square of cotton hung by two corners",
         "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells, "pattern": "alternating"}},
         "material": {
-            "density": DENSITY,
+            "density": density,
             "membrane": {
-                "c11": STIFFNESS,
-                "c22": STIFFNESS,
-                "c12": STIFFNESS / 3.0,
-                "c33": 0.25 * STIFFNESS,
+                "c11": stiffness,
+                "c22": stiffness,
+                "c12": stiffness / 3.0,
+                "c33": 0.25 * stiffness,
             },
-            "bending": BENDING,
-            "damping": DAMPING,
+            "bending": bending,
+            "damping": damping,
         },
         "gravity": [0.0, 0.0, -9.81],
         "handles": [{"nodes": [0, cells]}],

@@ -125,20 +125,8 @@ class RunRecord:
         return [report.time for report in self.reports]
 
 
-NEGLIGIBLE = 0.1
-"""Part of the driving forces below which a residual is negligible; the same for the displacements by both."""
-
 SMALL_DISSIPATION = 0.05
 """Numerical dissipation over the largest energy exchanged up to which a motion is called right."""
-
-MAX_DISSIPATION = 0.5
-"""The same ratio beyond which a run fails if its steps have no other balance (semi-implicit)."""
-
-NEWTON_MEDIAN, NEWTON_MAX = 10, 30
-"""Allowed Newton iterations per step of a stiff sheet, median and maximum."""
-
-MAX_RATIO = 5.0
-"""Allowed median time per step of a stiff sheet over that of the base scene."""
 
 
 def judge_convergence(record: RunRecord) -> Verdict:
@@ -172,10 +160,12 @@ def judge_resolution(record: RunRecord) -> Verdict:
 
     At the round-off floor the residual of stiff forces may be as large as the weight without any effect.
     """
+    # part of the driving forces below which a residual is negligible; the same for the displacements by both
+    negligible = 0.1
     steps = zip(record.balances, record.reports, strict=True)
-    by_force = [ratio(balance.residual, NEGLIGIBLE * balance.driving) for balance in record.balances]
+    by_force = [ratio(balance.residual, negligible * balance.driving) for balance in record.balances]
     by_displacement = [
-        ratio(report.remaining, NEGLIGIBLE * balance.displacement) for balance, report in steps
+        ratio(report.remaining, negligible * balance.displacement) for balance, report in steps
     ]
     number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_displacement[i]))
     worst, last = record.balances[number], record.reports[number].remaining
@@ -242,7 +232,8 @@ def judge_run(record: RunRecord) -> Verdict:
     )
     if record.balance["repeated"]:
         text += f", {record.balance['repeated']} attempts repeated for it"
-    good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or dissipation <= MAX_DISSIPATION)
+    # the same ratio beyond which a run fails if its steps have no other balance (semi-implicit)
+    good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or dissipation <= 0.5)
     if good and dissipation > SMALL_DISSIPATION:
         text += "; solved, but a smaller Δt moves otherwise"
     return Verdict(good, text)
@@ -280,12 +271,16 @@ def judge_speed(record: RunRecord, wall_ratio: float, cpu_ratio: float) -> Verdi
     ``wall_ratio`` and ``cpu_ratio`` are ratios of median wall and CPU times; one of them suffices, as wall
     times mean little on a machine with other load.
     """
+    # allowed Newton iterations per step of a stiff sheet, median and maximum
+    newton_median, newton_max = 10, 30
+    # allowed median time per step of a stiff sheet over that of the base scene
+    max_ratio = 5.0
     median, worst = record.median_newton, max(record.newton, default=0)
-    good = median <= NEWTON_MEDIAN and worst <= NEWTON_MAX and min(wall_ratio, cpu_ratio) <= MAX_RATIO
+    good = median <= newton_median and worst <= newton_max and min(wall_ratio, cpu_ratio) <= max_ratio
     text = (
         f"Newton iterations {short(median)} in the median and {worst} at worst "
-        f"({NEWTON_MEDIAN} and {NEWTON_MAX} allowed), {short(wall_ratio)} times the base's wall time, "
-        f"{short(cpu_ratio)} times its CPU time ({MAX_RATIO:g} allowed)"
+        f"({newton_median} and {newton_max} allowed), {short(wall_ratio)} times the base's wall time, "
+        f"{short(cpu_ratio)} times its CPU time ({max_ratio:g} allowed)"
     )
     return Verdict(good and not record.stop_reason, text)
 

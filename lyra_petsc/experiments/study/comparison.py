@@ -30,9 +30,6 @@ from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
-SAME_TIME = 1e-6
-"""Fraction of the time between samples by which the time of a state may differ from a sample time."""
-
 ROWS_AT_ONCE = 1 << 16
 """Rows of a file that a rank reads at once."""
 
@@ -202,7 +199,8 @@ def read_local(folder: Path, times: Sequence[float], spacing: float, sheets: Seq
     files = []
     for time in times:
         nearest = int(np.abs(at - time).argmin())
-        if abs(at[nearest] - time) > SAME_TIME * spacing:
+        # fraction of the time between samples by which the time of a state may differ from a sample time
+        if abs(at[nearest] - time) > 1e-6 * spacing:
             raise InputError(
                 f"has no state at t = {time:g} s, which is a sample time (its states run from "
                 f"{at.min():g} to {at.max():g} s); run it with output.every = {spacing:g}",
@@ -231,10 +229,6 @@ def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
     if not len(columns["time"]):
         raise InputError("has no rows", file=path)
     return columns, [int(np.abs(columns["time"] - time).argmin()) for time in times]
-
-
-CANDIDATES = 12
-"""Number of triangles with the nearest centroids among which the closest triangle is searched."""
 
 
 @dataclass
@@ -300,7 +294,8 @@ def _nearest_triangles(points: Array, vertices: Array, triangles: Ints) -> tuple
     from scipy.spatial import cKDTree
 
     corners = vertices[triangles]
-    count = min(CANDIDATES, len(triangles))
+    # number of triangles with the nearest centroids among which the closest triangle is searched
+    count = min(12, len(triangles))
     _, found = cKDTree(corners.mean(axis=1)).query(points, k=count)
     near = np.asarray(found).ravel()
     repeated = np.repeat(points, count, axis=0)

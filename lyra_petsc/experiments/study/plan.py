@@ -50,8 +50,6 @@ USUAL_OPTIONS = ("ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_type", "pc_type", "s
 NUMERICAL = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius", "solver.", "petsc.")
 """Keys that change how a scene is solved; other keys change the scene, which then has its own reference."""
 
-MAX_COMBINATIONS = 10_000
-
 
 @dataclass(frozen=True)
 class Axis:
@@ -99,6 +97,7 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     InputError
         Unknown key, no value, a value of the wrong kind, a value or a key given twice.
     """
+    max_combinations = 10_000
     axes: dict[str, Axis] = {}
     for text in texts:
         axis = _parse_axis(text)
@@ -110,8 +109,8 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
         raise InputError(
             "a tolerance is for steps of automatic length, dt for fixed ones: vary one of them", key="--vary"
         )
-    if math.prod(len(axis.values) for axis in axes.values()) > MAX_COMBINATIONS:
-        raise InputError(f"makes more than {MAX_COMBINATIONS} combinations", key="--vary")
+    if math.prod(len(axis.values) for axis in axes.values()) > max_combinations:
+        raise InputError(f"makes more than {max_combinations} combinations", key="--vary")
     return list(axes.values())
 
 
@@ -184,8 +183,6 @@ def _parse_value(path: str, word: str, text: str) -> Value:
     return word
 
 
-LONGEST_NAME = 80
-
 REDUCED_OUTPUT = ("output.fields=[]", "output.reactions=false")
 """Settings that switch off output which a study does not need."""
 
@@ -246,7 +243,7 @@ def _folder_name(chosen: Choice) -> str:
         key = "" if axis.path == "time.integrator" else axis.key
         parts.append(f"{key}{value!r}" if isinstance(value, float) else f"{key}-{value}".lstrip("-"))
     plain = "-".join(parts)
-    safe = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
+    safe = re.sub(r"[^\w.+-]+", "_", plain)[:80].strip("_.-")
     return safe if safe == plain else f"{safe}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
 

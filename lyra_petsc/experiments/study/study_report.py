@@ -115,7 +115,6 @@ def _rows_with_error(rows: Sequence[StudyRow], quantity: str) -> list[StudyRow]:
     return [row for row in rows if row.passed and not math.isnan(row.error_bound(quantity))]
 
 
-TARGETS = (0.1, 0.01, 0.001)
 DEFAULT_TARGET = 0.01
 """The accuracy for which the diagram marks the recommended setting."""
 
@@ -144,7 +143,7 @@ def advise(rows: Sequence[StudyRow], quantities: Sequence[str]) -> list[Advice]:
     The first quantity decides; the text names others in which the recommended row is less accurate.
     """
     able = _rows_with_error(rows, quantities[0])
-    return [_advice(able, quantities, target) for target in TARGETS] if able else []
+    return [_advice(able, quantities, target) for target in (0.1, 0.01, 0.001)] if able else []
 
 
 def _advice(rows: Sequence[StudyRow], quantities: Sequence[str], target: float) -> Advice:

@@ -196,25 +196,12 @@ def _scene_differences(plan: Plan, folder: Path) -> Sequence[str]:
     return [f"the reference run is of another scene: {', '.join(keys)} differ"] if keys else []
 
 
-STEP_REFINEMENT = 4
-"""Smallest Δt of the study over that of the reference."""
-
 SECOND_ORDER = ("bdf2", "alpha2", "midpoint")
-TOLERANCE_REFINEMENT = 100.0
 MINIMUM_TOLERANCES = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 TIME_KEYS = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius")
 
 SAFETY = 2.0
 """An error is not resolved if it is below this factor times the error of the reference."""
-
-LARGEST_SAFETY = 1.25
-"""Safety factor on the estimates of maximum errors."""
-
-REFINEMENT = 2.0
-"""Ratio of Δt or element size between neighbours of a chain."""
-
-MINIMUM_ORDER = 0.5
-"""Order of convergence below which an estimate is not trusted to follow it."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +236,8 @@ def make_chains(
     number : str
         Suffix of the names if there are several physical scenes.
     """
-    common = [*physics, *_tolerances(plan, TOLERANCE_REFINEMENT)]
+    tolerance_refinement = 100.0
+    common = [*physics, *_tolerances(plan, tolerance_refinement)]
     mesh = plan.axis("mesh")
     meshes: list[float | None] = [None]
     if mesh is not None:
@@ -278,10 +266,11 @@ def make_chains(
     if smallest is None:
         if mesh is not None:
             return [chain(2, *((h, None) for h in meshes))]
-        tolerances = (*physics, *_tolerances(plan, TOLERANCE_REFINEMENT / 10.0))
+        tolerances = (*physics, *_tolerances(plan, tolerance_refinement / 10.0))
         loose = StudyCase("reference-loose" + number, "tolerances ten times larger", tolerances)
         return [Chain((*chain(0, (None, None)).levels, loose), 0)]
-    finest = plan.interval / (STEP_REFINEMENT * math.ceil(plan.interval / smallest * (1.0 - 1e-9)))
+    # smallest Δt of the study over that of the reference
+    finest = plan.interval / (4 * math.ceil(plan.interval / smallest * (1.0 - 1e-9)))
     order = 2 if integrator in SECOND_ORDER else 1
     in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
     return [in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time]
@@ -333,6 +322,8 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
     order : int
         Expected order; the observed one is used if it is smaller.
     """
+    # order of convergence below which an estimate is not trusted to follow it
+    minimum_order = 0.5
     if math.isnan(first) or math.isnan(second):
         return EstimatedError(math.nan, math.nan, False)
     if first == second == 0.0:
@@ -340,8 +331,8 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
     observed = math.inf if first == 0.0 else -math.inf
     if first > 0.0 < second:
         observed = math.log(second / first) / math.log(ratio)
-    used = min(float(order), max(observed, MINIMUM_ORDER))
-    trusted = observed >= MINIMUM_ORDER
+    used = min(float(order), max(observed, minimum_order))
+    trusted = observed >= minimum_order
     largest = first if trusted else max(first, second)
     error = largest / (ratio**used - 1.0)
     if order > 0:
@@ -379,25 +370,24 @@ def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, Es
     ----------
     .. [1] P. J. Roache, Verification and Validation in Computational Science and Engineering, 1998, ch. 5.
     """
+    # ratio of Δt or element size between neighbours of a chain
+    refinement = 2.0
     sums = [comparison.overall(history) for history in differences]
     found = {}
     for name, first in sums[0].items():
         if len(differences) == 1:
             found[name] = EstimatedError(first, math.nan, True)
             continue
-        found[name] = whole = richardson(first, sums[1][name], REFINEMENT, chain.order)
+        found[name] = whole = richardson(first, sums[1][name], refinement, chain.order)
         if name != MEAN_SQUARE and not math.isnan(whole.error):
             pairs = zip(differences[0][name], differences[1][name], strict=True)
             each = [
-                richardson(float(fine), float(coarse), REFINEMENT, chain.order).error
+                richardson(float(fine), float(coarse), refinement, chain.order).error
                 for fine, coarse in pairs
             ]
-            found[name] = replace(whole, error=LARGEST_SAFETY * max(whole.error, *each))
+            # safety factor on the estimates of maximum errors
+            found[name] = replace(whole, error=1.25 * max(whole.error, *each))
     return found
-
-
-ROUND_OFF = 1e-13
-"""Error of an exact reference"""
 
 
 class StudyObserver(Protocol):
@@ -613,7 +603,9 @@ class StudyRunner:
         quantities = self.plan.quantities
         if found.motion is not None:
             found.own_errors = {
-                quantity.name: EstimatedError(ROUND_OFF, math.nan, True) for quantity in quantities
+                # error of an exact reference
+                quantity.name: EstimatedError(1e-13, math.nan, True)
+                for quantity in quantities
             }
             errors_of: Callable[..., Errors] = partial(
                 comparison.motion_errors, self.comm, motion=found.motion

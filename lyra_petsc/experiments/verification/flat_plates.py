@@ -134,13 +134,6 @@ def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]
     return scene(mesh, material, gravity=[0, 0, -G], handles=held)
 
 
-MORE = 8
-"""Additional eigenvectors: the mode of an unstable state may be farther from the shift than stable modes."""
-
-ROUND_OFF = 1e-6
-"""Squared frequency over the shift below which a frequency counts as zero."""
-
-
 @dataclass(frozen=True)
 class SmallMotions:
     """Stiffness and mass matrices of a sheet in its present state, the same on every rank.
@@ -222,7 +215,8 @@ def lowest_modes(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, A
         If the iteration does not converge, or the state is unstable.
     """
     squares, shapes = lowest_squares(trial, count, shift)
-    squares[np.abs(squares) < ROUND_OFF * shift] = 0.0
+    # squared frequency over the shift below which a frequency counts as zero
+    squares[np.abs(squares) < 1e-6 * shift] = 0.0
     if squares[0] < 0.0:
         raise SolverError("no stable equilibrium: a squared frequency is not positive", collective=True)
     return np.sqrt(squares), shapes
@@ -269,7 +263,8 @@ def _lowest(motions: SmallMotions, count: int, shift: float) -> tuple[Array, Arr
     stiffness, mass = motions.stiffness_of_free, motions.mass[motions.free]
     inertia = diags(mass, format="csc")
     rank = np.count_nonzero(mass)
-    more = min(count + MORE, rank - 1)
+    # additional eigenvectors: the mode of an unstable state may be farther from the shift than stable modes
+    more = min(count + 8, rank - 1)
     first = np.random.default_rng(0).standard_normal(len(mass))  # reproducible
     try:
         squares, vectors = eigsh(

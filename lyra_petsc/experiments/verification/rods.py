@@ -41,9 +41,6 @@ from lyra_petsc.arrays import Array
 POINTS, ACCURACY = 201, 1e-10
 """Points of a rod in the initial guess, and relative residual of its equations in the solution."""
 
-PACE = 0.7
-"""Load steps per doubling of the load."""
-
 
 @dataclass(frozen=True)
 class Cantilever:
@@ -145,7 +142,8 @@ def _grown(
     ArithmeticError
         If no equilibrium is found.
     """
-    s, steps = np.linspace(0.0, 1.0, POINTS), max(1, math.ceil(PACE * math.log2(1.0 + load)))
+    # load steps per doubling of the load
+    s, steps = np.linspace(0.0, 1.0, POINTS), max(1, math.ceil(0.7 * math.log2(1.0 + load)))
     state = np.tile(np.asarray(start)[:, None], POINTS)
     state[along] = s
     for step in range(1, steps + 1):

@@ -43,9 +43,6 @@ STEPS = 40
 PRESSURE, LAYERS, RAMP = 1e5, 10, 20
 """Pressure [Pa] on a number of layers, and number of steps in which it grows"""
 
-KNOT, CUT, TAIL, STRAND, WIDE, PULLED = 0.04, 0.2, 3.0, 0.01, 2, 0.25
-"""Size of the knot [m], half the angle that is cut out of it [rad], length of its tails over its size, edge
-length [m], cells across, displacement of each end [m]"""
 
 MANY, MANY_LAYERS, MANY_CELLS = 100_000, 5, 107
 """Required number of contacts, and sheets and cells along a side of the stack that reaches it"""
@@ -121,12 +118,16 @@ def _pressed(setting: Setting, bench: Bench) -> Content:
 
 def _knot(setting: Setting, bench: Bench) -> Content:
     """A strip in an overhand knot, whose ends are pulled: a trefoil knot that is cut open at its outside."""
-    t = np.linspace(CUT, 2.0 * math.pi - CUT, 2000) + math.pi / 3.0
+    # size of the knot [m], half the angle that is cut out of it [rad], length of its tails over its size
+    size, cut, tail = 0.04, 0.2, 3.0
+    # edge length [m], cells across, displacement of each end [m]
+    edge, wide, pulled = 0.01, 2, 0.25
+    t = np.linspace(cut, 2.0 * math.pi - cut, 2000) + math.pi / 3.0
     knot = np.column_stack(
         [np.sin(t) + 2.0 * np.sin(2.0 * t), np.cos(t) - 2.0 * np.cos(2.0 * t), -np.sin(3.0 * t)]
     )
     # tails that bend outwards from the cut
-    s = np.linspace(0.0, TAIL, 200)[1:, None]
+    s = np.linspace(0.0, tail, 200)[1:, None]
     outwards = np.array([math.sqrt(0.75), 0.5, 0.0])
     pull = knot[0] - knot[-1]
     pull /= np.linalg.norm(pull)
@@ -134,26 +135,26 @@ def _knot(setting: Setting, bench: Bench) -> Content:
     for end, before in ((knot[0], knot[1]), (knot[-1], knot[-2])):
         tangent = (end - before) / np.linalg.norm(end - before)
         tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * tangent + s * outwards)
-    line = KNOT * np.concatenate([tails[0][::-1], knot, tails[1]])
+    line = size * np.concatenate([tails[0][::-1], knot, tails[1]])
     length = float(np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))[-1])
-    cells = round(length / STRAND)
+    cells = round(length / edge)
     middle = resample_polyline(line, cells + 1)
     along = np.gradient(middle, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    flat, faces = rectangle(cells, WIDE, length, WIDE * STRAND)
-    side = np.arange(WIDE + 1.0) - 0.5 * WIDE
-    start = (middle + STRAND * side[:, None, None] * across).reshape(-1, 3)
-    row = (cells + 1) * np.arange(WIDE + 1)
-    ends = {"first": (row, PULLED * pull), "last": (row + cells, -PULLED * pull)}
+    flat, faces = rectangle(cells, wide, length, wide * edge)
+    side = np.arange(wide + 1.0) - 0.5 * wide
+    start = (middle + edge * side[:, None, None] * across).reshape(-1, 3)
+    row = (cells + 1) * np.arange(wide + 1)
+    ends = {"first": (row, pulled * pull), "last": (row + cells, -pulled * pull)}
     handles = [{"nodes": nodes.tolist(), "motion": name} for name, (nodes, _) in ends.items()]
     motions = {
         name: [{"time": 0.0}, {"time": 80 * STEP, "translate": displacement.tolist()}]
         for name, (_, displacement) in ends.items()
     }
     mesh = bench.mesh(start, faces, rest=flat[:, :2])
-    contact = {"gap": 0.4 * STRAND, "friction": 0.3}
+    contact = {"gap": 0.4 * edge, "friction": 0.3}
     return _scene(setting, mesh, contact, {}) | {"handles": handles, "motions": motions}
 
 

@@ -163,23 +163,16 @@ gravity = family(
 )
 
 
-NOISE = 0.3
-"""Standard deviation of each coordinate over the mean edge length."""
-
-FOLDS = 12
-RISE = 0.15
-"""Height of the dome [m]."""
-
-
 def _noisy(x: Array, spacing: float) -> Array:
-    return np.asarray(x + NOISE * spacing * np.random.default_rng(1).standard_normal(x.shape))
+    # standard deviation of each coordinate over the mean edge length
+    return np.asarray(x + 0.3 * spacing * np.random.default_rng(1).standard_normal(x.shape))
 
 
 def _crumpled(x: Array, spacing: float) -> Array:
     """Folded repeatedly along random planes near the middle of the present shape."""
     random = np.random.default_rng(2)
     y = x - x.mean(axis=0)
-    for _ in range(FOLDS):
+    for _ in range(12):
         normal = random.standard_normal(3)
         normal /= np.linalg.norm(normal)
         height = y @ normal
@@ -214,7 +207,8 @@ def _dome(setting: Setting, bench: Bench) -> Content:
     n = CELLS[setting.level]
     vertices, triangles = rectangle(n, n, 1.0, 1.0)
     u, v = 2.0 * vertices[:, 0] - 1.0, 2.0 * vertices[:, 1] - 1.0
-    vertices[:, 2] = RISE * (1.0 - u**2) * (1.0 - v**2)
+    # height of the dome [m]
+    vertices[:, 2] = 0.15 * (1.0 - u**2) * (1.0 - v**2)
     rim = np.flatnonzero(np.maximum(np.abs(u), np.abs(v)) > 1.0 - 1e-9)
     return content | {"mesh": bench.mesh(vertices, triangles), "handles": [{"nodes": rim.tolist()}]}
 
@@ -230,12 +224,10 @@ start = family(
     StressCase("inside-out", "a shell turned inside out", _dome, shape=_mirrored),
 )
 
-SPIN = [3.0, 20.0, 1.0]
-"""Angular velocity [rad/s]"""
-
 
 def _with_spin(content: Content) -> Content:
-    content["initial"] = {**(content.get("initial") or {}), "angular_velocity": SPIN}
+    # angular velocity [rad/s]
+    content["initial"] = {**(content.get("initial") or {}), "angular_velocity": [3.0, 20.0, 1.0]}
     return content
 
 
@@ -286,18 +278,13 @@ elements = family(
 )
 
 
-JUMP = (0.15, 0.1, 0.2)
-"""Displacement of handles over the size of the sheet."""
-
-TURNS = 10.0
-"""Turns of handles per second"""
-
 SIDES = [{"group": "left"}, {"group": "right"}]
 STEPS = 40
 
 
 def _jump(setting: Setting, bench: Bench) -> Content:
-    far = [part * setting.size for part in JUMP]
+    # displacement of handles over the size of the sheet
+    far = [part * setting.size for part in (0.15, 0.1, 0.2)]
     still = {"time": 2.0 * setting.step}
     return move_handles(
         setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}]
@@ -305,9 +292,11 @@ def _jump(setting: Setting, bench: Bench) -> Content:
 
 
 def _turning(content: Content) -> Content:
-    quarters = int(4.0 * TURNS * STEPS * float(content["time"]["step"])) + 2
+    # turns of handles per second
+    turns = 10.0
+    quarters = int(4.0 * turns * STEPS * float(content["time"]["step"])) + 2
     turn = [
-        {"time": k / (4.0 * TURNS), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
+        {"time": k / (4.0 * turns), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
         for k in range(quarters)
     ]
     return move_handles(content, turn)
@@ -333,13 +322,11 @@ handles = family(
 
 # -- a membrane that cannot buckle, compressed into the softening range of its model ----------------------
 
-COMPRESSION = 0.4
-"""Final width over the initial one; well below 1/√3."""
-
 
 def _pressed(setting: Setting, bench: Bench) -> Content:
     content = setting.content() | {"handles": [dict(side) for side in SIDES]}
-    move_handles(content, [{"time": 0.0}, {"time": STEPS * setting.step, "scale": [COMPRESSION, 1.0, 1.0]}])
+    # final width over the initial one; well below 1/√3
+    move_handles(content, [{"time": 0.0}, {"time": STEPS * setting.step, "scale": [0.4, 1.0, 1.0]}])
     # the sheet cannot leave its plane
     content["handles"].append({"group": "sheet", "axes": ["z"]})
     return content

@@ -266,12 +266,6 @@ def elastica_roll_up(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- strips that twist -----------------------------------------------------------------------------------
 
-COILING = (0.1, 1.0, 10.0, 100.0)
-"""w L³ / (0.8 B)"""
-
-STIFF = 1e7
-"""C L²/B, so high that a strip of width 1/64 hardly bends in its own plane."""
-
 
 @case(
     "Clamped strip of single diagonals under its own weight, Γ = w L³/(0.8 B): tip against the rod whose "
@@ -281,13 +275,16 @@ STIFF = 1e7
     **HINGED,
 )
 def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
+    # C L²/B, so high that a strip of width 1/64 hardly bends in its own plane
+    stiff = 1e7
     found: list[Measured] = []
-    for weight in COILING:
+    # w L³ / (0.8 B)
+    for weight in (0.1, 1.0, 10.0, 100.0):
         nominal = 0.8 * weight
-        scene = strip("diagonal", n, STIFF, gravity=[0, 0, -nominal / DENSITY])
+        scene = strip("diagonal", n, stiff, gravity=[0, 0, -nominal / DENSITY])
         with bench.simulation(scene) as trial:
             x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0)
-        exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / STIFF))
+        exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / stiff))
         reach, sideways, drop = exact
         tip_displacement = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
         label = f"Γ = {weight:g}"
@@ -409,14 +406,6 @@ def column(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- beyond the critical load ----------------------------------------------------------------------------
 
-SHORTENINGS = (0.4, 0.1)
-"""Shortenings over the length, in this order: the second is reached from above."""
-
-SOFTER = 1e5
-"""C L²/B, as of a thickness of 0.011 L; the effect of stretch is 5e-4"""
-
-ASIDE = 20.0
-"""Transverse load [N/m²] by which the column leaves the straight shape; removed at load factor 0.1"""
 
 LOADS = {"below": 0.95, "above": 1.2}
 """Loads over the critical load"""
@@ -432,21 +421,26 @@ LOADS = {"below": 0.95, "above": 1.2}
     counts="cells along the column",
 )
 def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
+    # shortenings over the length, in this order: the second is reached from above
+    shortenings = (0.4, 0.1)
     for kind in KINDS:
-        strip = partial(scene, strip_mesh(bench, kind, n, COLUMN), plate_material(SOFTER))
+        # C L²/B, as of a thickness of 0.011 L; the effect of stretch is 5e-4
+        strip = partial(scene, strip_mesh(bench, kind, n, COLUMN), plate_material(1e5))
         for label in ("pinned", "clamped"):
             frames: list[dict[str, Any]] = [{"time": 0.0}, {"time": 0.1, "translate": [-0.02, 0.0, 0.0]}]
-            for at, each in zip((0.5, 1.0), SHORTENINGS, strict=True):
+            for at, each in zip((0.5, 1.0), shortenings, strict=True):
                 frames.append({"time": at, "translate": [-each, 0.0, 0.0]})
             left, right = COLUMNS[label][0]
             shortened = strip(
                 STATIC | {"step": 0.1},
                 handles=[left, right | {"motion": "push", "interpolation": "linear"}],
                 motions={"push": frames},
-                loads=[{"traction": [0.0, 0.0, ASIDE], "until": 0.1}],
+                # transverse load [N/m²] by which the column leaves the straight shape; removed at load factor
+                # 0.1
+                loads=[{"traction": [0.0, 0.0, 20.0], "until": 0.1}],
             )
             with bench.simulation(shortened) as trial:
-                for shortening, _ in zip(SHORTENINGS, trial.run_through((0.5, 1.0)), strict=True):
+                for shortening, _ in zip(shortenings, trial.run_through((0.5, 1.0)), strict=True):
                     load, height = column_shape(shortening=shortening)
                     load *= COLUMNS[label][1] / math.pi**2
                     name = f"{label}, {kind}, shortened by {shortening:g} L"
@@ -477,14 +471,6 @@ def _height(trial: Trial) -> float:
 
 # -- lateral buckling ------------------------------------------------------------------------------------
 
-DEPTHS = (1.0 / 20.0, 1.0 / 50.0)
-"""Depths over the length"""
-
-POISSON = (0.0, 0.3)
-
-TALL = 1e8
-"""C L²/D, so high that the strip hardly bends in its plane"""
-
 
 @case(
     "Tall cantilever with a load at its tip, in its plane, D and ν of a plate: the load at which the lowest "
@@ -501,8 +487,9 @@ TALL = 1e8
     counts="cells across",
 )
 def lateral_buckling(bench: Bench, n: float) -> Iterator[Measured]:
-    for depth in DEPTHS:
-        for poisson in POISSON:
+    # depths over the length
+    for depth in (1.0 / 20.0, 1.0 / 50.0):
+        for poisson in (0.0, 0.3):
             bend, twist = (1.0 - poisson**2) * depth, 2.0 * (1.0 - poisson) * depth
             factor, ratio = tall_cantilever(bend / twist, bend * depth**2 / 12.0 / twist)
             unit = math.sqrt(bend * twist)
@@ -517,7 +504,8 @@ def _tipping(
     bench: Bench, kind: str, n: float, depth: float, poisson: float, about: float
 ) -> tuple[float, float]:
     """Critical load [N], near ``about``, and rotation of the tip over its deflection over L in the mode."""
-    strip = partial(scene, strip_mesh(bench, kind, n / depth, depth), plate_material(TALL, poisson=poisson))
+    # C L²/D, so high that the strip hardly bends in its plane
+    strip = partial(scene, strip_mesh(bench, kind, n / depth, depth), plate_material(1e8, poisson=poisson))
     clamp = {"group": "left", "clamp": True}
     # the equilibrium in the plane comes first; buckling needs displacements out of the plane only
     plane = strip(STATIC | {"step": 1.0}, handles=[clamp, {"group": "sheet", "axes": ["z"]}])

@@ -189,14 +189,9 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- belt over a cylinder --------------------------------------------------------------------------------
 
-DRUM, BELT_GAP = 0.1, 5e-4
-"""Radius of the drum and contact gap [m]"""
 
 WRAPS = ((0.5, 0.1), (0.5, 0.5), (1.0, 0.3), (1.5, 0.1), (1.5, 0.5))
 """Angle of wrap over π, and μ"""
-
-PULLED, PULL, TURN = 0.2, 0.01, 10.0
-"""Load factor at which the belt is stretched, its relative elongation, later rotation of the drum [°]"""
 
 
 def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str, Any], list[list[int]]]:
@@ -204,8 +199,10 @@ def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str
 
     The initial distance of its edges from the drum is the gap.
     """
+    # radius of the drum and contact gap [m]
+    drum_radius, gap = 0.1, 5e-4
     quarter = 0.5 * math.pi / n
-    radius, wrapped, tail = (DRUM + BELT_GAP) / math.cos(0.5 * quarter), round(angle / quarter), n // 2
+    radius, wrapped, tail = (drum_radius + gap) / math.cos(0.5 * quarter), round(angle / quarter), n // 2
     cells, size = wrapped + 2 * tail, 2.0 * radius * math.sin(0.5 * quarter)
     flat, faces = rectangle(cells, 1, cells * size, size)
     index = np.tile(np.arange(cells + 1.0) - tail, 2)
@@ -213,15 +210,17 @@ def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str
     cos, sin, beyond = np.cos(on_drum * quarter), np.sin(on_drum * quarter), size * (index - on_drum)
     start = np.column_stack([radius * sin + beyond * cos, flat[:, 1], radius * cos - beyond * sin])
     ends = [[0, cells + 1], [cells, 2 * cells + 1]]
-    elongation = PULL * cells * size
+    # load factor at which the belt is stretched by 1 %; later the drum turns by 10°
+    pulled = 0.2
+    elongation = 0.01 * cells * size
     pull = [elongation * math.cos(angle), 0.0, -elongation * math.sin(angle)]
     axis = [0.0, 1.0, 0.0]
     drum = {
-        "capsule": {"from": [0.0, -1.0, 0.0], "to": axis, "radius": DRUM},
+        "capsule": {"from": [0.0, -1.0, 0.0], "to": axis, "radius": drum_radius},
         "motion": [
             {"time": 0.0},
-            {"time": PULLED},
-            {"time": 1.0, "rotate": {"axis": axis, "degrees": -TURN}},
+            {"time": pulled},
+            {"time": 1.0, "rotate": {"axis": axis, "degrees": -10.0}},
         ],
         "interpolation": "linear",
     }
@@ -236,9 +235,9 @@ def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str
             {"nodes": list(range(len(flat))), "axes": ["y"]},
         ],
         motions={
-            "pull": [{"time": 0.0}, {"time": PULLED, "translate": pull}, {"time": 1.0, "translate": pull}]
+            "pull": [{"time": 0.0}, {"time": pulled, "translate": pull}, {"time": 1.0, "translate": pull}]
         },
-        contact={"gap": BELT_GAP, "friction": friction, "self": False},
+        contact={"gap": gap, "friction": friction, "self": False},
         obstacles={"drum": drum},
     )
     return content, ends
@@ -265,8 +264,6 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- sheets thrown at each other -------------------------------------------------------------------------
 
-SPEED, FLIGHT, THROWN = 2.0, 0.1, 8
-"""Speed [m/s], duration [s], cells along a side"""
 
 THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("midpoint", 0.3))
 """Integrators and coefficients of friction"""
@@ -304,17 +301,19 @@ class CollisionBalance:
 
 def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> CollisionBalance:
     """Simulate a sheet and a smaller, tilted one above it that fly towards each other; collective."""
+    # speed [m/s], duration [s], cells along a side
+    speed, flight, thrown = 2.0, 0.1, 8
     side, small = 0.3, 0.24
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 50.0}
     upper = {"transform": {"rotate": turn, "translate": [0.05, 0.05, 0.25]}}
     content = {
         "mesh": [
-            grid(side, side, THROWN, THROWN, "alternating"),
-            grid(small, small, THROWN, THROWN) | upper,
+            grid(side, side, thrown, thrown, "alternating"),
+            grid(small, small, thrown, thrown) | upper,
         ],
         "material": {"cloth": "gray-interlock"},
         "contact": {"gap": 0.005, "friction": friction},
-        "time": {"end": FLIGHT, "step": 1.0 / n, "integrator": integrator},
+        "time": {"end": flight, "step": 1.0 / n, "integrator": integrator},
     }
     found = CollisionBalance()
     with bench.simulation(content) as trial:
@@ -322,8 +321,8 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Collisi
         assert isinstance(contact, ContactBarrier)
         friction_term = trial.simulation.problem.terms.get("friction", contact)
         assert isinstance(friction_term, Elastic)
-        below = (np.arange(len(trial.start)) < (THROWN + 1) ** 2)[:, None]
-        trial.set_state(v=np.where(below, [0.2 * SPEED, 0.0, SPEED], [0.0, 0.0, -SPEED]))
+        below = (np.arange(len(trial.start)) < (thrown + 1) ** 2)[:, None]
+        trial.set_state(v=np.where(below, [0.2 * speed, 0.0, speed], [0.0, 0.0, -speed]))
         mass = trial.mass[:, None]
 
         def momenta() -> Array:
@@ -398,12 +397,6 @@ def collision(bench: Bench, n: float) -> Iterator[Measured]:
 LAYERS, WIDE, NARROW, LAYER_GAP = 3, 0.4, 0.3, 0.002
 """Number of lower sheets, their side, the side of the top sheet, the gap [m]"""
 
-WIDE_CELLS, NARROW_CELLS = 6, 5
-"""Cells along a side, different so that vertices do not lie on vertices"""
-
-FRICTION, PUSH, SETTLE = 0.3, 0.8, 0.4
-"""μ between sheets, initial speed of the top sheet [m/s], time for settling before [s]"""
-
 
 @case(
     "Block of four layers on a plane without friction; the top layer, which is smaller, gets a velocity: its "
@@ -417,50 +410,50 @@ FRICTION, PUSH, SETTLE = 0.3, 0.8, 0.4
     quick=1,
 )
 def layers(bench: Bench, n: float) -> Iterator[Measured]:
+    # cells along a side, different so that vertices do not lie on vertices
+    wide_cells, narrow_cells = 6, 5
+    # μ between sheets, initial speed of the top sheet [m/s], time for settling before [s]
+    friction, push, settle = 0.3, 0.8, 0.4
+
     def sheet(side: float, cells: int, number: int) -> dict[str, Any]:
         shift = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
         return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": shift}}
 
     part = NARROW**2 / (NARROW**2 + LAYERS * WIDE**2)
-    deceleration = FRICTION * G / (1.0 - part)
+    deceleration = friction * G / (1.0 - part)
     content = {
         "mesh": [
-            *(sheet(WIDE, WIDE_CELLS, number) for number in range(LAYERS)),
-            sheet(NARROW, NARROW_CELLS, LAYERS),
+            *(sheet(WIDE, wide_cells, number) for number in range(LAYERS)),
+            sheet(NARROW, narrow_cells, LAYERS),
         ],
         "material": {"cloth": "gray-interlock"},
         "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": LAYER_GAP, "friction": FRICTION},
+        "contact": {"gap": LAYER_GAP, "friction": friction},
         "obstacles": {"floor": FLOOR | {"friction": 0.0}},
-        "time": {"end": SETTLE + 1.4 * PUSH / deceleration, "step": 1.0 / n},
+        "time": {"end": settle + 1.4 * push / deceleration, "step": 1.0 / n},
     }
     with bench.simulation(content) as trial:
-        trial.run_to(SETTLE)
-        number = np.minimum(np.arange(len(trial.start)) // (WIDE_CELLS + 1) ** 2, LAYERS)
+        trial.run_to(settle)
+        number = np.minimum(np.arange(len(trial.start)) // (wide_cells + 1) ** 2, LAYERS)
         top, mass, before = number == LAYERS, trial.mass, trial.x[:, 0]
-        trial.set_state(v=np.where(top[:, None], [PUSH, 0.0, 0.0], 0.0))
+        trial.set_state(v=np.where(top[:, None], [push, 0.0, 0.0], 0.0))
         work = trial.simulation.budget.external_work
         moved, v = trial.run().x[:, 0] - before, trial.v[:, 0]
         work -= trial.simulation.budget.external_work
     means = np.bincount(number, mass * v) / np.bincount(number, mass)
     distance = float(np.average(moved[top], weights=mass[top]) - np.average(moved[~top], weights=mass[~top]))
-    yield Measured("final velocity", worst_value(means, part * PUSH), part * PUSH, "m/s")
-    yield Measured("sliding distance", distance, 0.5 * PUSH**2 / deceleration, "m")
-    yield Measured("work of friction", work, 0.5 * float(mass[top].sum()) * PUSH**2 * (1.0 - part), "J")
+    yield Measured("final velocity", worst_value(means, part * push), part * push, "m/s")
+    yield Measured("sliding distance", distance, 0.5 * push**2 / deceleration, "m")
+    yield Measured("work of friction", work, 0.5 * float(mass[top].sum()) * push**2 * (1.0 - part), "J")
 
 
 # -- ruck ------------------------------------------------------------------------------------------------
 
 RUCK = load_data("ruck")
 
-HALF, RUCK_GAP, MEMBRANE = 3.0, 1e-4, 1e4
-"""Half the length of the sheet over l, gap over l, C l²/B."""
 
 LONG_STEP, STEPS = 1.0, 8
 """Δt over √(l/g), long so that backward Euler damps the motion; steps in which the end moves, then rests."""
-
-FOOT = (0.1, 0.45)
-"""Range of (height over that of the ruck)^(1/3) in which it is linear along the sheet."""
 
 
 def _small_ruck(s: Array, half_length: float, height: float) -> Array:
@@ -486,24 +479,26 @@ def _small_ruck(s: Array, half_length: float, height: float) -> Array:
     quick=1,
 )
 def ruck(bench: Bench, n: float) -> Iterator[Measured]:
+    # half the length of the sheet over l, gap over l, C l²/B
+    half, ruck_gap, membrane = 3.0, 1e-4, 1e4
     cells = round(n)
-    flat, faces = rectangle(cells, 1, HALF, HALF / n)
+    flat, faces = rectangle(cells, 1, half, half / n)
     along, rows = flat[:, 0], RUCK["rows"]
     _, half_length, _, height = rows[0]
     start = _small_ruck(along, half_length, height)
     frames: list[dict[str, Any]] = [{"time": 0.0}]
     for force, _, shortening, _ in rows:
         # includes the elastic shortening by the force
-        displacement = HALF * (1.0 - force / MEMBRANE) - 0.5 * shortening - float(start[:, 0].max())
+        displacement = half * (1.0 - force / membrane) - 0.5 * shortening - float(start[:, 0].max())
         begin = frames[-1]["time"]
         for time in (begin + STEPS * LONG_STEP, begin + 2 * STEPS * LONG_STEP):
             frames.append({"time": time, "translate": [displacement, 0.0, 0.0]})
     ends = [[0, cells + 1], [cells, 2 * cells + 1]]
     content = scene(
         bench.mesh(
-            np.column_stack([start[:, 0], flat[:, 1], start[:, 1] + 0.95 * RUCK_GAP]), faces, rest=flat[:, :2]
+            np.column_stack([start[:, 0], flat[:, 1], start[:, 1] + 0.95 * ruck_gap]), faces, rest=flat[:, :2]
         ),
-        plate_material(MEMBRANE),
+        plate_material(membrane),
         {"end": frames[-1]["time"], "step": LONG_STEP},
         gravity=[0.0, 0.0, -1.0],
         handles=[
@@ -512,7 +507,7 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
             {"nodes": list(range(len(flat))), "axes": ["y"]},
         ],
         motions={"push": frames},
-        contact={"gap": RUCK_GAP, "self": False},
+        contact={"gap": ruck_gap, "self": False},
         obstacles={"floor": FLOOR},
         solver={"force_tolerance": 1e-7, "step_tolerance": 1e-7},
     )
@@ -523,10 +518,10 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
             push = trial.gather(trial.simulation.energy_balance.reaction)[ends[1], 0]
             z = trial.x[:, 2] - trial.x[ends[1], 2].mean()
             root = np.cbrt(z / z.max())
-            foot = (root > FOOT[0]) & (root < FOOT[1])
+            foot = (root > 0.1) & (root < 0.45)  # the range in which it is linear along the sheet
             label = f"P = {force:g} B/l²"
             found += [
-                Measured(f"P l²/B, {label}", -float(push.sum()) * n / HALF, force),
+                Measured(f"P l²/B, {label}", -float(push.sum()) * n / half, force),
                 Measured(f"height / l, {label}", float(z.max()), height),
                 Measured(
                     f"half length / l, {label}",
@@ -539,8 +534,6 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- against a pole, over an edge ------------------------------------------------------------------------
 
-LENGTH, CELLS, STRIP_STEP, STRIP_GAP = 0.3, 12, 0.004, 0.002
-"""Length of a strip [m]; cells along it, Δt [s] and gap [m], of which one at a time is refined"""
 
 FABRIC = {"density": 0.2, "membrane": isotropic(200.0), "bending": 2e-4}
 
@@ -562,6 +555,8 @@ def _refined(
 
     ``transform`` places the strip as a function of the gap [m].
     """
+    # length of a strip [m]; cells along it, Δt [s] and gap [m], of which one at a time is refined
+    length, coarse_cells, coarse_step, coarse_gap = 0.3, 12, 0.004, 0.002
     falls = {
         "gravity": [0, 0, -9.81],
         "handles": [*held, {"group": "sheet", "axes": ["y"]}],
@@ -573,11 +568,11 @@ def _refined(
         ends: list[Array] = []
         for part in (0.5 * n, n):
             # with long steps the friction of bouncing parts would hide the effect of the gap
-            step = STRIP_STEP / {"Δt": part, "h": 1.0, "gap": 4.0}[label]
-            gap = STRIP_GAP / part if label == "gap" else STRIP_GAP
-            cells = round(CELLS * part) if label == "h" else CELLS
+            step = coarse_step / {"Δt": part, "h": 1.0, "gap": 4.0}[label]
+            gap = coarse_gap / part if label == "gap" else coarse_gap
+            cells = round(coarse_cells * part) if label == "h" else coarse_cells
             strip = scene(
-                grid(LENGTH, LENGTH / cells, cells, 1, "alternating") | {"transform": transform(gap)},
+                grid(length, length / cells, cells, 1, "alternating") | {"transform": transform(gap)},
                 FABRIC,
                 {"end": end, "step": step},
                 contact={"gap": gap, "self": False, "friction": friction},
@@ -586,7 +581,7 @@ def _refined(
             with bench.simulation(strip) as trial:
                 ends.append(trial.run().x[[0, cells]])
         change = float(np.abs(ends[1] - ends[0])[:, ::2].max())
-        yield Measured(f"change of the ends, {label} halved", change, 0.0, "m", scale=LENGTH)
+        yield Measured(f"change of the ends, {label} halved", change, 0.0, "m", scale=length)
 
 
 REFINED: dict[str, Any] = {
@@ -629,15 +624,6 @@ RIM, WAVES = 1e-3, range(2, 10)
 With 4 mm cloths are stretched so much where they are lifted that they may jump off the disc.
 """
 
-SHORT, AT_REST = 1e-3, 1e-3
-"""Gap [m], below the shortest edge of the finest mesh; speed [m/s] below which a cloth counts as at rest"""
-
-OF_DENIMS = 0.8
-"""Middle of the published range of 70 to 90 %"""
-
-IN_TABLE = 4.0
-"""Bending stiffness of the table over the one that the program it belongs to uses (`theory.md`)"""
-
 
 def _disc(kind: str, n: int, random: np.random.Generator) -> tuple[Array, Ints]:
     """A randomly rotated disc of radius 1: rings, or a square of n × n cells mapped smoothly.
@@ -668,12 +654,14 @@ def _wavy(flat: Array, random: np.random.Generator) -> Array:
 
 def _drape(bench: Bench, kind: str, n: int, start: int) -> float:
     """Drape coefficient of one simulation; kinds and starts have independent waves; collective."""
-    material = {"cloth": "11oz-black-denim", "bending_model": "midedge", "bending_scale": IN_TABLE}
+    # bending stiffness of the table over the one that the program it belongs to uses (`theory.md`)
+    material = {"cloth": "11oz-black-denim", "bending_model": "midedge", "bending_scale": 4.0}
     random = np.random.default_rng([MESHES.index(kind), start])
     flat, faces = _disc(kind, n, random)
     lifted, rest = _wavy(flat, random), CLOTH * flat[:, :2]
-    scene = drape_scene(bench, lifted, faces, rest, material, start, SHORT, iterations=200)
-    x = drape_cloth(bench, scene, AT_REST)
+    # gap [m], below the shortest edge of the finest mesh; speed [m/s] below which a cloth counts as at rest
+    scene = drape_scene(bench, lifted, faces, rest, material, start, 1e-3, iterations=200)
+    x = drape_cloth(bench, scene, 1e-3)
     return drape_coefficient(shadow(x, faces, PIXELS))
 
 
@@ -703,7 +691,8 @@ def cusick(bench: Bench, n: float) -> Iterator[Measured]:
     samples = []
     for kind in MESHES:
         samples.append([_drape(bench, kind, round(n), start) for start in range(STARTS)])
-        yield Measured(f"drape coefficient, {kind}", float(np.mean(samples[-1])), OF_DENIMS, scale=1.0)
+        # middle of the published range of 70 to 90 %
+        yield Measured(f"drape coefficient, {kind}", float(np.mean(samples[-1])), 0.8, scale=1.0)
     if len(samples) > 1:
         yield Measured("scatter of the kinds", scatter_of_means(samples), 0.0, scale=1.0)
 

@@ -105,9 +105,6 @@ CONVERGING: dict[str, Any] = {
 STRETCHES = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
 """Weight over c11 by span, which bounds the stretch; its effect is larger the less the strip sags."""
 
-UNEQUAL = 2e-6
-"""Weight over c11, which bounds the stretch"""
-
 
 def _middle(bench: Bench, n: float, e: float, dx: float, dz: float = 0.0) -> tuple[float, float]:
     """x and z [m] of the middle of a strip from its left support; supports at distance (dx, dz) L."""
@@ -134,7 +131,8 @@ def catenary(bench: Bench, n: float) -> Iterator[Measured]:
 )
 def catenary_unequal(bench: Bench, n: float) -> Iterator[Measured]:
     for dx, dz, a, lowest, _, _ in CATENARY["unequal_heights"]["rows"]:
-        x, z = _middle(bench, n, UNEQUAL, dx, dz)
+        # weight over c11, which bounds the stretch
+        x, z = _middle(bench, n, 2e-6, dx, dz)
         exact = middle(a, lowest)
         supports = f"right support {dx:g} L away, {dz:g} L up"
         yield Measured(f"x of the middle, {supports}", x, exact[0] * LENGTH, "m")

@@ -81,10 +81,6 @@ def _slopes(corners: Array) -> Array:
     return slopes
 
 
-OFF_THE_LINES = 0.0917
-"""Offset of the periodic cell over its size, such that no hinge lies on its border."""
-
-
 def strip_stiffness(hinges: PlateHinges, points: Array, start: float, period: float, width: float) -> float:
     """B_effective [N·m] of a strip along x with free edges: moment per width over curvature.
 
@@ -131,7 +127,8 @@ def _relaxed(hinges: PlateHinges, points: Array, shapes: Array, to_cell: Array, 
 
     ``to_cell`` (d, 2) maps positions to lattice coordinates.
     """
-    cell = points @ to_cell.T - start - OFF_THE_LINES
+    # offset of the periodic cell over its size, such that no hinge lies on its border
+    cell = points @ to_cell.T - start - 0.0917
     middle = 0.5 * (cell[hinges.stencil[:, 0]] + cell[hinges.stencil[:, 1]])
     inside = ((middle >= 0.0) & (middle < 1.0)).all(axis=1)
     stencil, slopes = hinges.stencil[inside], hinges.slopes[inside]
@@ -306,10 +303,6 @@ def hinge_plate(bench: Bench, n: float) -> Sequence[Measured]:
     return found
 
 
-BETA_L = (1.8751040687119611, 4.694091132974175, 7.854757438237613)
-"""Roots of cos βL cosh βL = −1."""
-
-
 @case(
     "Clamped strip: frequencies from the assembled K and M against the beam's with B_effective",
     source="Euler-Bernoulli beam, closed form: ω = (βL)² √(B/(ρ L⁴))",
@@ -319,13 +312,15 @@ BETA_L = (1.8751040687119611, 4.694091132974175, 7.854757438237613)
     counts="cells along the strip",
 )
 def strip_vibration(bench: Bench, n: float) -> Sequence[Measured]:
+    # roots of cos βL cosh βL = −1
+    beta_l = (1.8751040687119611, 4.694091132974175, 7.854757438237613)
     found = []
     for pattern in PATTERNS:
         across = strip(pattern, n)
         across["handles"].append({"group": "sheet", "axes": ["x", "y"]})
         with bench.simulation(across) as trial:
-            omegas, _ = lowest_modes(trial, len(BETA_L))
-        for number, (omega, beta) in enumerate(zip(omegas, BETA_L, strict=True), 1):
+            omegas, _ = lowest_modes(trial, len(beta_l))
+        for number, (omega, beta) in enumerate(zip(omegas, beta_l, strict=True), 1):
             exact = beta**2 * np.sqrt(expected(pattern) / DENSITY)
             found.append(Measured(f"ω{number}, {pattern}", float(omega), float(exact), "rad/s"))
     return found

@@ -159,8 +159,6 @@ G = 9.81
 # -- a round membrane ------------------------------------------------------------------------------------
 
 ROUND = load_data("circular_membrane")
-RADIUS, STIFFNESS = 1.0, 1000.0
-"""Radius [m], membrane stiffness [N/m]"""
 
 
 @case(
@@ -171,17 +169,19 @@ RADIUS, STIFFNESS = 1.0, 1000.0
     counts="cells along the radius",
 )
 def circular_membrane(bench: Bench, n: float) -> Iterator[Measured]:
+    # radius [m], membrane stiffness [N/m]
+    radius, stiffness = 1.0, 1000.0
     number = np.arange((int(n) + 1) ** 2).reshape(int(n) + 1, int(n) + 1)
     rim = np.unique(np.concatenate([number[-1], number[:, -1]]))
-    mesh, symmetry = bench.mesh(*quarter_disc(int(n), RADIUS)), {"x": number[:, 0], "y": number[0]}
+    mesh, symmetry = bench.mesh(*quarter_disc(int(n), radius)), {"x": number[:, 0], "y": number[0]}
     held: list[dict[str, Any]] = [{"nodes": rim.tolist()}]
     held += [{"nodes": nodes.tolist(), "axes": [axis]} for axis, nodes in symmetry.items()]
     for nu, e, exact in ROUND["rows"]:
-        material = {"density": e * STIFFNESS / (G * RADIUS), "membrane": isotropic(STIFFNESS, nu)}
+        material = {"density": e * stiffness / (G * radius), "membrane": isotropic(stiffness, nu)}
         with bench.simulation(scene(mesh, material, gravity=[0, 0, -G], handles=held)) as trial:
             sag = -float(trial.run().x[0, 2])
         name = f"central deflection, ν = {nu:g}, load {e:g} C/a"
-        yield Measured(name, sag, exact * RADIUS, "m")
+        yield Measured(name, sag, exact * radius, "m")
 
 
 # -- a stretched one -------------------------------------------------------------------------------------
@@ -193,8 +193,6 @@ TENSE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
 """N/m"""
 
 STRETCHES = np.diag([1.02, 1.01])
-MODES = ((1, 1), (2, 1), (3, 1), (1, 2))
-"""Numbers of half waves along and across, by ascending frequency."""
 
 
 def omega_of(along: int, across: int) -> float:
@@ -224,17 +222,15 @@ def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[
     counts="cells along the longer side",
 )
 def stretched_membrane(bench: Bench, n: float) -> Sequence[Measured]:
+    # numbers of half waves along and across, by ascending frequency
+    modes = ((1, 1), (2, 1), (3, 1), (1, 2))
     with bench.simulation(_stretched(bench, int(n), ASSEMBLED)) as trial:
-        found, _ = lowest_modes(trial, len(MODES))
+        found, _ = lowest_modes(trial, len(modes))
     return [
         Measured(f"ω of mode {mode[0]}{mode[1]}", float(omega), omega_of(*mode), "rad/s")
-        for mode, omega in zip(MODES, found, strict=True)
+        for mode, omega in zip(modes, found, strict=True)
     ]
 
-
-CELLS = 16
-AMPLITUDE = 1e-5
-"""Amplitude [m], small enough for a linear motion, large enough for forces above round-off"""
 
 PERIOD = 2.0 * math.pi / omega_of(1, 1)
 """s"""
@@ -276,10 +272,11 @@ def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[n
     time = {"end": PERIOD, "step": PERIOD / n, "integrator": integrator}
     # Newton's method must reach round-off: forces of the stretched sheet are large, those of the motion small
     tight = {"force_tolerance": 1e-15, "step_tolerance": 1e-15}
-    with bench.simulation(_stretched(bench, CELLS, time, solver=tight)) as trial:
+    with bench.simulation(_stretched(bench, 16, time, solver=tight)) as trial:
         frequencies, shapes = lowest_modes(trial, 1)
         omega, shape = float(frequencies[0]), shapes[0]
-        trial.set_state(x=trial.start + AMPLITUDE / np.abs(shape).max() * shape)
+        # amplitude [m], small enough for a linear motion, large enough for forces above round-off
+        trial.set_state(x=trial.start + 1e-5 / np.abs(shape).max() * shape)
         weights = trial.mass[:, None] * shape
         states = []
         for count in range(round(n) + 1):

@@ -125,12 +125,8 @@ def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- a sheet on springs ----------------------------------------------------------------------------------
 
-SPRING_STEPS = 3
 OMEGA = 5.0
 """rad/s"""
-
-SPRING_DENSITY = 0.3
-"""kg/m²"""
 
 
 def _sprung_sheet(time: dict[str, Any]) -> dict[str, Any]:
@@ -139,8 +135,10 @@ def _sprung_sheet(time: dict[str, Any]) -> dict[str, Any]:
     The sheet moves rigidly as one linear oscillator, as masses and spring stiffnesses of the vertices have
     the same ratio: both are a third of those of each adjacent triangle.
     """
-    third = SPRING_DENSITY * 0.5 / 3.0 * OMEGA**2
-    material = {"density": SPRING_DENSITY, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}}
+    # kg/m²
+    spring_density = 0.3
+    third = spring_density * 0.5 / 3.0 * OMEGA**2
+    material = {"density": spring_density, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}}
     springs = [{"nodes": [0, 3], "stiffness": 2.0 * third}, {"nodes": [1, 2], "stiffness": third}]
     initial = {"velocity": [0, 0, 1]}
     return scene(grid(1.0, 1.0, 1, 1), material, time, handles=springs, initial=initial)
@@ -159,10 +157,11 @@ def _states(trial: Trial) -> NDArray[np.complex128]:
     counts="1/(ωΔt)",
 )
 def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
+    spring_steps = 3
     amplification, phase = 1.0 / math.hypot(1.0, 1.0 / n), math.atan(1.0 / n)
-    time = {"end": SPRING_STEPS / (n * OMEGA), "step": 1.0 / (n * OMEGA)}
+    time = {"end": spring_steps / (n * OMEGA), "step": 1.0 / (n * OMEGA)}
     with bench.simulation(_sprung_sheet(time)) as trial:
-        for _ in range(SPRING_STEPS):
+        for _ in range(spring_steps):
             before = _states(trial)
             trial.step()
         # z + i v/ω rotates and shrinks in the complex plane
@@ -180,14 +179,13 @@ STEPS = 10
 TRIANGLE_DENSITY, RADIUS, DT = 0.2, 1.0, 1e-2
 """Density [kg/m²], radius [m], Δt [s]"""
 
-STRAIN = 1e-6
-"""ρ ω² R²/c11, the size of the strain of the nearly rigid triangle"""
 
 RIGID = "angle of a step, of a rigid body"
 
 
 def _stiffness(n: float) -> float:
-    return TRIANGLE_DENSITY * (RADIUS / (n * DT)) ** 2 / STRAIN
+    # ρ ω² R²/c11, the size of the strain of the nearly rigid triangle
+    return TRIANGLE_DENSITY * (RADIUS / (n * DT)) ** 2 / 1e-6
 
 
 def _first_velocity(n: float) -> complex:

@@ -84,10 +84,6 @@ SECTIONS: dict[str, tuple[Section, float, tuple[tuple[float, float], ...]]] = {
 }
 """Columns of walls 1 m wide: the walls, the length of the column [m], and the edges that stay straight."""
 
-SHIFT = 0.4
-"""Shift of the eigenvalue problem over the lowest squared frequency without compression, larger than any
-negative square"""
-
 
 def flange(length: float, poisson: float) -> float:
     """Buckling load over π² D/b² of a plate of width b with one free and three supported sides.
@@ -133,7 +129,9 @@ def sections(bench: Bench, n: float) -> Iterator[Measured]:
             handles=[{"nodes": held.tolist(), "axes": ["x", "z"]}, {"nodes": [0], "axes": ["y"]}],
         )
         exact = math.pi**2 * (flange(length, POISSON) if len(straight) == 1 else 4.0)
-        shift = SHIFT * exact * (math.pi / length) ** 2
+        # shift of the eigenvalue problem over the lowest squared frequency without compression, larger than
+        # any negative square
+        shift = 0.4 * exact * (math.pi / length) ** 2
         with bench.simulation(content) as trial:
 
             def lowest(load: float, trial: Trial = trial, shift: float = shift) -> float:

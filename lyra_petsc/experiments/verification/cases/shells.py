@@ -105,10 +105,6 @@ def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
     return [*found, Measured("−U at full load", float(tip[0]), length, "m")]
 
 
-PRESSURES = (6.0, 30.0)
-"""Pressures q L³/B; the second one bends the strip by more than half a circle."""
-
-
 @case(
     "Cantilever under a follower pressure, bending_model: midedge: displacement of the tip against the rod",
     source="equations of an inextensible rod, integrated from the tip",
@@ -117,12 +113,14 @@ PRESSURES = (6.0, 30.0)
     counts="cells along the strip",
 )
 def pressed_strip(bench: Bench, n: float) -> Sequence[Measured]:
+    # pressures q L³/B; the second one bends the strip by more than half a circle
+    pressures = (6.0, 30.0)
     mesh = grid(1.0, 0.1, round(n), round(0.1 * n), "alternating")
     strip = scene(mesh, plate_material(1e6), handles=[{"group": "left", "clamp": True}])
-    content = strip | {"loads": [{"pressure": PRESSURES[-1]}]}
+    content = strip | {"loads": [{"pressure": pressures[-1]}]}
     found: list[Measured] = []
     for factor, trial in increments(bench, content, 0.1):
-        load = next((each for each in PRESSURES if math.isclose(each, factor * PRESSURES[-1])), None)
+        load = next((each for each in pressures if math.isclose(each, factor * pressures[-1])), None)
         if load is not None:
             end = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
             x, z = pressed_tip(load)
@@ -251,16 +249,16 @@ def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
 # -- curved shells, linear -----------------------------------------------------------------------------
 
 PATTERNS = ("diagonal", "alternating")
-FAR = 1e4
-BESIDE = 1e-6
-"""Tolerance of a coordinate over the size of the shell within which vertices count as on a plane."""
 
 
 def plane_box(axis: str, at: float, size: float) -> list[list[float]]:
     """Opposite corners of a box that contains the vertices on a coordinate plane."""
+    far = 1e4
+    # tolerance of a coordinate over the size of the shell within which vertices count as on a plane
+    beside = 1e-6
     return [
-        [at - BESIDE * size if each == axis else -FAR for each in "xyz"],
-        [at + BESIDE * size if each == axis else FAR for each in "xyz"],
+        [at - beside * size if each == axis else -far for each in "xyz"],
+        [at + beside * size if each == axis else far for each in "xyz"],
     ]
 
 
@@ -477,10 +475,6 @@ def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
         yield from worst(found)
 
 
-DEFLECTION = 30.0
-"""Final deflection at the centre of the roof [mm]."""
-
-
 @case(
     "Shallow cylindrical roof, hinged at its straight edges, whose middle is pushed through, a quarter, "
     "bending_model: midedge: distance of the table from the computed curve of load over deflection, "
@@ -491,6 +485,8 @@ DEFLECTION = 30.0
     quick=2,
 )
 def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
+    # final deflection at the centre of the roof [mm]
+    deflection = 30.0
     radius, half, angle = 2540.0, 254.0, 0.1
     loads, deflections = np.array(TABLES["hinged_roof"]["rows"]).T
     for pattern in PATTERNS:
@@ -504,12 +500,12 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
                 {"box": plane_box("x", radius * math.sin(angle), radius)},
                 {"nodes": [0], "axes": ["z"], "motion": "push", "interpolation": "linear"},
             ],
-            motions={"push": [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, -DEFLECTION]}]},
+            motions={"push": [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, -deflection]}]},
         )
         curve = [(0.0, 0.0)]
         for factor, trial in increments(bench, content, INCREMENT / 3.0):
             push = trial.simulation.energy_balance.handle_forces(4)[3][2]
-            curve.append((factor * DEFLECTION, -4.0 * push / 3000.0))  # over the largest load [N]
+            curve.append((factor * deflection, -4.0 * push / 3000.0))  # over the largest load [N]
         extent = deflections.max(), loads.max()
         distance = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
         found = np.interp(deflections, *np.array(curve).T)
