@@ -16,11 +16,8 @@ from lyra_petsc.kernels.compilation import COMPILATION
 MIN_SECONDS = 3.0
 """Wall time of steps [s] before a note is given."""
 
-MAX_WAIT = 0.4
-"""Fraction of the time without a processor above which a note is given; below a half, as it fluctuates."""
-
-MAX_WAIT_CROWDED = 0.2
-"""The same on machines with fewer processors than ranks, where waiting ranks use processor time as well."""
+MAX_WAIT = 0.3
+"""Fraction of the time without a processor above which a note is given; it fluctuates."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +78,15 @@ def note_on(shares: Sequence[Share]) -> str:
     machines: dict[str, list[Share]] = {}
     for share in shares:
         machines.setdefault(share.machine, []).append(share)
-    suitable, crowded, processors = 0, False, 0
+    suitable, processors = 0, 0
     for here in machines.values():
         available = len(frozenset().union(*(one.processors for one in here)))
         processors += available
-        crowded |= available < len(here)
         suitable += max(1, min(available, len(here), round(sum(one.share for one in here))))
     waiting = 1.0 - sum(one.share for one in shares) / ranks
-    if waiting < (MAX_WAIT_CROWDED if crowded else MAX_WAIT) or suitable >= ranks:
+    if waiting < MAX_WAIT or suitable >= ranks:
         return ""
-    why = f"there are {processors}" if crowded else "other programs use them"
+    why = f"there are {processors}" if processors < ranks else "other programs use them"
     return (
         f"{ranks} ranks were without a processor for {100.0 * waiting:.0f} % of the time ({why}) and waited "
         f"for each other; {suitable} {'rank' if suitable == 1 else 'ranks'} would be faster"

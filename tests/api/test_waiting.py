@@ -51,10 +51,3 @@ def test_a_note_comes_once_and_not_for_one_rank(monkeypatch: pytest.MonkeyPatch)
     noted = [step for step, note in enumerate(notes) if note]
     assert noted == ([] if comm.size == 1 else [7])
     assert comm.allgather(counted.note) == [counted.note] * comm.size
-
-
-def test_short_runs_are_not_judged() -> None:
-    counted = Waiting(MPI.COMM_WORLD)
-    with counted.step():
-        time.sleep(0.01)
-    assert not counted.check(last=True)

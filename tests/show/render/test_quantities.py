@@ -11,14 +11,11 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.render.colour_quantities import (
-    PERCENTILES,
     ColourQuantity,
     ColourRange,
-    colour_limits,
     quantity,
     round_numbers,
 )
-from lyra_petsc.show.render.draw import measure_states
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 
@@ -68,18 +65,6 @@ def test_missing_fields_are_reported(run, tmp_path):
         quantity(bare, "speed")
 
 
-def test_extents_and_percentiles_are_measured_for_each_state(run):
-    normals = np.random.default_rng(0).normal(size=(5, 3))
-    shown = quantity(run, "speed")
-    supports, values = measure_states(run, [0, 2], normals, shown)
-    for row, state in enumerate((0, 2)):
-        np.testing.assert_array_equal(supports[row], (position(state) @ normals.T).max(axis=0))
-        speeds = np.linalg.norm(velocity(state), axis=1)
-        np.testing.assert_allclose(values[row][[0, -1]], [speeds.min(), speeds.max()])
-    empty = measure_states(run, [], normals, None)
-    assert [part.shape for part in empty] == [(0, 5), (0, len(PERCENTILES))]
-
-
 def ranges(values: list[np.ndarray], asked: str | None = None, signed: bool = False) -> tuple[float, float]:
     made = ColourQuantity("made up", lambda i: values[i], signed=signed)
     found = np.array([made.percentiles(i) for i in range(len(values))])
@@ -121,12 +106,6 @@ def test_vertex_values_are_means_weighted_by_area(run):
     assert quantity(run, "speed").on_vertices(run).label == "speed [m/s]"
     ranks = ColourQuantity("rank", lambda i: np.zeros(len(triangles)), on_triangles=True, averages=False)
     assert ranks.on_vertices(run) is ranks
-
-
-def test_the_range_of_the_colours_is_not_empty():
-    assert colour_limits(1.0, 3.0) == (1.0, 3.0)
-    assert colour_limits(0.0, 0.0) == (0.0, 1e-12)
-    assert colour_limits(np.inf, -np.inf) == (0.0, 1e-12)
 
 
 def test_held_vertices_follow_the_windows_of_handles(tmp_path):

@@ -11,7 +11,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.show.render.render_plan import (
     decimals,
     film_timing,
-    nearest_states,
     pick_state,
     spread_states,
 )
@@ -32,18 +31,6 @@ def test_a_film_lasts_as_long_as_the_motion(every, fps):
     assert len(timing.states) / timing.fps == pytest.approx(times[-1], abs=1.01 / timing.fps)
     assert timing.states[0] == 0
     assert timing.states[-1] >= len(times) - 1 - round(1.0 / (fps * every))
-
-
-def test_each_state_is_a_frame_if_their_interval_suits_a_film():
-    times = np.cumsum([0.0] + [0.025] * 80)
-    assert film_timing(times).states == tuple(range(81))
-
-
-def test_slow_motion_has_all_states():
-    times = 0.01 * np.arange(41)
-    timing = film_timing(times, speed=0.25)
-    assert timing.fps == 25.0
-    assert timing.states == tuple(range(41))
 
 
 def test_a_given_number_of_frames_per_second():
@@ -79,20 +66,6 @@ def test_a_single_state_is_a_film_of_one_frame():
 def test_films_that_are_too_long_are_refused():
     with pytest.raises(InputError, match=r"--film: .* would have 1e.06 frames"):
         film_timing(np.linspace(0.0, 1e5, 1001))
-
-
-def test_the_nearest_state():
-    times = np.array([0.0, 1.0, 4.0])
-    assert nearest_states(times, np.array([-1.0, 0.49, 0.5, 0.51, 2.4, 2.6, 9.0])).tolist() == [
-        0,
-        0,
-        0,
-        1,
-        1,
-        2,
-        2,
-    ]
-    assert pick_state(run_of(times), 3.0, "--at") == 2
 
 
 @pytest.mark.parametrize("time", [-0.03, 1.03])
