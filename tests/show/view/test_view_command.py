@@ -62,3 +62,11 @@ def test_under_mpirun_one_rank_serves_and_all_end_alike(serve, tmp_path):
 def test_options_of_the_page_without_live_are_refused(tmp_path, option):
     refused(["run", *option], tmp_path, f"{option[0]}: says where the page of --live is")
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_missing_extra_is_one_line_with_its_remedy(tmp_path):
+    written(tmp_path / "run")
+    left = lyra(["view", "run"], tmp_path, extra={"TESTS_WITHOUT": "trame_pyvista"})
+    assert left.code == 2
+    (line,) = left.ours
+    assert "trame_pyvista is not installed; get the extra: pip install 'lyra-petsc[view]'" in line
