@@ -147,6 +147,8 @@ class Trial:
                 problem.points.update_ghosts(problem.system.x)
                 problem.system.active.refreeze({term: term.frames})
         self.simulation.energy_balance.measure()  # the next step compares its energies with these
+        if self.simulation.guard is not None:
+            self.simulation.guard.forget_end()
 
     def sum_over_ranks(self, owned: Array) -> float:
         """Sum over all ranks of this rank's values; collective."""

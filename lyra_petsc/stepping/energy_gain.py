@@ -101,20 +101,25 @@ class EndForces:
         self._forces = [load for load in system.active.loads if not load.registration.energy]
         self._drift = np.array(drift)
         self._stiffness: float | None = None
-        # gradients of ``_plain`` at the end of the last accepted step, and of the present one
-        self._pull: Array | None = None
-        self._end_pull: Array | None = None
+        # forces at the start of the step, if known as those at the end of the last, and at its end: gradients
+        # of ``_plain``, and forces of the wind
+        self._start: dict[str, Array] = {}
+        self._end: dict[str, Array] = {}
 
     def keep_end(self) -> None:
         """The present step is accepted: the next starts where it ends."""
-        self._pull = self._end_pull
+        self._start = self._end
+
+    def forget(self) -> None:
+        """The next step starts from another state."""
+        self._start = {}
 
     def gain(self, x0: Array, v0: Array, ledger: EnergyBalance) -> Gain:
         """Gain of the step just taken from x0, v0 (n_local, 3), whose account the ledger has."""
         system, layout = self._system, self._system.points
         if system.discretisation.stencils_change:  # ghosts may have changed in the step
             x0, v0 = (layout.extended(values) for values in (x0, v0))
-        x1, v1, n = system.x, system.v, layout.n_owned
+        x1, v1, n, self._end = system.x, system.v, layout.n_owned, {}
         moved = x1[:n] - x0[:n]
         moved[: layout.n_vertices] -= system.dt * self._drift
         account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
@@ -222,27 +227,39 @@ class EndForces:
         system = self._system
         if not (self._forces or system.active.viscous):
             return 0.0
-        t0, t1 = system.t0, system.t1
-        force, wind = np.zeros_like(x1), np.zeros_like(x1)
+        force = np.zeros_like(x1)
         for load in self._forces:
             for x in (x0, x1) if load.is_follower else (x1, x1):
-                load.add_force(x, t0, t1, force)
-        for x, v in ((x0, v0), (x1, v1)):
-            for term in system.active.viscous:
-                term.add_gradient(v, term.freeze(UpcomingStep(t0, t1, t0, x, system.reference.at)), wind)
+                load.add_force(x, system.t0, system.t1, force)
+        n = len(moved)
+        force = force[:n]
+        if system.active.viscous:
+            start = self._start.get("wind")
+            force -= self._wind(x0, v0, n) if start is None else start
+            self._end["wind"] = end = self._wind(x1, v1, n)
+            force -= end
         free = np.where(system.prescribed.free, moved, 0.0)
-        return 0.5 * float(np.vdot((force - wind)[: len(free)], free))
+        return 0.5 * float(np.vdot(force, free))
+
+    def _wind(self, x: Array, v: Array, n: int) -> Array:
+        """Gradient (n, 3) [N] of the wind's potential at x and v (n_local, 3)."""
+        system, out = self._system, np.zeros_like(x)
+        for term in system.active.viscous:
+            step = UpcomingStep(system.t0, system.t1, system.t0, x, system.reference.at)
+            term.add_gradient(v, term.freeze(step), out)
+        return out[:n]
 
     def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
         """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
         system, at = self._system, self._system.prescribed.indices
-        start, self._end_pull, displacement = self._pull, None, moved.take(at)
+        displacement = moved.take(at)
         if not displacement.any():
             return 0.0
+        start, end = self._start.get("pull"), system.gradient_of(self._plain, x1)
         if start is None:
             start = system.gradient_of(self._plain, x0)
-        self._end_pull = system.gradient_of(self._plain, x1)
-        force = 0.5 * (start + self._end_pull).take(at)
+        self._end["pull"] = end
+        force = 0.5 * (start + end).take(at)
         targets, weight = np.zeros_like(x1), np.zeros_like(x1)
         for time, x in ((system.t0, x0), (system.t1, x1)):
             for term, frozen in self._frozen(self._targets, time, x).items():

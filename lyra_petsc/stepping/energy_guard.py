@@ -89,6 +89,10 @@ class EnergyGuard:
         """
         return self.judge(self._forces.gain(x0, v0, ledger))
 
+    def forget_end(self) -> None:
+        """The next step does not start where the last has ended."""
+        self._forces.forget()
+
     def judge(self, step: Gain) -> bool:
         """Whether a step with this gain is accepted; if so, it is recorded."""
         new = self._updated(step)
