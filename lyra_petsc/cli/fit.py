@@ -14,7 +14,7 @@ from lyra_petsc.cli.progress import ProgressBar, duration
 from lyra_petsc.cli.run import petsc_prints, warn_unused
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
-from lyra_petsc.experiments.fit.estimate import Evaluation
+from lyra_petsc.experiments.fit.estimate import Misfit
 from lyra_petsc.experiments.fit.fit_report import FitOutcome, FitView, outcome_of
 from lyra_petsc.experiments.fit.fit_runner import FIT, FitObserver, fit_scene, unknowns_of
 from lyra_petsc.experiments.results import Results
@@ -35,7 +35,7 @@ class FitProgress(ProgressBar, FitObserver):
     def progress(self, number: int, part: float) -> None:
         self.show(min(part, 0.999), f"evaluation {number}{self._cost}")
 
-    def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
+    def evaluated(self, number: int, evaluation: Misfit, *, resumed: bool) -> None:
         self._cost = f"  sum of squares {2.0 * evaluation.cost:.5g}"
         source = " (from before)" if resumed else ""
         self.say(f"evaluation {number}{self._cost}{source}")

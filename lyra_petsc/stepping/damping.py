@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.discretisation import Discretisation
-from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term
 
 
@@ -66,8 +65,6 @@ class Damping:
         Whether any term is damped, on any rank; if not, nothing is stored.
     frozen : mapping of Term → any
         Frozen data of the terms at the start of the step, before frames of edges were updated.
-    product : Remembered
-        D v (n_owned, 3) [N] for velocities v (n_local, 3).
     """
 
     def __init__(
@@ -88,8 +85,6 @@ class Damping:
         self._multiple: ScaledDamping | None = None
         self._x: Array | None = None
         self.frozen: Mapping[Term, Any] = {}
-        # residual, objective and works need it at the same velocities
-        self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max()
         self._gamma = float(factors[0]) if uniform else 0.0
@@ -104,7 +99,6 @@ class Damping:
         """Set the geometry to positions x (n_local, 3), not copied, with the terms' frozen data."""
         self.release_values()
         self._x, self._stored, self.frozen = x, False, frozen
-        self.product.forget()
         if not self._single_assembly:
             self._stored_values()
 
@@ -126,7 +120,8 @@ class Damping:
             self._stored = True
         return self._values
 
-    def _product(self, v: Array) -> Array:
+    def product(self, v: Array) -> Array:
+        """D v (n_owned, 3) [N] for velocities v (n_local, 3)."""
         if not v.any():  # for example in the residual of a semi-implicit step
             return np.zeros((self._discretisation.layout.n_owned, 3))
         if self._multiple is not None:
@@ -138,7 +133,6 @@ class Damping:
         kept, self._x, self._stored = self._x, x, False
         out = self._blocks.product(self._stored_values(), v)
         self._x, self._stored = kept, False
-        self.product.forget()
         return out
 
     def assemble(self, values: Array, diagonal: Array) -> None:
@@ -153,26 +147,24 @@ class Damping:
                 rows.add_blocks(self._stored_values(), positions, values)
 
     def assemble_with_stiffness(
-        self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
+        self, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
     ) -> bool:
-        """Write D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I to ``values``, if K⁺ is a multiple of D.
+        """Write D + weight · K⁺ + ``diagonal`` (n_owned,) · I to ``values``, if K⁺ is a multiple of D.
 
-        K⁺ is a multiple of D if all elements have the same γ and D was frozen at x. This halves the assembly
-        of a semi-implicit step, and D need not be stored. Returns False, and writes nothing, in other cases.
-        The caller may afterwards overwrite ``values`` at the flat indices ``changing`` (n,).
+        K⁺ is that of the frozen geometry; it is a multiple of D if all elements have the same γ. This halves
+        the assembly of a semi-implicit step, and D need not be stored. Returns False, and writes nothing, in
+        other cases. The caller may afterwards overwrite ``values`` at the flat indices ``changing`` (n,).
         """
         self.release_values()
         other = self._discretisation.fixed_positions is not None or any(
             term.n_elements for term in self._undamped
         )
-        if not self._gamma or other:
-            return False
-        if self._x is None or not np.array_equal(x, self._x):
+        if not self._gamma or other or self._x is None:
             return False
         factor = 1.0 + weight / self._gamma
         if self._single_assembly and not self._stored:
             self._blocks.set_diagonal(diagonal, values)
-            self._add(x, lambda term: self._gamma + weight, values)
+            self._add(self._x, lambda term: self._gamma + weight, values)
             self._multiple = ScaledDamping(values, factor, diagonal, changing)
         else:
             self._blocks.scale(self._stored_values(), factor, diagonal, values)

@@ -65,15 +65,15 @@ class Directors:
         if self._terms and integrator.lagged_loads and integrator.dynamic:
             system.active.refreeze({term: term.frames_at_end(system.x, frozen[term]) for term in self._terms})
             self._frozen_before = frozen
-            system.forget_forces()
+            system.change()
             self._end_frames = {term: system.active.frozen[term] for term in self._terms}
 
-    def update_frames(self) -> bool:
-        """Update the frames of edges that have turned far from theirs to the positions last evaluated.
+    def update_frames(self, x: Array) -> bool:
+        """Update the frames of edges that have turned far from theirs to positions x (n_local, 3).
 
         Returns whether any changed, and with them the forces on vertices; collective.
         """
-        system, x = self._system, self._system.evaluated[0]
+        system = self._system
         found: dict[Term, Any] = {}
         for term in () if system.solving_edges else self._terms:
             updated = term.updated_frames(x, system.active.frozen[term], system.prescribed.mask)
@@ -81,7 +81,7 @@ class Directors:
         if not system.points.comm.allreduce(len(found), MPI.MAX):
             return False
         system.active.refreeze(found)
-        system.forget_forces()
+        system.change()
         return True
 
     def transport_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
@@ -89,7 +89,7 @@ class Directors:
         for term in self._terms:
             term.accept(self._system.x, (frozen or self._system.active.frozen)[term])
         if self._terms:
-            self._system.forget_forces()  # where directors are loaded, those on vertices depend on the frames
+            self._system.change()  # where directors are loaded, those on vertices depend on the frames
 
     def forget(self) -> None:
         """Discard the remembered directors, whose memory the linear solve needs."""

@@ -302,7 +302,7 @@ class EnergyBalance:
 
     def handle_moments(self) -> dict[int, Array]:
         """Moment [N·m] about its mean of each handle that holds slopes, in the last step; collective."""
-        system, x = self._system, self._system.stage_positions
+        system, x = self._system, self._system.evaluated.x
         edges, numbers = system.held.edges, system.held.with_slopes
         if edges is None:
             return {}

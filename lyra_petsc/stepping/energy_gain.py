@@ -218,7 +218,7 @@ class EndForces:
         if contact is not None and contact.friction is not None:
             # by the force at the stage, which the impulses complete
             friction = contact.friction
-            friction.add_gradient(system.stage_positions, system.active.frozen[friction], force)
+            friction.add_gradient(system.evaluated.x, system.active.frozen[friction], force)
         total: Array = force[: system.points.n_vertices].sum(axis=0)
         return total + (system.contact_impulses.loads[:, :3].sum(axis=0) if system.contact_impulses else 0.0)
 
@@ -275,5 +275,5 @@ class EndForces:
     def _stiffness_sum(self) -> float:
         """Sum [N/m] of the stiffnesses of this rank's elements."""
         if self._stiffness is None:
-            self._stiffness = sum(float(each.sum()) for each in self._system.objective.stiffnesses.values())
+            self._stiffness = sum(float(each.sum()) for each in self._system.stiffnesses.values())
         return self._stiffness

@@ -455,7 +455,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
-    system.stage_positions[:] = system.x
+    system.evaluate_at_start()
     for term in system.active.stateful:
         term.initialise(system.x)
     system.hold_targets(0.0)

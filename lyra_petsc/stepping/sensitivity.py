@@ -244,11 +244,11 @@ class Sensitivities:
         with self._solver(still, set_up=True, keep=False) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, still):
-                    each.system.end_edge_solve(v)
+                    each.system.end_edge_solve(each.system.evaluate(v))
                     self._change_frames(each.system)
                 rates = _difference(neighbours, delta, lambda each: each.system.x[:n])
                 tangent.x[vertices:] = rates[vertices:]
-        system.end_edge_solve(still)
+        system.end_edge_solve(system.evaluate(still))
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -279,7 +279,6 @@ class Sensitivities:
         velocity, end = system.stage_velocity.copy(), self.simulation.time
         usual, taken = system.integrator, self.simulation.last_integrator
         semi = self._semi and taken is usual
-        system.reopen(before.x)
         with self._solver(velocity, set_up=not semi, keep=not fresh) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each in neighbours:
@@ -287,7 +286,7 @@ class Sensitivities:
                         each.system.integrator = type(taken)()
                     self._begin_step(each, before, tangent, delta, end, semi=semi)
                 for each, v in self._solve_stages(solve, neighbours, delta, velocity):
-                    each.system.accept(v)
+                    each.system.accept(each.system.evaluate(v))
         if system.solves_edges_at_end:
             self._differentiate_edges(before)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
@@ -320,7 +319,7 @@ class Sensitivities:
             start = np.zeros_like(before.x)
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()
-            system.jacobian(start, 1.0, each.jacobian)
+            system.jacobian(system.linearised(start), 1.0, each.jacobian)
             each.prescribed_force = system.prescribed_force
 
     def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
@@ -333,7 +332,7 @@ class Sensitivities:
         found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
             system.active.refreeze(found)
-            system.forget_forces()
+            system.change()
 
     def _solve_stages(
         self, solve: Callable[[Array], Array], neighbours: Neighbours, delta: float, velocity: Array
@@ -356,13 +355,11 @@ class Sensitivities:
         def residual(each: Neighbour) -> Array:
             system, v = each.system, velocity + each.offset * delta * dv
             system.prescribe(v)
-            out = np.zeros_like(v)
             if each.jacobian is None:
-                system.residual(v, system.stage.sigma * (v - system.history), out)
-                return out
+                return system.residual_at(v)
             start = np.zeros_like(v)
             system.prescribe(start)
-            system.residual(start, system.stage.sigma * (start - system.history), out)
+            out = system.residual_at(start)
             if each.prescribed_force is not None:
                 out += each.prescribed_force
             return out + _product(system, each.jacobian, v - start)
@@ -421,8 +418,8 @@ class Sensitivities:
         with self._solver(rates, set_up=True, keep=False) as solve:
             for neighbours, delta in zip(self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, rates):
-                    each.system.end_edge_solve(v)
-        system.end_edge_solve(rates)
+                    each.system.end_edge_solve(each.system.evaluate(v))
+        system.end_edge_solve(system.evaluate(rates))
 
     # -- equilibria --------------------------------------------------------------------------------
 
@@ -487,7 +484,7 @@ class Sensitivities:
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
             system.predicted_stress.forget()
-            linear.assemble(velocity, 0.0, keep=keep, convex=True)
+            linear.assemble(system.linearised(velocity), 0.0, keep=keep, convex=True)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()
         ksp.setTolerances(rtol=max(0.3 * self._tolerance, 1e-13), atol=0.0, max_it=5000)

@@ -19,11 +19,10 @@ This module works on arrays only, without PETSc. Methods that return sums over r
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.linear.block_rows import squared_norm_without
@@ -33,16 +32,15 @@ from lyra_petsc.stepping.active_terms import ActiveTerms
 from lyra_petsc.stepping.applied_loads import AppliedLoads
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.directors import Directors
+from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
-from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.predicted_stress import PredictedStress
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.start_acceleration import StartAcceleration
-from lyra_petsc.stepping.state import State
+from lyra_petsc.stepping.state import State, kinetic_energy
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
 from lyra_petsc.terms.protocols import FollowsHandles
-from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
@@ -86,8 +84,10 @@ class StageEquations:
         its stage.
     t0, t1 : float
         Start and end of the step [s].
-    objective : Objective
-        The function whose gradient F is.
+    version : int
+        Number that changes whenever the equations do: with a step, its data, or its ghosts.
+    evaluated : Evaluation
+        The last one; after a step that of its stage.
     start_acceleration : StartAcceleration
     active : ActiveTerms
     applied : AppliedLoads
@@ -132,21 +132,18 @@ class StageEquations:
         self.reference = ReferencePositions(self.points, rows, starts)
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
-        internal, once = partial(self._sum, active.sheet), integrator.lagged_loads
-        # with moving targets, forces at the same positions change
-        self._internal = internal if active.moving else Remembered(internal)
         self.damping = Damping(
-            discretisation, active.elastic, dynamic=integrator.dynamic, single_assembly=once
+            discretisation,
+            active.elastic,
+            dynamic=integrator.dynamic,
+            single_assembly=integrator.lagged_loads,
         )
-        last = (self._internal, self.damping.product) if once else ()
-        self._evaluated_once = [each for each in last if isinstance(each, Remembered)]
         self.state = State(discretisation)
-        n_local = self.points.n_local
-        self._xs, self._vs = np.zeros((n_local, 3)), np.zeros((n_local, 3))
+        self.version = 0
+        self.evaluated = Evaluation(np.zeros_like(self.x), np.zeros_like(self.x))
         self._xh, self.history = self.x, self.v[: self.points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
-        self.objective = Objective(self)
-        self.t0 = self.t1 = self.moving_energy_before = 0.0
+        self.t0 = self.t1 = self.moving_energy_before = self._size = 0.0
         self._squares: list[float] = []
         self.start_acceleration = StartAcceleration(self, events)
         self.directors = Directors(self)
@@ -225,8 +222,9 @@ class StageEquations:
         x = self.frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         if self.directors.begin_step() and self.integrator.dynamic:
-            self.forget_forces()
-        self.objective.begin_step()
+            self.state.evaluation = None
+        self.change()
+        self._size = float(np.abs(self.x).max(initial=0.0))
         if self.integrator.dynamic or self.applied.override is None:
             lagged = self.active.viscous and self.integrator.lagged_loads
             wind = self._sum(self.active.viscous, self.v) if lagged else None
@@ -242,14 +240,9 @@ class StageEquations:
             return self.x
         x = self.x + (at - self.t0) * self.v
         if self.points.n_edges_global:  # unknowns of edges are never extrapolated
-            edges = ~self._vertex_rows
+            edges = ~self.points.are_vertices(self.points.global_number)
             x[edges] = self.x[edges]
         return x
-
-    @cached_property
-    def _vertex_rows(self) -> NDArray[np.bool_]:
-        """Mask (n_local,) of the local rows of vertices; ghosts that contact adds are vertices."""
-        return self.points.are_vertices(self.points.global_number)
 
     def _set_history(self, stage: Stage, at: float) -> None:
         """Set x_h with its ghosts, and the velocities of the prescribed unknowns."""
@@ -270,22 +263,17 @@ class StageEquations:
     def out_of_balance(self, v: Array | None = None) -> Array:
         """Force (n_owned, 3) [N] on the free unknowns, with the state's velocities or v (n_local, 3)."""
         v = self.v if v is None else v
-        total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
+        total = self._total(Evaluation(self.x, v), np.zeros_like(self.history), np.empty_like(self.history))
         return np.where(self.prescribed.free, -total, 0.0)
 
     def forces_now(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the start of the step without inertia, each (n_owned, 3) [N]."""
-        return self._parts(self.x, self.v, np.zeros_like(self.history))
+        return self._parts(Evaluation(self.x, self.v), np.zeros_like(self.history))
 
     @property
     def stage_velocity(self) -> Array:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
-        return self._vs[: self.points.n_owned]
-
-    @property
-    def stage_positions(self) -> Array:
-        """Positions (n_local, 3) [m] of the stage of the step just accepted."""
-        return self._xs
+        return self.evaluated.v[: self.points.n_owned]
 
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
@@ -297,12 +285,12 @@ class StageEquations:
 
     def evaluate_at_start(self) -> None:
         """Evaluate the stage at the positions where the step starts; collective."""
-        self.evaluate_at(self.stationary_velocity())
+        self.evaluate(self.stationary_velocity())
 
-    def accept(self, v: Array) -> None:
-        """Set the state at the end of the step from velocities v (n_owned, 3) of its stage; collective."""
+    def accept(self, solution: Evaluation) -> None:
+        """Set the state at the end of the step from the stage that solves it; collective."""
         n, given, free = self.points.n_owned, self.integrator.handles_at_stage, self.prescribed.free
-        self.evaluate_at(v)  # for the forces that are asked for after the step
+        self.evaluated, v = solution, solution.v[:n]
         before, rate_before = self.x[:n], self.v[:n]
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
         followers = {self.in_contact} if self.integrator is self.usual else set()
@@ -312,12 +300,13 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_end_velocity(rate)
         self.state.set(moved, rate)
-        if not self.integrator.dynamic:
-            return
-        if self.contact is None:
+        if not self.evaluates_iterates and not self.active.moving:
+            # the stage is at the end, and the next step is linearised there
+            self.evaluated = self.state.evaluation = Evaluation(self.x, solution.v)
+        if not self.integrator.dynamic or self.contact is None:
             return
         if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
-            self.update_stencils(self._xs, self.x - self._xs)
+            self.update_stencils(self.evaluated.x, self.x - self.evaluated.x)
         self._past_velocity = rate_before
         step = self._step_end(self.v)
         impulses = self.contact.finish(step, self.active.frozen, damps=self.suits_contact)
@@ -363,7 +352,7 @@ class StageEquations:
     @property
     def touches_at_stage(self) -> bool:
         """Whether anything touches at the stage of the step just accepted; collective."""
-        return self.contact is not None and self.contact.is_touching(self._xs, self.active.frozen)
+        return self.contact is not None and self.contact.is_touching(self.evaluated.x, self.active.frozen)
 
     def resolves_contact(self) -> bool:
         """Whether the step's integrator can follow the changes of the normal forces in it; collective."""
@@ -395,17 +384,12 @@ class StageEquations:
                 each.set_acceleration(np.where(moves, rate, 0.0))
         self.integrator = self.usual
 
-    def reopen(self, x_before: Array) -> None:
-        """Let the equations of the step just accepted, from x_before (n_owned, 3), be evaluated again;
-        collective.
-        """
-        if self._xh is self.x:
-            self._xh = self.points.extended(x_before)
-
     def initial_edge_moments(self) -> float:
         """Norm [N] of the moments on free edges at the start of a run, handles set; collective."""
         self.prescribed.begin_step(self.t0, self.t0, self.x)
-        moments = np.where(self.prescribed.free, self._internal(self.x), 0.0)[self.points.n_vertices :]
+        moments = np.where(self.prescribed.free, self._sum(self.active.sheet, self.x), 0.0)[
+            self.points.n_vertices :
+        ]
         return float(np.sqrt(self.points.global_sum(float(np.vdot(moments, moments)))[0]))
 
     # -- unknowns of edges ---------------------------------------------------------------------------
@@ -425,7 +409,7 @@ class StageEquations:
         velocity, frozen = self.stage_velocity.copy(), self.active.frozen
         self._stage_before_edges = self.stage, self.history, self._xh, velocity, frozen
         self.predicted_stress.forget()
-        self.objective.forget()
+        self.change()
         self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
         self._xh = self.points.extended(x_before)
@@ -434,22 +418,22 @@ class StageEquations:
         self.solving_edges = True
         self.prescribed.set_velocity_to_goal(self._xh[:n], dt)
 
-    def end_edge_solve(self, v: Array | None) -> None:
-        """Set the edges' unknowns from their rates v (n_owned, 3), unless None, and restore the stage;
-        collective.
+    def end_edge_solve(self, solution: Evaluation | None) -> None:
+        """Set the edges' unknowns from the stage that solves their equations, unless None, and restore the
+        stage; collective.
         """
         n = self.points.n_owned
-        moved = None if v is None else self._xh[:n] + self.stage.c * v
+        moved = None if solution is None else solution.x[:n]
         self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._stage_before_edges
         self.prescribed.release_vertices()
         self.solving_edges = False
-        self.objective.forget()
+        self.change()
         self.predicted_stress.forget()
         if moved is not None:
             rows = slice(self.points.n_vertices, n)
             self.x[rows] = moved[rows]
             self.state.update_ghosts()
-        self.evaluate_at(stage_velocity)
+        self.evaluate(stage_velocity)
 
     # -- terms -------------------------------------------------------------------------------------
 
@@ -459,15 +443,15 @@ class StageEquations:
         return velocity
 
     def gradient_of(self, terms: Sequence[Elastic], x: Array) -> Array:
-        """Gradient (n_owned, 3) [N] at x (n_local, 3) of the energy of ``terms``: all without targets."""
-        return self._sum(terms, x) if self.active.moving else self._internal(x)
+        """Gradient (n_owned, 3) [N] at x (n_local, 3) of the energy of ``terms``."""
+        return self._sum(terms, x)
 
     def obstacle_work(self) -> float:
         """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
         if self.contact is None or not self.contact.obstacles_move:
             return 0.0
         at = self.t0 + self.stage.offset if self.integrator.dynamic else self.t1
-        work = self.contact.barrier.work(self._xs, at, self.t0, self.t1)
+        work = self.contact.barrier.work(self.evaluated.x, at, self.t0, self.t1)
         return work + (self.contact.impulses.work if self.contact.impulses else 0.0)
 
     def move_targets_to_end(self) -> float:
@@ -483,8 +467,7 @@ class StageEquations:
 
         ``increment`` (n_owned, 3) [m/s] is added to the velocities; collective.
         """
-        x = self.evaluate_at(v)[0]
-        return x, self.points.extended(increment * self.stage.c)
+        return self.evaluate(v).x, self.points.extended(increment * self.stage.c)
 
     # -- limits of motion --------------------------------------------------------------------------
 
@@ -600,7 +583,7 @@ class StageEquations:
         """Whether parts that are near move by a notable part of the gap in the step; collective."""
         if self.contact is None:
             return False
-        return self.contact.may_impact(self.stage.c * self._vs[: self.points.n_vertices])
+        return self.contact.may_impact(self.stage.c * self.evaluated.v[: self.points.n_vertices])
 
     # -- residual and Jacobian -----------------------------------------------------------------------
 
@@ -613,41 +596,57 @@ class StageEquations:
 
     def _follow_ghosts(self) -> None:
         """Resize all arrays to the layout's present ghosts; collective."""
-        same = self._xh is self.x
         self.state.resize()
-        self._xh = self.x if same else self.points.extended(self._xh)
-        self._xs, self._vs = self.points.extended(self._xs), self.points.extended(self._vs)
-        self.__dict__.pop("_vertex_rows", None)
+        self._xh = self.points.extended(self._xh)
+        self.change()
+        now = self.evaluated
+        self.evaluated = Evaluation(self.points.extended(now.x), self.points.extended(now.v))
         self.prescribed.resize()
 
-    def evaluate_at(self, v: Array) -> tuple[Array, Array]:
-        """Positions and velocities (n_local, 3) of the stage, ghosts up to date; collective."""
-        self._vs[: self.points.n_owned] = v
-        self.points.update_ghosts(self._vs)
-        np.multiply(self._vs, self.stage.c, out=self._xs)
-        self._xs += self._xh
-        self.update_stencils(self._xs)
-        return self._xs, self._vs
+    def evaluate(self, v: Array) -> Evaluation:
+        """The stage at velocities v (n_owned, 3); collective."""
+        rates = self.points.extended(v)
+        self.evaluated = Evaluation(self.stage.c * rates + self._xh, rates)
+        self.update_stencils(self.evaluated.x)
+        return self.evaluated
 
-    @property
-    def evaluated(self) -> tuple[Array, Array]:
-        """The positions and velocities that `evaluate_at` last returned."""
-        return self._xs, self._vs
+    def linearised(self, v: Array) -> Evaluation:
+        """The stage at which F and its Jacobian are evaluated for velocities v (n_owned, 3); collective.
+
+        One linear solve takes them where the step starts, also if handles move: elements at a handle would be
+        stretched by its whole motion.
+        """
+        if self.evaluates_iterates:
+            return self.evaluate(v)
+        known = self.state.evaluation
+        self.evaluated = Evaluation(self._xh, np.zeros_like(self._xh), known.internal if known else None)
+        self.update_stencils(self._xh)
+        return self.evaluated
+
+    def revisit(self, evaluation: Evaluation) -> Evaluation:
+        """An evaluation of the present equations again, with the pairs that are near there; collective."""
+        self.evaluated = evaluation
+        self.update_stencils(evaluation.x)
+        return self.evaluated
+
+    def change(self) -> None:
+        """The equations have changed: nothing that has been evaluated holds any longer."""
+        self.version += 1
 
     def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
         n, at = self.points.n_owned, self.prescribed.indices
-        rate = self.stage.sigma * (self._vs[:n] - self.history)
+        rate = self.stage.sigma * (self.evaluated.v[:n] - self.history)
         if self.stage.offset < self.dt and len(at):  # handles do not have the integrator's accelerations
             mean = (self.v[:n].take(at) - self.history.take(at)) / self.dt
             self.prescribed.overwrite(rate, mean)
-        return self._parts(self._xs, self._vs, rate)
+        return self._parts(self.evaluated, rate)
 
-    def _parts(self, x: Array, vs: Array, vdot: Array) -> Iterator[tuple[str, Array]]:
+    def _parts(self, at: Evaluation, vdot: Array) -> Iterator[tuple[str, Array]]:
         """Names and values (n_owned, 3) [N] of the parts of F.
 
         They are generated one by one, because all of them together take much memory. Internal forces come
-        last, because their remembered data take memory, too.
+        last, because terms keep data of them, which take memory, too.
         """
         self._squares = []
         yield self._with_square("inertia", self.mass[:, None] * vdot)
@@ -657,15 +656,24 @@ class StageEquations:
         springs = [term for term in constraints if term not in friction]
         for name, terms in (("springs", springs), ("friction", friction)):
             if terms:
-                yield self._with_square(name, self._sum(terms, x))
-        yield self._with_square("loads", -self.applied.force_at(x))
+                yield self._with_square(name, self._sum(terms, at.x))
+        yield self._with_square("loads", -self.applied.force_at(at.x))
         if self.damping.active:
-            yield self._with_square("damping", self.damping.product(vs))
-            if self.integrator.lagged_loads:  # there is no second evaluation
-                self.damping.product.forget()
+            yield self._with_square("damping", self._damping(at))
         if self.active.viscous and not self.integrator.lagged_loads:
-            yield self._with_square("wind", self._sum(self.active.viscous, vs))
-        yield self._with_square("internal", self._internal(x))
+            yield self._with_square("wind", self._sum(self.active.viscous, at.v))
+        if at.internal is None:
+            at.internal = self._sum(self.active.sheet, at.x)
+        yield self._with_square("internal", at.internal)
+
+    def _damping(self, at: Evaluation) -> Array:
+        """The damping's part of F, (n_owned, 3) [N]."""
+        if at.damping is not None:
+            return at.damping
+        found = self.damping.product(at.v)
+        if self.integrator.iterates:  # else there is no second evaluation
+            at.damping = found
+        return found
 
     def _with_square(self, name: str, part: Array) -> tuple[str, Array]:
         """The part of F, after its square is kept for `largest_force`."""
@@ -680,32 +688,77 @@ class StageEquations:
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
         return self.active.gradient(terms, at, self.points)
 
-    def _total(self, x: Array, vs: Array, vdot: Array, out: Array) -> Array:
+    def _total(self, at: Evaluation, vdot: Array, out: Array) -> Array:
         """F (n_owned, 3) [N], written to ``out``."""
         out[:] = 0.0
-        for _, part in self._parts(x, vs, vdot):
+        for _, part in self._parts(at, vdot):
             out += part
             del part
         return out
 
-    def _linearised_at(self, v: Array) -> Array:
-        """Velocities (n_owned, 3) at which F and its Jacobian are evaluated for v.
-
-        One linear solve takes them where the step starts, also if handles move: elements at a handle would be
-        stretched by its whole motion.
-        """
-        return np.zeros_like(v) if self._from_start else v
-
     @property
-    def _from_start(self) -> bool:
-        """Whether F is linear in v, from the positions where the step starts."""
-        return not (self.integrator.iterates or self.solving_edges)
+    def evaluates_iterates(self) -> bool:
+        """Whether F is evaluated where Newton's method is; else it is linear in v, from the positions where
+        the step starts.
+        """
+        return self.integrator.iterates or self.solving_edges
 
-    def residual(self, v: Array, vdot: Array, out: Array) -> None:
-        """Write F (n_owned, 3) [N] to ``out``, in rows of prescribed unknowns σ m (v − v*); collective."""
-        self._total(*self.evaluate_at(self._linearised_at(v)), vdot, out)
-        at, velocity = self.prescribed.indices, self.prescribed.velocity
-        self.prescribed.overwrite(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
+    def residual(self, v: Array, at: Evaluation, out: Array) -> None:
+        """Write F (n_owned, 3) [N] at velocities v (n_owned, 3), whose stage is `linearised` ``at``, to
+        ``out``, in rows of prescribed unknowns σ m (v − v*); collective.
+        """
+        sigma, prescribed = self.stage.sigma, self.prescribed.indices
+        self._total(at, sigma * (v - self.history), out)
+        wrong = v.take(prescribed) - self.prescribed.velocity
+        self.prescribed.overwrite(out, sigma * self.mass[prescribed // 3] * wrong)
+
+    def residual_at(self, v: Array) -> Array:
+        """F (n_owned, 3) [N] at velocities v (n_owned, 3); collective."""
+        self.residual(v, self.linearised(v), out := np.empty_like(v))
+        return out
+
+    def objective(self, at: Evaluation) -> tuple[float, float]:
+        """Value of the function whose gradient F is, and the scale to which its round-off is relative, both
+        [W]; collective.
+
+        The scale is the sum of the absolute summands and of the geometric mean of each elastic energy and the
+        energy at which strains are of order one: small strains are small differences of large coordinates.
+        """
+        if at.objective is None:
+            at.objective = self._objective(at)
+        return at.objective
+
+    def _objective(self, at: Evaluation) -> tuple[float, float]:
+        n, rate, v = self.points.n_owned, 1.0 / self.stage.c, at.v[: self.points.n_owned]
+        parts, square = [self.stage.sigma * kinetic_energy(self.mass, v - self.history)], 0.0
+        for term in self.active.elastic:
+            if not term.n_elements:
+                continue
+            each = term.energies(at.x, self.active.frozen[term])
+            parts.append(rate * float(each.sum()))
+            stiffness = self.stiffnesses.get(term)
+            if stiffness is None:
+                stiffness = term.stiffness(at.x, self.active.frozen[term])[: term.n_owned]
+            sizes = term.coordinate_scale(self._size)
+            of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
+            # `**` would raise an error where the square is infinite
+            square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
+        parts.append(-rate * float(np.vdot(self.applied.force, at.x[:n] - self.x[:n])))
+        if self.applied.following is not None:
+            parts.append(rate * self.applied.following.energy(at.x))
+        if self.damping.active:
+            parts.append(0.5 * float(np.vdot(v, self._damping(at))))
+        if not self.integrator.lagged_loads:
+            frozen = self.active.frozen
+            parts += [float(wind.potentials(at.v, frozen[wind]).sum()) for wind in self.active.viscous]
+        value, size, square = self.points.global_sum(sum(parts), sum(abs(part) for part in parts), square)
+        return float(value), float(size) + float(np.sqrt(square))
+
+    @cached_property
+    def stiffnesses(self) -> dict[Term, Array]:
+        """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
+        fixed = [term for term in self.active.elastic if not term.registration.of_contact]
+        return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
@@ -722,7 +775,7 @@ class StageEquations:
         patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
         numbers = self.points.global_sum(*(pattern.n_couplings for pattern in patterns))
         fixed, every = numbers.astype(np.int64)
-        pairs = self.contact.summary(self._xs, self.active.frozen)
+        pairs = self.contact.summary(self.evaluated.x, self.active.frozen)
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({pairs})"]
 
     def update_pattern(self) -> bool:
@@ -730,7 +783,9 @@ class StageEquations:
 
         Returns whether the pattern changed; collective.
         """
-        acting = self.contact.acting(self._xs, self.active.frozen) if self.contact and self.near else {}
+        acting = (
+            self.contact.acting(self.evaluated.x, self.active.frozen) if self.contact and self.near else {}
+        )
         if acting:
             number = sum(int(np.count_nonzero(mask)) for mask in acting.values())
             self.has_active_pairs = any(self.points.global_max(number))
@@ -743,48 +798,45 @@ class StageEquations:
         """Whether there are friction pairs; collective."""
         return self.contact is not None and self.contact.has_friction_pairs
 
-    def follow_contacts(self, v: Array) -> bool:
-        """Give friction the contacts at velocities v (n_owned, 3) that solve the stage, where these differ
-        notably from those of its equations; returns whether they do; collective.
+    def follow_contacts(self, solution: Evaluation) -> bool:
+        """Give friction the contacts of the stage that solves the equations, where these differ notably from
+        theirs; returns whether they do; collective.
         """
         if not self.near or not self.integrator.dynamic or self.solving_edges:
             return False
         assert self.contact is not None
-        x, _ = self.evaluate_at(v)
-        if not self.contact.follow(x, self.x, self.active.frozen):
+        if not self.contact.follow(solution.x, self.x, self.active.frozen):
             return False
-        self.objective.forget()
-        self.evaluate_at(v)
+        self.change()
         return True
-
-    def forget_forces(self) -> None:
-        """Discard the remembered energies and forces."""
-        if isinstance(self._internal, Remembered):
-            self._internal.forget()
-        self.objective.forget()
 
     def forget_rows(self) -> None:
         """Drop all references to the rows that `jacobian` was given, so that their owner can free them."""
         self.damping.release_values()
 
-    def jacobian(self, v: Array, blend: float, values: Array) -> None:
+    def jacobian(self, at: Evaluation, blend: float, values: Array) -> None:
         """Write σ M + c K + D + ∇∇P to block rows (n_blocks, 3, 3), prescribed unknowns decoupled.
 
-        ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one.
+        ``at`` is the `linearised` stage, ``blend`` the weight of the regularised elastic Hessian: 0 takes the
+        exact one.
         """
-        x, vs = self.evaluate_at(self._linearised_at(v))
+        x, vs = at.x, at.v
         # may have other ghosts than x, but of contact only: those of fixed stencils are the first
         rows, predicted = self.discretisation.rows, self.predicted_stress.positions
         lagged = self.integrator.lagged_loads
-        for remembered in self._evaluated_once:  # the linear solve needs the memory
-            remembered.forget()
+        if not self.evaluates_iterates:  # the linear solve needs the memory
+            at.internal = self.state.evaluation = None
         reach = self.stage.c
         inertia = self.stage.sigma * self.mass
         if self.active.with_edges:
             inertia[self.points.n_vertices :] += reach * self.directors.min_stiffness
         constrained = self.prescribed.constrained
         changing = constrained.changed
-        if blend < 1.0 or not self.damping.assemble_with_stiffness(x, reach, inertia, values, changing):
+        if not (
+            not self.evaluates_iterates
+            and blend == 1.0
+            and self.damping.assemble_with_stiffness(reach, inertia, values, changing)
+        ):
             self.damping.assemble(values, inertia)
             for term in self.active.elastic:
                 rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, predicted)
@@ -793,7 +845,7 @@ class StageEquations:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
         if self.applied.following is not None and blend < 1.0:
             self.applied.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
-        self.prescribed_force = self._force_of_prescribed(values) if self._from_start else None
+        self.prescribed_force = None if self.evaluates_iterates else self._force_of_prescribed(values)
         if len(changing):
             rows.constrain(values, self.prescribed.mask, constrained)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.stepping.evaluation import Evaluation
 
 
 class State:
@@ -15,7 +16,11 @@ class State:
     ----------
     x, v : (n_local, 3)
         Positions [m] and velocities [m/s]; rows of edges hold their unknowns and the rates of these.
+    evaluation : Evaluation or None
+        The stage of the last step, if it is at these positions.
     """
+
+    evaluation: Evaluation | None = None
 
     def __init__(self, discretisation: Discretisation) -> None:
         self._discretisation = discretisation
@@ -30,16 +35,11 @@ class State:
 
     def resize(self) -> None:
         """Resize to the layout's present ghosts; collective."""
-        layout = self._discretisation.layout
-        self.x, self.v = (
-            resized(self.x, layout.n_owned, layout.n_local),
-            resized(self.v, layout.n_owned, layout.n_local),
-        )
-        self.update_ghosts()
+        self.set(self.x, self.v)
 
     def set(self, x: Array, v: Array) -> None:
         """Set positions and velocities (n_owned, 3), in new arrays; collective."""
-        layout = self._discretisation.layout
+        layout, self.evaluation = self._discretisation.layout, None
         self.x, self.v = (resized(values, layout.n_owned, layout.n_local) for values in (x, v))
         self.update_ghosts()
 

@@ -29,12 +29,14 @@ from lyra_petsc.linear.petsc_options import (
 from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.newton.blend import Blend
 from lyra_petsc.stepping.newton.conditioning import expected_iterations
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
 from lyra_petsc.stepping.newton.initial_guess import first_guess
+from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
 from lyra_petsc.stepping.newton.snes_callbacks import Newton
@@ -204,12 +206,14 @@ class Stepper:
         convergence = Convergence(
             system, scene.solver, self._spacing, self._floor, break_even_iterations=limit
         )
+        self._points = Iterates(system)
         self._newton = newton = Newton(
             snes,
             system,
             self.linear,
             self._blend,
             convergence,
+            self._points,
             iterates=self._iterates,
             follow=self._follow_stencils,
         )
@@ -223,7 +227,7 @@ class Stepper:
             snes.setMonitor(
                 ContactMonitor(
                     system.contact,
-                    lambda v: (system.evaluate_at(v)[0], system.active.frozen),
+                    lambda v: (system.evaluate(v).x, system.active.frozen),
                     lambda: newton.step_fraction,
                 )
             )
@@ -266,7 +270,7 @@ class Stepper:
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
-        if iteration > 0 and self._system.directors.update_frames():
+        if iteration > 0 and self._system.directors.update_frames(self._points.at(snes.getSolution()).x):
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
         self._follow_stencils()
@@ -327,22 +331,23 @@ class Stepper:
             self._trace.begin_solve()
             failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
-        velocity, message = self._solve(t0)
+        n = self._shape[0]
+        solution, message = self._solve(t0)
         newton = linear = 0
         for _ in range(MAX_SOLVES - 1):
-            if velocity is None or not (self._iterates and system.follow_contacts(velocity)):
+            if solution is None or not (self._iterates and system.follow_contacts(solution)):
                 break
             newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
-            velocity, message = self._solve(t0, velocity)
-        if velocity is not None and not system.end_is_free(velocity):
-            velocity, message = None, WOULD_CROSS
+            solution, message = self._solve(t0, solution.v[:n])
+        if solution is not None and not system.end_is_free(solution.v[:n]):
+            solution, message = None, WOULD_CROSS
         newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.remaining, outcome.at_roundoff
-        if velocity is not None:
+        if solution is not None:
             if not self._iterates and system.active.with_edges:
-                velocity = self._turn_directors(velocity)
-            system.accept(velocity)
+                solution = self._turn_directors(solution)
+            system.accept(solution)
             if before is not None:
                 assert rate_before is not None
                 system.begin_edge_solve(before)
@@ -352,14 +357,14 @@ class Stepper:
                     linear + self._newton.linear_iterations,
                 )
                 if rates is None:
-                    failed, velocity = self._trace.failed_solve(), None
+                    failed, solution = self._trace.failed_solve(), None
                 system.end_edge_solve(rates)
                 if rates is None:
                     system.state.set(before, rate_before)
         else:
             failed = self._trace.failed_solve()
         self.ts.setTimeStep(t1 - t0)
-        if velocity is not None:
+        if solution is not None:
             self.velocity.setArray(system.v[: self._shape[0]].ravel())
             self.ts.setTime(t1)
             self.ts.setStepNumber(number + 1)
@@ -377,16 +382,14 @@ class Stepper:
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, message=message, failed_solve=failed)
 
-    def _turn_directors(self, velocity: Array) -> Array:
-        """Velocities (n_owned, 3) whose directors turn with their triangles if they turn far; collective."""
-        system = self._system
-        staying = system.stationary_velocity()
-        increment = velocity - staying
+    def _turn_directors(self, solution: Evaluation) -> Evaluation:
+        """The solution, whose directors turn with their triangles if they turn far; collective."""
+        system, staying = self._system, self._system.stationary_velocity()
+        increment = solution.v[: len(staying)] - staying
         if system.directors.turn_with_triangles(staying, increment):
-            velocity = staying + increment
-        system.evaluate_at(velocity)
-        system.directors.update_frames()
-        return velocity
+            solution = system.evaluate(staying + increment)
+        system.directors.update_frames(solution.x)
+        return solution
 
     def balance_edge_moments(self, floor: float) -> bool:
         """Solve for edge unknowns until moments on edges balance at the start shape, to ``floor`` [N];
@@ -404,10 +407,11 @@ class Stepper:
                 return False
         return True
 
-    def _solve(self, t0: float, start: Array | None = None) -> tuple[Array | None, str]:
-        """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective.
+    def _solve(self, t0: float, start: Array | None = None) -> tuple[Evaluation | None, str]:
+        """The evaluation that solves the present stage, or None and why; collective.
 
-        ``start``: those of a solve of the stage with other contacts, where this one starts.
+        ``start``: velocities (n_owned, 3) [m/s] of a solve of the stage with other contacts, where this one
+        starts.
         """
         system, stage, self._start = self._system, self._system.stage, start
         self._follow_stencils()
@@ -453,10 +457,11 @@ class Stepper:
                 self._linear_failed = False
                 return None, f"{self.stopped_by} stopped Newton's method short of solver.force_tolerance"
             return None, reasons.failure_reason(self.snes, self.ksp)
-        velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
+        reached = self.snes.getSolution()
+        velocity = reached.getArray(readonly=True).reshape(self._shape)
         if system.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
-        return velocity, ""
+        return self._points.at(reached) if system.evaluates_iterates else system.evaluate(velocity), ""
 
     def _next_may_help(self, error: Exception) -> bool:
         """Whether an error of PETSc's on all ranks is one of this preset's set-up, not of a user's option,
@@ -510,7 +515,7 @@ class Stepper:
         velocity = self._newton.globalisation.lowest_iterate()
         if velocity is None:
             return None
-        positions: Array = self._system.evaluate_at(velocity)[0][: len(velocity)].copy()
+        positions: Array = self._system.evaluate(velocity).x[: len(velocity)].copy()
         return positions
 
     @property
@@ -542,8 +547,8 @@ class Stepper:
 
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
-        v, rate = (vec.getArray(readonly=True).reshape(self._shape) for vec in (u, udot))
-        self._system.residual(v, rate, f.getArray().reshape(self._shape))
+        v = u.getArray(readonly=True).reshape(self._shape)
+        self._system.residual(v, self._points.at(u), f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)

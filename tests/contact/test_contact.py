@@ -118,7 +118,7 @@ class Watched:
     def forces(self, x: Array | None = None) -> tuple[Array, float]:
         """Sum of the contact forces on the sheets [N], and the largest of them, at the last stage."""
         system = self.system
-        x = system.stage_positions if x is None else x
+        x = system.evaluated.x if x is None else x
         force = np.zeros((system.points.n_local, 3))
         self.term.add_gradient(x, system.active.frozen[self.term], force)
         own = -force[: system.points.n_owned]

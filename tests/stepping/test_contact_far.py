@@ -79,14 +79,14 @@ def test_damping_is_a_multiple_of_the_stiffness_until_something_is_near() -> Non
         system = simulation.problem.system
         values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         system.damping.freeze(system.x, system.active.frozen)
-        assert system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
+        assert system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
         assert not system.near
     floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
     with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
         values = system.discretisation.rows.zeros()
         system.damping.freeze(system.x, system.active.frozen)
-        assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
+        assert not system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
         assert system.near
 
 

@@ -27,11 +27,10 @@ def test_damping_plus_stiffness_is_a_multiple_if_all_factors_are_equal(comm: MPI
         for term in system.active.elastic:
             blocks.add_stiffness(term, x, system.active.frozen[term], 1.0, 0.3, expected)
         none = np.empty(0, dtype=np.int64)
-        if damping.assemble_with_stiffness(x, 0.3, diagonal, found, none):
+        if damping.assemble_with_stiffness(0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
         else:
             assert comm.size > 1  # a rank without an element of a term takes the long way
-        assert not damping.assemble_with_stiffness(x + 1e-9, 0.3, diagonal, found, none)
 
 
 def test_different_factors_give_no_multiple() -> None:
@@ -45,7 +44,7 @@ def test_different_factors_give_no_multiple() -> None:
         system.damping.freeze(system.x, system.active.frozen)
         values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
-        assert not system.damping.assemble_with_stiffness(system.x, 0.3, system.mass, values, none)
+        assert not system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
 
 
 def test_damping_forces_follow_velocities_and_geometry(comm: MPI.Comm) -> None:
@@ -54,7 +53,6 @@ def test_damping_forces_follow_velocities_and_geometry(comm: MPI.Comm) -> None:
         v = np.cos(5.0 * system.x)
         system.damping.freeze(system.x, system.active.frozen)
         once = system.damping.product(v)
-        np.testing.assert_array_equal(system.damping.product(v), once)
         assert not system.damping.product(0.0 * v).any()
         np.testing.assert_allclose(system.damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
         system.damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.active.frozen)
@@ -83,7 +81,6 @@ def test_damping_forces_if_the_matrix_contains_the_damping(comm: MPI.Comm) -> No
             matrix, simulation.stepper.linear.operator.rows
         )  # as a lagged Jacobian needs it
         system.forget_rows()
-        damping.product.forget()
         expected = damping.product(v)
         scale = comm.allreduce(float(np.abs(expected).max(initial=0.0)), MPI.MAX)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * scale)
@@ -99,8 +96,7 @@ def test_rows_are_released_before_they_hold_another_matrix() -> None:
         system = simulation.problem.system
         damping, rows, none = system.damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         damping.freeze(system.x, system.active.frozen)
-        assert damping.assemble_with_stiffness(system.x, 0.3, system.mass, rows, none)
+        assert damping.assemble_with_stiffness(0.3, system.mass, rows, none)
         once = damping.product(v := np.cos(3.0 * system.x))
         damping.assemble(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may
-        damping.product.forget()
         np.testing.assert_allclose(damping.product(v), once, rtol=0.0, atol=1e-12 * np.abs(once).max())

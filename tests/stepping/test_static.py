@@ -246,7 +246,7 @@ def test_the_jacobian_of_directors_is_the_hessian_of_their_energy(comm: MPI.Comm
         system = simulation.problem.system
         system.begin_step(0.0, 0.01)
         rows = system.discretisation.rows
-        system.jacobian(system.v[: system.points.n_owned], 0.0, values := rows.zeros())
+        system.jacobian(system.evaluate(system.v[: system.points.n_owned]), 0.0, values := rows.zeros())
         add_exact_hessian(system, exact := rows.zeros())
         edges = rows.pattern.indptr[system.points.n_vertices : -1]  # each row's first block is its own
         found, plain = (np.diagonal(each[edges], axis1=1, axis2=2) for each in (values, exact))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numba import typeof
-from physics import CLOTH, Simulation, grid
+from physics import Simulation, grid
 
 from lyra_petsc.contact.barrier import NO_PAIRS, ContactBarrier
 from lyra_petsc.linear.block_rows import BlockRows
@@ -68,12 +68,3 @@ def test_one_weight_has_the_type_of_many() -> None:
     for weight in (2.0, np.broadcast_to(np.ones(1), 1), np.broadcast_to(np.ones(1), 3)):
         rows.add_stiffness(Term(), None, None, 0.0, weight, None)
     assert given == 3 * [typeof(np.ones(1))]
-
-
-def test_forces_of_moving_clamps_are_always_computed() -> None:
-    scene = {"mesh": grid(1, 1, 3, 3), "material": CLOTH | {"bending": 0.1}}
-    clamp = {"handles": [{"group": "left", "clamp": True}]}
-    with Simulation(scene, MPI.COMM_SELF) as simulation:
-        assert isinstance(simulation.system._internal, Remembered)
-    with Simulation(scene | clamp, MPI.COMM_SELF) as simulation:
-        assert not isinstance(simulation.system._internal, Remembered)

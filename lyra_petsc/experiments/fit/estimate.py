@@ -51,7 +51,7 @@ class Unknown:
 
 
 @dataclass
-class Evaluation:
+class Misfit:
     """Residuals (m,) and their derivatives (m, n) at the numbers (n,)."""
 
     numbers: StoredArray
@@ -117,14 +117,14 @@ class Conclusion:
         return self.notes
 
 
-Evaluate = Callable[[Array], Evaluation]
+Evaluate = Callable[[Array], Misfit]
 
 
 class _StalledError(Exception):
     """Ends a search that is near the minimum but makes no progress."""
 
 
-def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation, str]:
+def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Misfit, str]:
     """Minimise the cost; returns the best evaluation and why the search ended, the same on every rank.
 
     Parameters
@@ -148,7 +148,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
     n = len(unknowns)
     size = np.array([unknown.size for unknown in unknowns])
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
-    known: dict[bytes, Evaluation] = {}
+    known: dict[bytes, Misfit] = {}
     failure: list[BaseException] = []
 
     def is_stalled() -> bool:
@@ -159,7 +159,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
             _gauss_newton_step(min(known.values(), key=lambda evaluation: evaluation.cost), low, high) <= NEAR
         )
 
-    def at(y: PETSc.Vec) -> Evaluation:
+    def at(y: PETSc.Vec) -> Misfit:
         numbers = np.clip(np.array(y.getArray(readonly=True)) * size, low, high)
         key = numbers.tobytes()
         if key not in known:
@@ -268,13 +268,13 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Evaluation,
     )
 
 
-def _has_full_rank(evaluation: Evaluation, size: Array) -> bool:
+def _has_full_rank(evaluation: Misfit, size: Array) -> bool:
     """Whether the Jacobian has full rank: the data determine all combinations of the numbers."""
     values = np.linalg.svd(evaluation.jacobian * size, compute_uv=False)
     return len(values) == len(size) and bool(values[-1] > 1e-6 * values[0])
 
 
-def _gauss_newton_step(evaluation: Evaluation, low: Array, high: Array) -> float:
+def _gauss_newton_step(evaluation: Misfit, low: Array, high: Array) -> float:
     """Length of the Gauss-Newton step from an evaluation, in standard deviations of the numbers."""
     gradient = evaluation.jacobian.T @ evaluation.residuals
     free = ~_at_bounds(evaluation.numbers, gradient, low, high)
@@ -292,7 +292,7 @@ def _at_bounds(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
     return ((numbers <= low + slack) & (gradient > 0.0)) | ((numbers >= high - slack) & (gradient < 0.0))
 
 
-def refuse_insensitive(unknowns: Sequence[Unknown], evaluation: Evaluation, file: object = None) -> None:
+def refuse_insensitive(unknowns: Sequence[Unknown], evaluation: Misfit, file: object = None) -> None:
     """Refuse numbers that do not influence any measurement.
 
     Raises
@@ -312,7 +312,7 @@ def refuse_insensitive(unknowns: Sequence[Unknown], evaluation: Evaluation, file
             )
 
 
-def conclude(unknowns: Sequence[Unknown], evaluation: Evaluation) -> Conclusion:
+def conclude(unknowns: Sequence[Unknown], evaluation: Misfit) -> Conclusion:
     """Estimates, covariance and notes at the numbers of an evaluation."""
     n, m = len(unknowns), len(evaluation.residuals)
     size = np.array([unknown.size for unknown in unknowns])

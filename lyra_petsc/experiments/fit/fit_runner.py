@@ -25,7 +25,7 @@ from lyra_petsc.errors import InputError, python_argument_names
 from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import (
     Conclusion,
-    Evaluation,
+    Misfit,
     Unknown,
     conclude,
     refuse_insensitive,
@@ -68,17 +68,17 @@ class StoredEvaluations:
     ----------
     fingerprint : str
         Digest of everything that they depend on.
-    trials : list of Evaluation
+    trials : list of Misfit
     """
 
     fingerprint: str
-    trials: list[Evaluation] = field(default_factory=list)
+    trials: list[Misfit] = field(default_factory=list)
 
 
 class FitObserver:
     """Is notified of the progress of a fit; to be overridden."""
 
-    def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
+    def evaluated(self, number: int, evaluation: Misfit, *, resumed: bool) -> None:
         """An evaluation has ended, or was found on disk."""
 
     def progress(self, number: int, part: float) -> None:
@@ -96,7 +96,7 @@ class Fitted:
     readings : list of Reading
     before, after : (m,)
         Values of the readings at the start and at the end.
-    evaluations : list of Evaluation
+    evaluations : list of Misfit
     ending : str
         Text on how the search ended.
     shapes : tuple of (V, 3) or None
@@ -114,7 +114,7 @@ class Fitted:
     readings: list[Reading]
     before: Array
     after: Array
-    evaluations: list[Evaluation]
+    evaluations: list[Misfit]
     ending: str
     shapes: tuple[Array | None, Array | None]
     triangles: Ints | None
@@ -235,10 +235,10 @@ def fit_scene(
         path = folder / TRIALS_FILE
         kept = on_root(comm, lambda: _read(path, kept))
     stored = {evaluation.numbers.tobytes(): evaluation for evaluation in kept.trials}
-    evaluations: list[Evaluation] = []
+    evaluations: list[Misfit] = []
     shapes: dict[bytes, Array | None] = {}
 
-    def evaluate(numbers: Array) -> Evaluation:
+    def evaluate(numbers: Array) -> Misfit:
         numbers = comm.bcast(numbers)
         number = len(evaluations) + 1
         evaluation = stored.get(numbers.tobytes())
@@ -248,7 +248,7 @@ def fit_scene(
             assert found.jacobian is not None
             # all ranks use the numbers of rank 0, bit by bit
             evaluation = comm.bcast(
-                Evaluation(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
+                Misfit(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
             if number == 1:
@@ -331,7 +331,7 @@ def _has_strip(mesh: Mesh, group: str | None) -> bool:
     return False
 
 
-def _refuse_large_residuals(readings: Sequence[Reading], evaluation: Evaluation, scene: Scene) -> None:
+def _refuse_large_residuals(readings: Sequence[Reading], evaluation: Misfit, scene: Scene) -> None:
     """Refuse measurements whose residuals at the start are not finite, or dominate all others."""
     keys = [reading.key for reading in readings for _ in reading.parts]
     worst = int(np.argmax(np.abs(evaluation.residuals)))

@@ -302,8 +302,8 @@ class BalanceRecorder:
         internal forces and those of damping without the terms that act from outside.
         """
         system, n, stage = self._system, self._system.points.n_owned, self._system.stage
-        x, v = system.evaluated  # before impacts, which act after the equations are solved
-        y = self._x
+        # before impacts, which act after the equations are solved
+        x, v, y = system.evaluated.x, system.evaluated.v, self._x
         if self._simulation.last_integrator.centred:
             vertices = system.points.are_vertices(system.points.global_number)
             y = y + np.where(vertices[:, None], stage.offset * self._v, 0.0)

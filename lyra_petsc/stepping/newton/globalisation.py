@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.newton.convergence import Convergence
+from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 PATIENCE = 5
@@ -109,11 +110,14 @@ class Globalisation:
     ----------
     snes : PETSc.SNES
     system : StageEquations
+    iterates : Iterates
     convergence : Convergence
     """
 
-    def __init__(self, snes: PETSc.SNES, system: StageEquations, convergence: Convergence) -> None:
-        self._snes, self._system, self._convergence = snes, system, convergence
+    def __init__(
+        self, snes: PETSc.SNES, system: StageEquations, iterates: Iterates, convergence: Convergence
+    ) -> None:
+        self._snes, self._system, self._iterates, self._convergence = snes, system, iterates, convergence
         self._shape = (system.points.n_owned, 3)
         self._watchdog = Watchdog()
         self._first_energy = -math.inf
@@ -127,7 +131,7 @@ class Globalisation:
 
     def note_iterate(self, u: PETSc.Vec) -> None:
         """Note energy and residual of iterate u, with which trial points are compared; collective."""
-        self._energy = self._system.objective(u.getArray(readonly=True).reshape(self._shape))
+        self._energy = self._system.objective(self._iterates.at(u))
         self._norm = self._snes.getFunctionNorm()
         # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
         # would progress slowly
@@ -172,17 +176,16 @@ class Globalisation:
         Where energies differ by round-off only, the returned value depends on the residual. Full steps get a
         value that every line search accepts.
         """
-        v = u.getArray(readonly=True).reshape(self._shape)
-        value, size = self._system.objective(v)
+        at = self._iterates.at(u)
+        value, size = self._system.objective(at)
         here, own_size = self._energy
         if value != here and np.isfinite(value) and (self._returns or self.takes_full_steps):
             return min(value, here - self._slope)
         noise = ENERGY_ROUNDOFF * max(size, own_size)
         if value == here or not abs(value - here) < noise:
             return value
-        trial = np.empty(self._shape)
-        system = self._system
-        system.residual(v, system.stage.sigma * (v - system.history), trial)
+        system, trial = self._system, np.empty(self._shape)
+        system.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
         (square,) = system.points.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._norm)
         return here - noise if smaller else here + noise

@@ -39,6 +39,7 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     if integrator.order > 1 and system.contact is None:
         out[:] = moving
         return False
-    use_still = system.objective(still)[0] < system.objective(moving)[0]
+    energies = [system.objective(system.evaluate(each))[0] for each in (still, moving)]
+    use_still = energies[0] < energies[1]
     out[:] = still if use_still else moving
     return False

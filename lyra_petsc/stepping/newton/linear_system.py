@@ -18,6 +18,7 @@ from lyra_petsc.linear.multigrid import Multigrid
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import is_incomplete, shows_negative_curvature
 from lyra_petsc.phases import JACOBIAN_AGAIN, logged
+from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 MIN_SHIFT, MAX_SHIFT = 0.01, 1.0
@@ -265,8 +266,8 @@ class LinearSystem:
         """Prepare for a new solve, in which nothing of the last one can be kept."""
         self.kept_preconditioner = self.uses_operator = False
 
-    def assemble(self, v: Array, blend: float, *, keep: bool, convex: bool) -> None:
-        """Assemble the Jacobian and the preconditioning matrix at velocities v (n_owned, 3).
+    def assemble(self, at: Evaluation, blend: float, *, keep: bool, convex: bool) -> None:
+        """Assemble the Jacobian and the preconditioning matrix at the `linearised` stage.
 
         Parameters
         ----------
@@ -277,12 +278,12 @@ class LinearSystem:
         convex : bool
             Whether the Hessian was positive definite in the last solve.
         """
-        self.assemble_operator(v, blend)
+        self.assemble_operator(at, blend)
         if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._system):
-            self._set_preconditioner(v, keep=keep, convex=convex)
+            self._set_preconditioner(at, keep=keep, convex=convex)
         self._system.directors.forget()
 
-    def _set_preconditioner(self, v: Array, *, keep: bool, convex: bool) -> None:
+    def _set_preconditioner(self, at: Evaluation, *, keep: bool, convex: bool) -> None:
         if not self._regularised:
             self.preconditioner.set(self.operator.rows, self.shift.value)
             return
@@ -296,23 +297,23 @@ class LinearSystem:
             # while the Jacobian is positive definite there is no better preconditioner
             self.preconditioner.set(self.operator.rows, self.shift.value)
         elif not keep:
-            self._set_regularised(v)
+            self._set_regularised(at)
 
-    def assemble_operator(self, v: Array, blend: float) -> None:
-        """Assemble the Jacobian at velocities v (n_owned, 3) with this weight of the regularised Hessian."""
-        self._system.jacobian(v, blend, self.operator.rows)
+    def assemble_operator(self, at: Evaluation, blend: float) -> None:
+        """Assemble the Jacobian at the `linearised` stage with this weight of the regularised Hessian."""
+        self._system.jacobian(at, blend, self.operator.rows)
         self.operator.set(self.operator.rows)
 
-    def _set_regularised(self, v: Array) -> None:
-        self._system.jacobian(v, 1.0, self.preconditioner.rows)
+    def _set_regularised(self, at: Evaluation) -> None:
+        self._system.jacobian(at, 1.0, self.preconditioner.rows)
         self.preconditioner.set(self.preconditioner.rows, self.shift.value)
 
-    def save_rows(self, v: Array) -> None:
-        """Save the block rows assembled at v (n_owned, 3), for `assemble_with`."""
+    def save_rows(self, at: Evaluation) -> None:
+        """Save the block rows assembled ``at`` a stage, for `assemble_with`."""
         self._saved_rows = [self.operator.rows.copy()]
         if self.preconditioner is not self.operator and self._regularised and not self.uses_operator:
             if self.kept_preconditioner:
-                self._system.jacobian(v, 1.0, self.preconditioner.rows)
+                self._system.jacobian(at, 1.0, self.preconditioner.rows)
             self._saved_rows.append(self.preconditioner.rows.copy())
 
     def assemble_with(self, add: Callable[[Array], None]) -> None:
@@ -325,27 +326,27 @@ class LinearSystem:
             own = self.preconditioner if len(self._saved_rows) > 1 else self.operator
             self.preconditioner.set(own.rows, self.shift.value)
 
-    def improve_preconditioner(self, v: Array) -> bool:
-        """Build a better preconditioner at v after the linear solve failed; whether there is one."""
+    def improve_preconditioner(self, at: Evaluation) -> bool:
+        """Build a better preconditioner after the linear solve has failed; whether there is one."""
         if self.preconditioner is self.operator or not (
             self.kept_preconditioner or self.uses_operator or self.shift.increase()
         ):
             return False
-        self._rebuild_preconditioner(v)
+        self._rebuild_preconditioner(at)
         return True
 
     @logged(JACOBIAN_AGAIN)
-    def _rebuild_preconditioner(self, v: Array) -> None:
+    def _rebuild_preconditioner(self, at: Evaluation) -> None:
         if self._regularised:
-            self._set_regularised(v)
+            self._set_regularised(at)
         else:
             self.preconditioner.set(self.operator.rows, self.shift.value)
         self.kept_preconditioner = self.uses_operator = False
 
     @logged(JACOBIAN_AGAIN)
-    def reassemble_operator(self, v: Array, blend: float) -> None:
+    def reassemble_operator(self, at: Evaluation, blend: float) -> None:
         """As `assemble_operator`, logged as a repeated assembly."""
-        self.assemble_operator(v, blend)
+        self.assemble_operator(at, blend)
 
     def _free(self, *, permanently: bool) -> None:
         self._system.forget_rows()

@@ -130,8 +130,7 @@ class Trace:
         n = system.points.n_owned
         if velocity is None:
             velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
-        residual = np.empty((n, 3))
-        system.residual(velocity, stage.sigma * (velocity - system.history), residual)
+        residual = system.residual_at(velocity)
         position = (system.x[:n] if stage.x is None else stage.x) + stage.c * velocity
         if system.held and system.integrator.handles_at_stage:
             system.prescribed.targets(system.t0, system.t1, system.t0 + stage.offset, position)

@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -20,7 +21,8 @@ class RepeatedSolves:
     ksp : PETSc.KSP
     system : StageEquations
     linear : LinearSystem
-    v : (n_owned, 3)
+    at : callable
+        Returns the evaluation of the equations at Newton's iterate.
     renew, ease : callable
         Assembles the system again where the pattern has changed; changes the system after a failed solve, and
         returns whether another may succeed.
@@ -36,24 +38,24 @@ class RepeatedSolves:
         ksp: PETSc.KSP,
         system: StageEquations,
         linear: LinearSystem,
-        v: Array,
+        at: Callable[[], Evaluation],
         renew: Callable[[], None],
         ease: Callable[[], bool],
     ) -> None:
-        self._ksp, self._system, self._linear, self._v = ksp, system, linear, v
+        self._ksp, self._system, self._linear, self._at = ksp, system, linear, at
         self._renew, self._ease = renew, ease
         self.iterations = 0
 
     def renew(self) -> None:
         """Assemble the system again if the pattern of the present pairs demands it, for `solve`."""
         self._renew()
-        self._linear.save_rows(self._v)
+        self._linear.save_rows(self._at())
 
     def ease(self) -> bool:
         """Change the system after a failed solve, and return whether another may succeed."""
         eased = self._ease()
         if eased:
-            self._linear.save_rows(self._v)
+            self._linear.save_rows(self._at())
         return eased
 
     def product(self, z: PETSc.Vec) -> Array:

@@ -22,7 +22,7 @@ def residual_roundoff(system: StageEquations, size: float) -> float:
 
 def contact_roundoff(system: StageEquations) -> float:
     """The same for contact at the positions last evaluated; its stiffness grows without bound; collective."""
-    points, (x, _) = system.points, system.evaluated
+    points, x = system.points, system.evaluated.x
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
     if system.contact is not None:
         term = system.contact.barrier

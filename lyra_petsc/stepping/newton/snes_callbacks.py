@@ -14,11 +14,13 @@ from lyra_petsc.linear import failed_factors
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
+from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.blend import Blend
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.globalisation import Globalisation
 from lyra_petsc.stepping.newton.inexact import COLLISION, Forcing
+from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -73,6 +75,7 @@ class Newton:
     linear : LinearSystem
     blend : Blend
     convergence : Convergence
+    points : Iterates
     iterates : bool
         Whether there is more than one iteration (not so under ``semi-implicit``).
     follow : callable
@@ -95,13 +98,14 @@ class Newton:
         linear: LinearSystem,
         blend: Blend,
         convergence: Convergence,
+        points: Iterates,
         *,
         iterates: bool,
         follow: Callable[[], bool],
     ) -> None:
         self._snes, self._ksp, self._system = snes, snes.getKSP(), system
-        self._linear, self._blend, self._iterates = linear, blend, iterates
-        self.convergence, self.globalisation = convergence, Globalisation(snes, system, convergence)
+        self._linear, self._blend, self._points, self._iterates = linear, blend, points, iterates
+        self.convergence, self.globalisation = convergence, Globalisation(snes, system, points, convergence)
         self._shape = (system.points.n_owned, 3)
         self._follow, contact = follow, system.contact
         self._models_contact = (
@@ -131,6 +135,7 @@ class Newton:
         self._convex = self._convex_at_start
         approach = COLLISION * self.convergence.spacing
         collides = self._iterates and self._system.may_collide(approach)
+        self._points.forget()
         self._linear.begin_solve()
         self._linear.shift.decrease()
         self.convergence.begin_solve()
@@ -146,13 +151,13 @@ class Newton:
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
         """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
-        v = self._array(u)
+        at = self._points.at(u)
         if self._iterates:
-            self._system.predicted_stress.set_iterate(self._system.evaluate_at(v)[0])
+            self._system.predicted_stress.set_iterate(at.x)
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
-        self._linear.assemble(v, blend, keep=self.convergence.fell_fast, convex=self._convex)
+        self._linear.assemble(at, blend, keep=self.convergence.fell_fast, convex=self._convex)
         if self._system.prescribed_force is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
             force += self._system.prescribed_force
@@ -190,7 +195,7 @@ class Newton:
         if self._snes.getIterationNumber() == 0:
             self._convex_at_start = self._convex
         while failed:
-            if not self._ease_linear_solve(self._array(x)):
+            if not self._ease_linear_solve(x):
                 y.zeroEntries()
                 return True
             self._ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)
@@ -216,16 +221,17 @@ class Newton:
         self.globalisation.set_slope(residual.dot(y))
         return changed
 
-    def _ease_linear_solve(self, v: Array) -> bool:
-        """Improve the preconditioner or regularise the matrix at velocities v after the linear solve failed.
+    def _ease_linear_solve(self, x: PETSc.Vec) -> bool:
+        """Improve the preconditioner or regularise the matrix at the iterate x after the linear solve failed.
 
         Returns whether another solve may succeed; collective.
         """
-        if failed_factors.replace_failed(self._ksp) or self._linear.improve_preconditioner(v):
+        at = self._points.at(x)
+        if failed_factors.replace_failed(self._ksp) or self._linear.improve_preconditioner(at):
             return True
         if not self._blend.increase():
             return False
-        self._linear.reassemble_operator(v, self._blend.value)
+        self._linear.reassemble_operator(at, self._blend.value)
         return True
 
     def _apply_contact_model(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
@@ -233,18 +239,19 @@ class Newton:
         from lyra_petsc.contact.contact_model import ContactModel  # needed with small gaps only
         from lyra_petsc.stepping.newton.repeated_solves import RepeatedSolves
 
-        v = self._array(x)
+        def at() -> Evaluation:
+            return self._points.at(x)
 
         def renew() -> None:
             if self._follow():
-                self._linear.assemble(v, self._blend.value, keep=False, convex=self._convex)
+                self._linear.assemble(at(), self._blend.value, keep=False, convex=self._convex)
 
         def ease() -> bool:
-            self._linear.reassemble_operator(v, self._blend.value)
-            return self._ease_linear_solve(v)
+            self._linear.reassemble_operator(at(), self._blend.value)
+            return self._ease_linear_solve(x)
 
-        solves = RepeatedSolves(self._ksp, self._system, self._linear, v, renew, ease)
-        model = ContactModel(*self._system.contact_at(v))
+        solves = RepeatedSolves(self._ksp, self._system, self._linear, at, renew, ease)
+        model = ContactModel(*self._system.contact_at(self._array(x)))
         changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
         self.contact_iterations += solves.iterations
         return changed
@@ -282,16 +289,15 @@ class Newton:
                 break
             steps.append(correction.copy())
         if corrected:
-            self._system.predicted_stress.take_uncorrected(self._system.evaluate_at(first)[0])
+            self._system.predicted_stress.take_uncorrected(self._system.evaluate(first).x)
         for vector in (right, correction, *steps):
             vector.destroy()
         return corrected
 
     def _residual(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
-        system, force = self._system, np.empty(self._shape)
-        system.residual(v, system.stage.sigma * (v - system.history), force)
-        (square,) = system.points.global_sum(float(np.vdot(force, force)))
+        force = self._system.residual_at(v)
+        (square,) = self._system.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
     def curve_guess(self, v: Array, guess: Array) -> None:
@@ -309,7 +315,7 @@ class Newton:
             self._system.prescribe(end)
             if not self._system.moves_freely(start, end - start):
                 continue
-            energy = self._system.objective(end)[0] if others else 0.0
+            energy = self._system.objective(self._system.evaluate(end))[0] if others else 0.0
             if energy < lowest:
                 lowest, guess[:] = energy, end
 
@@ -339,7 +345,7 @@ class Newton:
         y.setArray(-curved.ravel())
         descends = bool(residual.dot(y) > 0.0) and self._system.moves_freely(v, curved)
         if descends:
-            self._system.predicted_stress.take_uncorrected(self._system.evaluate_at(v + increment)[0])
+            self._system.predicted_stress.take_uncorrected(self._system.evaluate(v + increment).x)
             self.step_fraction = 1.0
         else:
             before.copy(y)
@@ -410,6 +416,7 @@ class Newton:
 
     def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
         """For ``SNES.setConvergenceTest``."""
+        self._points.reach(snes.getSolution())
         spent = self.linear_iterations - self.contact_iterations
         return self.convergence.test(snes, iteration, norms[2], spent)
 

@@ -62,7 +62,8 @@ class VertexEquations:
         Prescribed unknowns ``held`` (n_local, 3) are decoupled.
         """
         system, rows = self._system, self._rows
-        (x, vs), stage, damped = system.evaluated, system.stage, system.damping.active
+        x, vs = system.evaluated.x, system.evaluated.v
+        stage, damped = system.stage, system.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.update(x)

@@ -317,10 +317,10 @@ class Equilibrium:
             here = system.out_of_balance()
             system.x[:n] += part * moved
             system.points.update_ghosts(system.x)
-            system.forget_forces()
+            system.change()
             rate = rate + (system.out_of_balance() - here) / (part * step)
             system.x[:] = x
-            system.forget_forces()
+            system.change()
         if self._whole_stiffness is None:
             self._tangent, iterations = self._stepper.tangent(rate)
         else:

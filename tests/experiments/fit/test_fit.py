@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.fit.estimate import Evaluation, Unknown, conclude, search
+from lyra_petsc.experiments.fit.estimate import Misfit, Unknown, conclude, search
 from lyra_petsc.experiments.fit.fit_runner import FIT, FitObserver, fit_scene
 from lyra_petsc.experiments.fit.model import Model
 from lyra_petsc.experiments.fit.readings import Positions, readings_of
@@ -105,7 +105,7 @@ def test_search_and_conclusion(kind: str) -> None:
     matrix, right = rng.standard_normal((12, 3)), rng.standard_normal(12)
     unknowns = [Unknown(name, 0.5, -10.0, 10.0) for name in "abc"]
     PETSc.Options()["tao_type"] = kind
-    best, words = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
+    best, words = search(unknowns, lambda p: Misfit(p, matrix @ p - right, matrix))
     exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
     covariance = np.linalg.inv(matrix.T @ matrix)
     deviation = np.sqrt(np.diag(covariance))
@@ -123,11 +123,11 @@ def test_a_search_ends_at_a_jump() -> None:
     best = np.linalg.lstsq(matrix, right, rcond=None)[0]
     matrix, right, made = np.vstack([matrix, [0.0, 0.0]]), np.append(right, 0.0), []
 
-    def jumps(numbers: np.ndarray) -> Evaluation:
+    def jumps(numbers: np.ndarray) -> Misfit:
         made.append(numbers)
         missed = matrix @ numbers - right
         missed[-1] = 9.0 * (numbers[0] > best[0] - 0.04)
-        return Evaluation(numbers, missed, matrix)
+        return Misfit(numbers, missed, matrix)
 
     found, words = search([Unknown("a", best[0] - 0.1, -9.0, 9.0), Unknown("b", best[1], -9.0, 9.0)], jumps)
     assert words.startswith("the search ended")
@@ -139,7 +139,7 @@ def test_a_parameter_at_its_bound_and_undetermined_parameters() -> None:
     matrix = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
     right = np.array([1.0, 2.0, 5.0, 10.0])
     unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
-    best, _ = search(unknowns, lambda p: Evaluation(p, matrix @ p - right, matrix))
+    best, _ = search(unknowns, lambda p: Misfit(p, matrix @ p - right, matrix))
     found = conclude(unknowns, best)
     text = " ".join(found.notes)
     assert "the data cannot tell a and b apart" in text
@@ -152,14 +152,14 @@ def test_a_fit_resumes_without_repeating(tmp_path: Path) -> None:
     scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
 
     class Stops(FitObserver):
-        def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
+        def evaluated(self, number: int, evaluation: Misfit, *, resumed: bool) -> None:
             if number == 2:
                 raise KeyboardInterrupt
 
     class Counts(FitObserver):
         made = resumed = 0
 
-        def evaluated(self, number: int, evaluation: Evaluation, *, resumed: bool) -> None:
+        def evaluated(self, number: int, evaluation: Misfit, *, resumed: bool) -> None:
             self.made, self.resumed = self.made + (not resumed), self.resumed + resumed
 
     comm = MPI.COMM_SELF

@@ -342,7 +342,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Collisi
         while not trial.simulation.finished:
             begin = trial.x
             trial.step()
-            x = system.stage_positions
+            x = system.evaluated.x
             force, moment = imbalance(contact, x, trial.gather(x))
             if friction:
                 friction_force, friction_moment = map(float, imbalance(friction_term, x, begin))

@@ -1,0 +1,51 @@
+"""Evaluations of the stage at the vectors with which PETSc calls back."""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+from lyra_petsc.stepping.evaluation import Evaluation
+from lyra_petsc.stepping.stage_equations import StageEquations
+
+Key = tuple[int, int, int]
+
+
+class Iterates:
+    """The last two points of one SNES: its iterate and a trial point; collective.
+
+    A vector is known again by its object state, which changes with its values, as long as the equations are
+    the same.
+
+    Parameters
+    ----------
+    system : StageEquations
+    """
+
+    def __init__(self, system: StageEquations) -> None:
+        self._system = system
+        self._known: dict[Key, Evaluation] = {}
+
+    def forget(self) -> None:
+        """Begin another solve, whose vectors may have the addresses of those of the last."""
+        self._known = {}
+
+    def _key(self, u: PETSc.Vec) -> Key:
+        return int(u.handle), int(u.stateGet()), self._system.version
+
+    def at(self, u: PETSc.Vec) -> Evaluation:
+        """The evaluation of the equations at velocities u."""
+        found = self._known.get(self._key(u))
+        if found is not None:
+            return self._system.revisit(found)
+        found = self._system.linearised(u.getArray(readonly=True).reshape(-1, 3))
+        self._add(u, found)
+        return found
+
+    def reach(self, u: PETSc.Vec) -> None:
+        """The SNES has copied the point of its last residual to its iterate u."""
+        if self._known and self._key(u) not in self._known:
+            self._add(u, self._known[next(reversed(self._known))])
+
+    def _add(self, u: PETSc.Vec, evaluation: Evaluation) -> None:
+        last = dict([*self._known.items()][-1:])
+        self._known = last | {self._key(u): evaluation}
