@@ -14,7 +14,7 @@ from lyra_petsc.output import read_run
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import is_locked
-from lyra_petsc.show.report.document import percent, seconds, short
+from lyra_petsc.show.report.document import percent, short
 
 ENERGIES = {column: column.removesuffix("_energy") for column in read_run.ENERGIES}
 """Columns of energies [J] and their names on the page."""
@@ -131,29 +131,13 @@ MANY_LINEAR = 100.0
 """Mean linear iterations per Newton iteration."""
 
 MUCH_OUTPUT = 0.2
-MUCH_MESHING = 0.25
-"""Fractions of the wall time."""
+"""Fraction of the wall time."""
 
 FEW_VERTICES = 300
 """Vertices per rank."""
 
 MUCH_LOSS = 0.05
 """Numerical dissipation relative to the largest change of an energy."""
-
-SLOW_FIRST_STEP = 5.0
-"""Wall time [s] by which the first step exceeds the median."""
-
-OPTIONS = {
-    "block-jacobi": "-pc_type pbjacobi",
-    "ilu": "-pc_type ilu",
-    "block-ilu": "-pc_type bjacobi -sub_pc_type ilu",
-    "multigrid": "-pc_type mg",
-    "multigrid-w": "-pc_type mg -pc_mg_w_from 2",
-    "gamg": "-pc_type gamg",
-    "direct": "-pc_type cholesky",
-    "cholesky": "-pc_type cholesky",
-}
-"""Command line options for each linear solver; the program adds the options that these need."""
 
 Rule = Callable[[Facts], Iterator[str]]
 
@@ -190,16 +174,6 @@ def _rejected_steps(facts: Facts) -> Iterator[str]:
         yield f"{seen}, a few hard moments of the motion. time.step: auto takes small steps only there."
 
 
-def _solver_changed(facts: Facts) -> Iterator[str]:
-    changed = [note for note in facts.summary.get("notes", []) if "going on with" in note]
-    name = facts.summary.get("linear_solver", "")
-    if changed and name in OPTIONS:
-        yield (
-            f"The linear solver was changed during the run ({changed[-1]}). To start with it: "
-            f"{OPTIONS[name]}, or the same in the scene's petsc block."
-        )
-
-
 def _newton(facts: Facts) -> Iterator[str]:
     mean = facts.newton_per_step
     if facts.static or mean <= MANY_NEWTON:
@@ -215,14 +189,11 @@ def _linear(facts: Facts) -> Iterator[str]:
     mean = facts.linear_per_newton
     if mean <= MANY_LINEAR:
         return
-    used = str(facts.summary.get("linear_solver", ""))
-    incomplete = "ilu" if facts.summary.get("ranks", 1) == 1 else "block-ilu"
-    tries = "; ".join(
-        OPTIONS[name] for name in (incomplete, "multigrid", "direct") if not used.startswith(name)
-    )
+    incomplete = "-pc_type ilu" if facts.summary.get("ranks", 1) == 1 else "-pc_type bjacobi -sub_pc_type ilu"
     yield (
-        f"A Newton iteration takes {short(mean)} linear iterations on average with '{used}'. Try, comparing "
-        f"wall times: {tries}; or a looser -ksp_rtol."
+        f"A Newton iteration takes {short(mean)} linear iterations on average with "
+        f"'{facts.summary.get('linear_solver', '')}'. Try, comparing wall times: {incomplete}; -pc_type mg; "
+        "-pc_type cholesky; or a looser -ksp_rtol."
     )
 
 
@@ -232,26 +203,6 @@ def _output(facts: Facts) -> Iterator[str]:
         yield (
             f"Writing took {percent(share)} of the wall time. A longer output.every and fewer output.fields "
             "write less."
-        )
-
-
-def _meshing(facts: Facts) -> Iterator[str]:
-    share = facts.share("mesh")
-    if share > MUCH_MESHING and facts.phases["mesh"] > 1.0:
-        made = facts.run.scene.has_scripts
-        remedy = " Mesh the .geo once (gmsh -2 FILE.geo) and name the .msh in the scene." if made else ""
-        yield f"Reading the mesh took {percent(share)} of the wall time.{remedy}"
-
-
-def _compilation(facts: Facts) -> Iterator[str]:
-    wall = facts.steps("wall_seconds")
-    if len(wall) < 3:
-        return
-    first, median = float(wall[0]), float(np.median(wall))
-    if first - median > SLOW_FIRST_STEP:
-        yield (
-            f"The first step took {seconds(first)}, a later one {seconds(median)}: kernels were compiled. "
-            "The next run loads them."
         )
 
 
@@ -286,12 +237,9 @@ def _accuracy(facts: Facts) -> Iterator[str]:
 RULES: tuple[Rule, ...] = (
     _how_to_continue,
     _rejected_steps,
-    _solver_changed,
     _newton,
     _linear,
     _output,
-    _meshing,
-    _compilation,
     _ranks,
     _accuracy,
 )
