@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
+from petsc4py import PETSc
 
 from lyra_petsc.arrays import Ints
 
@@ -16,8 +15,8 @@ from lyra_petsc.arrays import Ints
 class FileOrder:
     """Communication plan between rows in the owners' numbering and contiguous slabs in file order.
 
-    Rank r of P has the slab ``[r N // P, (r + 1) N // P)`` of the N rows of a file. Each
-    direction is one ``Alltoallv``; no rank ever holds more than its rows and its slab.
+    Rank r of P has the slab ``[r N // P, (r + 1) N // P)`` of the N rows of a file. No rank ever holds more
+    than its rows and its slab.
 
     Parameters
     ----------
@@ -31,17 +30,11 @@ class FileOrder:
     """
 
     def __init__(self, comm: MPI.Comm, original: ArrayLike, n_global: int) -> None:
-        rows = np.asarray(original, dtype=np.int64).reshape(-1)
         self.comm = comm
         self.n_global = int(n_global)
         self.starts: Ints = np.arange(comm.size + 1, dtype=np.int64) * self.n_global // comm.size
-
-        self._outgoing: Ints = np.argsort(rows, kind="stable")
-        ordered = rows[self._outgoing]
-        self._to_ranks = np.diff(np.searchsorted(ordered, self.starts)).astype(np.int32)
-        self._from_ranks = np.empty_like(self._to_ranks)
-        comm.Alltoall(self._to_ranks, self._from_ranks)
-        self._incoming: Ints = self._exchange(ordered, self._to_ranks, self._from_ranks) - self.start
+        self._n_owned = np.size(original)
+        self._plan = self._plan_for(np.asarray(original, dtype=np.int64).reshape(-1))
 
     @property
     def start(self) -> int:
@@ -65,11 +58,12 @@ class FileOrder:
         -------
         (n_slab, ...) array
         """
-        arrived = self._exchange(np.take(rows, self._outgoing, axis=0), self._to_ranks, self._from_ranks)
-        if self.comm.size == 1:  # rows of a single rank arrive in file order
-            return arrived
-        slab = np.empty_like(arrived)
-        slab[self._incoming] = arrived
+        rows = np.ascontiguousarray(rows)
+        slab = np.empty((self.n_slab, *rows.shape[1:]), rows.dtype)
+        kind = _row_type(rows)
+        self._plan.reduceBegin(kind, rows, slab, MPI.REPLACE)
+        self._plan.reduceEnd(kind, rows, slab, MPI.REPLACE)
+        kind.Free()
         return slab
 
     def from_slab(self, slab: NDArray[Any]) -> NDArray[Any]:
@@ -84,10 +78,7 @@ class FileOrder:
         -------
         (n_owned, ...) array
         """
-        arrived = self._exchange(slab[self._incoming], self._from_ranks, self._to_ranks)
-        rows = np.empty_like(arrived)
-        rows[self._outgoing] = arrived
-        return rows
+        return _fetch(self._plan, slab, self._n_owned)
 
     def look_up(self, rows: NDArray[Any], numbers: Ints) -> NDArray[Any]:
         """Values of any rows of the file, also of rows that other ranks own. Collective.
@@ -103,40 +94,28 @@ class FileOrder:
         -------
         (n, ...) array
         """
-        slab = self.to_slab(rows)
+        return _fetch(self._plan_for(numbers), self.to_slab(rows), len(numbers))
+
+    def _plan_for(self, numbers: Ints) -> PETSc.SF:
+        """Plan for an array whose rows are these rows of the file."""
         holder = np.searchsorted(self.starts, numbers, side="right") - 1
-        by_rank = [np.flatnonzero(holder == rank) for rank in range(self.comm.size)]
-        requests = self.comm.alltoall([numbers[at] - self.starts[rank] for rank, at in enumerate(by_rank)])
-        answers = self.comm.alltoall([slab[at] for at in requests])
-        values = np.empty((len(numbers), *slab.shape[1:]), dtype=slab.dtype)
-        for at, answer in zip(by_rank, answers, strict=True):
-            values[at] = answer
-        return values
-
-    def _exchange(
-        self, rows: NDArray[Any], send: NDArray[np.int32], receive: NDArray[np.int32]
-    ) -> NDArray[Any]:
-        rows = np.ascontiguousarray(rows)
-        if self.comm.size == 1:
-            return rows
-        arrived = np.empty((int(receive.sum()), *rows.shape[1:]), dtype=rows.dtype)
-        with row_type(rows) as kind:
-            self.comm.Alltoallv(
-                [rows, (send, _offsets(send)), kind], [arrived, (receive, _offsets(receive)), kind]
-            )
-        return arrived
+        places = np.column_stack([holder, numbers - self.starts[holder]])
+        plan = PETSc.SF().create(self.comm)
+        plan.setGraph(self.n_slab, None, np.ascontiguousarray(places, dtype=PETSc.IntType))
+        plan.setUp()
+        return plan
 
 
-def _offsets(counts: NDArray[np.int32]) -> NDArray[np.int32]:
-    return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int32)
+def _fetch(plan: PETSc.SF, slab: NDArray[Any], n: int) -> NDArray[Any]:
+    slab = np.ascontiguousarray(slab)
+    rows = np.empty((n, *slab.shape[1:]), slab.dtype)
+    kind = _row_type(slab)
+    plan.bcastBegin(kind, slab, rows, MPI.REPLACE)
+    plan.bcastEnd(kind, slab, rows, MPI.REPLACE)
+    kind.Free()
+    return rows
 
 
-@contextmanager
-def row_type(rows: NDArray[Any]) -> Iterator[MPI.Datatype]:
-    """MPI datatype of one row of an array; counts of rows, unlike counts of bytes, fit 32 bits."""
-    width = rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
-    kind = MPI.BYTE.Create_contiguous(width).Commit()
-    try:
-        yield kind
-    finally:
-        kind.Free()
+def _row_type(rows: NDArray[Any]) -> MPI.Datatype:
+    """MPI datatype of one row of an array."""
+    return MPI.BYTE.Create_contiguous(rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
