@@ -12,7 +12,7 @@ venv=${LYRA_VENV:-$root/.venv}
 [[ $venv == /* ]] || venv=$PWD/$venv
 helper=$root/scripts/environment.py
 mark=$venv/made-by-lyra-petsc # tells our .venv from one made by hand
-packages=(python3-petsc4py-real python3-petsc4py python3-mpi4py python3-h5py python3-gmsh
+packages=(python3-petsc4py-real python3-petsc4py python3-mpi4py python3-h5py python3-h5py-mpi python3-gmsh
     python3-numpy python3-venv openmpi-bin)
 # not needed, but factorisations take less than half the time with an optimised BLAS
 faster=(libopenblas0-serial)

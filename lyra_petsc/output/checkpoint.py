@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -17,15 +17,21 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint_entries import LARGEST, OPTIONAL_ARRAYS, check_entries
 from lyra_petsc.output.file_operations import writing
-from lyra_petsc.output.hdf5 import NewFile, read_slab
+from lyra_petsc.output.hdf5 import Empty, create_file, read_slab, write_rows
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
-from lyra_petsc.output.stored import check_sums, open_stored, text_attribute
+from lyra_petsc.output.stored import check_sums, open_stored
 from lyra_petsc.parallel import on_root
 
-FORMAT = 3
+LARGEST = 1e50
+"""Largest magnitude of a number [SI]; energies of larger positions overflow."""
+
+ENTRIES = "entries"
+"""Dataset of bytes: the SHA-256 of a JSON text, and the text with all numbers and check sums."""
+
+PADDING = 1 << 12
+"""The length of the text is a multiple of this, so that a file can be used again [bytes]."""
 
 Scalars = dict[str, Any]
 
@@ -39,7 +45,7 @@ class Checkpoint:
     arrays : dict of str to array
         Vertex arrays (n_owned, 3) by name, in this rank's numbering.
     scalars : dict
-        As given to `checkpoint_file`.
+        As given to `CheckpointWriter.write`.
     file : Path
         The file that was read: the newest undamaged checkpoint.
     note : str or None
@@ -58,59 +64,87 @@ class Checkpoint:
     elements: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
-def checkpoint_file(
-    folder: str | os.PathLike[str],
-    order: FileOrder,
-    arrays: Mapping[str, NDArray[Any]],
-    scalars: Mapping[str, Any],
-    edge_order: FileOrder | None = None,
-    edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
-    elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
-) -> NewFile:
-    """A new checkpoint, to be passed to `write_collective`; the old file is kept as the previous checkpoint.
+class CheckpointWriter:
+    """Writes checkpoints; the one before is kept as the previous one. All methods are collective.
 
     Parameters
     ----------
-    folder : path
+    folder : Path
         The run's folder.
     order : FileOrder
-        File order of the vertices that each rank owns; collective over its ranks.
-    arrays : mapping of str to (n_owned, 3) array of float64
-        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
+        File order of the vertices that each rank owns.
     edge_order : FileOrder or None
         File order of the edges with an unknown that each rank owns; None without such edges.
-    edge_arrays : mapping of str to (n_edges,) array of float64
-        Arrays of the unknowns of edges.
-    elements : mapping of str to (n, m) array of float64
-        Rows of this rank's changing elements, in any order.
-    scalars : mapping
-        The entries of `CheckpointEntries`; the same on every rank.
     """
-    folder = Path(folder)
-    slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
-    if edge_order is not None:
-        slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
-    slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
-    sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
-    text = json.dumps(dict(scalars))
-    facts = {name: Stored(slab.dtype.str, slab.shape, sums[name]) for name, slab in slabs.items()}
-    attributes: dict[str, dict[str, int | float | str]] = {
-        "/": {
-            "format": FORMAT,
-            "n_vertices": order.n_global,
-            "scalars": text,
-            "digest": _digest(order.n_global, text, facts),
-        },
-        **{name: {"sum": str(value)} for name, value in sums.items()},
-    }
-    return NewFile(folder / NEXT, slabs, attributes, publish=lambda: _rotate(folder))
+
+    def __init__(self, folder: Path, order: FileOrder, edge_order: FileOrder | None = None) -> None:
+        self._folder, self._order, self._edge_order = folder, order, edge_order
+        # datasets of the newest file and of the one before, if this run has written them (rank 0)
+        self._layouts: tuple[dict[str, Empty], ...] = ({}, {})
+
+    def write(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        scalars: Mapping[str, Any],
+        edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+        elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    ) -> None:
+        """Write a checkpoint.
+
+        Parameters
+        ----------
+        arrays : mapping of str to (n_owned, 3) array of float64
+            Vertex arrays: ``position`` [m], ``velocity`` [m/s], and arrays of the integrator's history.
+        scalars : mapping
+            Numbers, texts, and lists and mappings of these; the same on every rank.
+        edge_arrays : mapping of str to (n_edges,) array of float64
+            Arrays of the unknowns of edges.
+        elements : mapping of str to (n, m) array of float64
+            Rows of this rank's changing elements, in any order.
+
+        Raises
+        ------
+        OutputError
+            On every rank, if the file cannot be written; then the newest checkpoint is kept.
+        """
+        order = self._order
+        slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
+        if self._edge_order is not None:
+            slabs |= {f"edges/{n}": self._edge_order.to_slab(np.asarray(v)) for n, v in edge_arrays.items()}
+        slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
+        sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
+        entries = _encoded({"n_vertices": order.n_global, "sums": sums, "scalars": dict(scalars)})
+        slabs[ENTRIES] = np.frombuffer(entries if order.comm.rank == 0 else b"", np.uint8)
+        part = self._folder / f"{NEXT}.part"
+        newest, previous = (self._folder / name for name in (CHECKPOINT, PREVIOUS))
+
+        def prepare(lengths: Sequence[int]) -> None:
+            layout = {
+                name: Empty((n, *rows.shape[1:]), rows.dtype)
+                for n, (name, rows) in zip(lengths, slabs.items(), strict=True)
+            }
+            if layout == self._layouts[1] and previous.exists():
+                with writing(part):
+                    os.replace(previous, part)
+            else:
+                create_file(part, layout)
+            self._layouts = layout, self._layouts[0]
+
+        def publish() -> None:
+            with writing(newest):
+                os.replace(part, newest.with_name(NEXT))
+                if newest.exists():
+                    os.replace(newest, previous)
+                os.replace(newest.with_name(NEXT), newest)
+
+        write_rows(part, slabs, order.comm, prepare, publish)
 
 
-def _rotate(folder: Path) -> None:
-    with writing(folder / CHECKPOINT):
-        if (folder / CHECKPOINT).exists():
-            os.replace(folder / CHECKPOINT, folder / PREVIOUS)
-        os.replace(folder / NEXT, folder / CHECKPOINT)
+def _encoded(entries: Mapping[str, Any]) -> bytes:
+    """A check sum and the entries as text, padded so that its length seldom changes."""
+    text = json.dumps(entries).encode()
+    text += b" " * (-len(text) % PADDING)
+    return hashlib.sha256(text).hexdigest().encode() + text
 
 
 class Stored(NamedTuple):
@@ -202,17 +236,16 @@ def _read_metadata(
 ) -> tuple[Scalars, dict[str, Stored]]:
     """The checked entries, and the arrays that the scene needs by their paths (rank 0)."""
     with open_stored(file) as content:
-        version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
-        if version != FORMAT:
-            raise InputError(f"checkpoint has format {version}, this version reads {FORMAT}", file=file)
-        text, digest = text_attribute(content, "scalars"), text_attribute(content, "digest")
+        encoded = content[ENTRIES][()].tobytes()
+        if hashlib.sha256(encoded[64:]).hexdigest().encode() != encoded[:64]:
+            raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
+        entries = json.loads(encoded[64:])
+        n_vertices, scalars = entries["n_vertices"], entries["scalars"]
         stored = {
-            f"{kind}/{name}": Stored(data.dtype.str, data.shape, int(text_attribute(data, "sum")))
+            f"{kind}/{name}": Stored(data.dtype.str, data.shape, entries["sums"][f"{kind}/{name}"])
             for kind in ("vertices", "edges", "elements")
             for name, data in content.get(kind, {}).items()
         }
-    if digest != _digest(n_vertices, text, stored):
-        raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
     if n_vertices != order.n_global:
         raise InputError(
             f"checkpoint has {n_vertices} vertices, the scene's mesh {order.n_global}: "
@@ -220,9 +253,8 @@ def _read_metadata(
             file=file,
         )
     try:
-        scalars, names = check_entries(text)
         n_edges = 0 if edge_order is None else edge_order.n_global
-        needed = _needed_arrays(stored, names, n_vertices, n_edges, terms)
+        needed = _needed_arrays(stored, n_vertices, n_edges, terms)
         if 8 * max(math.prod(array.shape) for array in needed.values()) > file.stat().st_size:
             raise ValueError("an array is longer than the file")
     except ValueError as error:
@@ -231,21 +263,17 @@ def _read_metadata(
 
 
 def _needed_arrays(
-    stored: Mapping[str, Stored], names: Set[str], n_vertices: int, n_edges: int, terms: TermArrays
+    stored: Mapping[str, Stored], n_vertices: int, n_edges: int, terms: TermArrays
 ) -> dict[str, Stored]:
-    """The arrays that the scene needs; ``names`` are those that belong to the entries.
+    """The arrays that the scene needs.
 
     Raises
     ------
     ValueError
-        In one line, if an array is missing or has another type or shape than it must, or is unknown.
+        In one line, if an array is missing or has another type or shape than it must.
     """
     of_vertices = {path.split("/", 1)[1] for path in stored if path.startswith("vertices/")}
     own = {name for name in of_vertices if "." not in name}  # arrays of terms have a dot
-    if own - OPTIONAL_ARRAYS != names:
-        raise ValueError(
-            f"{', '.join(sorted((own - OPTIONAL_ARRAYS) ^ names))}: without its array or its entry"
-        )
     known = {name.split(".")[0] for name in of_vertices}
     of_vertices |= {name for name in terms.vertices if name.split(".")[0] in known}
     shapes: dict[str, tuple[int, ...]] = {f"vertices/{name}": (n_vertices, 3) for name in of_vertices}
@@ -281,14 +309,3 @@ def _equal_slabs(comm: MPI.Comm, count: int) -> FileOrder:
     """A file order in which each rank owns the rows of its slab."""
     starts = np.arange(comm.size + 1, dtype=np.int64) * count // comm.size
     return FileOrder(comm, np.arange(starts[comm.rank], starts[comm.rank + 1]), count)
-
-
-def _digest(n_vertices: int, entries: str, arrays: Mapping[str, Stored]) -> str:
-    """SHA-256 of a checkpoint's content: the entries, and type, shape and check sum of each array.
-
-    A rank does not know the number of all elements.
-    """
-    facts = sorted(
-        (name, dtype, str(shape[1:]), str(total)) for name, (dtype, shape, total) in arrays.items()
-    )
-    return hashlib.sha256(json.dumps([FORMAT, n_vertices, entries, facts]).encode()).hexdigest()

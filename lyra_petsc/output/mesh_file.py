@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
-from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.hdf5 import create_file
 from lyra_petsc.output.stored import SUM, StoredMesh, check_sum
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
@@ -55,7 +55,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     def work() -> None:
         assert mesh is not None
         datasets = _arrays(mesh)
-        names: dict[str, dict[str, int | float | str]] = {"mesh": {"vt": int(mesh.has_uv)}}
+        names: dict[str, dict[str, int | float | str | np.uint64]] = {"mesh": {"vt": int(mesh.has_uv)}}
         for number, (name, group) in enumerate(mesh.groups.items()):
             names[f"groups/{number}"] = {"name": name}
             parts = _group_arrays(group)
@@ -63,11 +63,11 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
         for number, (name, surface) in enumerate(mesh.obstacles.items()):
             names[f"obstacles/{number}"] = {"name": name}
             datasets |= {f"obstacles/{number}/{part}": rows for part, rows in surface._asdict().items()}
-        names |= {name: {SUM: str(check_sum(rows))} for name, rows in datasets.items()}
+        names |= {name: {SUM: np.uint64(check_sum(rows))} for name, rows in datasets.items()}
         for name, rows in datasets.items():
             if rows.dtype.kind == "f":  # all but numbers of vertices and triangles are lengths
                 names[name]["units"] = "m"
-        write_collective([NewFile(Path(folder) / MESH_FILE, datasets, names)], MPI.COMM_SELF)
+        create_file(Path(folder) / MESH_FILE, datasets, names)
 
     on_root(comm, work)
 
@@ -150,7 +150,7 @@ def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
     tolerance = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
     shapes = ((stored.rest, mesh.rest, "at rest"), (stored.start, mesh.positions, "at the start"))
     for before, after, shape in shapes:
-        if before is not None and (row := _largest_difference(before, after, tolerance)):
+        if row := _largest_difference(before, after, tolerance):
             return f"vertex {row[0]} stands {row[1]:.3g} m off {shape}"
     one_uv, corner_uv = vertex_uv(mesh) is not None, mesh.triangle_uv
     if one_uv != (stored.uv is not None) or _largest_difference(stored.corner_uv, corner_uv, tolerance):

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import math
-import time as wall
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
-from xml.etree.ElementTree import Element, ParseError, parse
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,30 +17,28 @@ from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.extras import require_packages
 from lyra_petsc.output.file_operations import possible_path, reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.stored import StoredMesh, check_file, check_file_name, check_folder, read_stored
+from lyra_petsc.output.run_folder import LOCK_FILE
+from lyra_petsc.output.stored import (
+    StoredMesh,
+    check_file,
+    check_folder,
+    read_stored,
+    state_files,
+    states_of,
+)
 from lyra_petsc.output.summary import read_summary
-from lyra_petsc.output.tensors import COMPONENTS, TENSORS
-from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
+from lyra_petsc.output.tensors import COMPONENTS, is_tensor
+from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
 
 if TYPE_CHECKING:
     from lyra_petsc.scene.schema import Scene
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 
-DatasetPath: TypeAlias = tuple[str, str]
-"""File name, relative to the run's folder, and name of a dataset in the file."""
-
-
 ENERGIES = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 INTEGER_COLUMNS = frozenset({"step", *ITERATIONS})
 TEXT_COLUMNS = frozenset({"obstacle"})
-
-CLOCK_RESOLUTION = 0.05
-"""Upper bound of the resolution of a file system's time stamps [s]."""
-
-VECTOR_SHAPES: dict[str, tuple[int, ...]] = {"velocity": (3,), "displacement": (3,)}
-"""Shape of a row of each field that is a vector."""
 
 
 class StoredRun:
@@ -71,18 +65,16 @@ class StoredRun:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = possible_path(folder)
+        self._mesh_file = _identity(self.folder / MESH_FILE)
         self._load()
 
     def _load(self) -> None:
-        self._stamp = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
-        # a file changed just now may change again without a new time stamp
-        written = self._stamp[0][0] * 1e-9 if self._stamp[0] else 0.0
-        self._settled = abs(wall.time() - written) > CLOCK_RESOLUTION
-        self._states: list[AnnouncedState] = read_announced_states(self.folder)
+        self._states = stored_states(self.folder)
         self.times: Array = np.array([state.time for state in self._states])
-        first = self._states[0].fields
         # a run that was resumed with other fields has them in some states only
-        self.fields = tuple(name for name in first if all(name in state.fields for state in self._states))
+        of_states = [{field.name: field for field in state.fields} for state in self._states]
+        self._fields = {n: field for n, field in of_states[0].items() if all(n in each for each in of_states)}
+        self.fields = tuple(self._fields)
 
     def refresh(self) -> bool:
         """Read the states again that a running simulation may have added.
@@ -99,14 +91,12 @@ class StoredRun:
         """
         for name in ("_history", "summary", "scene"):
             self.__dict__.pop(name, None)
-        states, mesh = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
-        if mesh != self._stamp[1]:  # replaced by another run
+        before, mesh = self._states, self._mesh_file
+        self._mesh_file = _identity(self.folder / MESH_FILE)
+        if self._mesh_file != mesh:  # replaced by another run
             self.__dict__.pop("mesh", None)
-        if (states, mesh) == self._stamp and self._settled:
-            return False
-        before, same = self._states, mesh == self._stamp[1]
         self._load()
-        return not same or self._states != before
+        return self._mesh_file != mesh or self._states != before
 
     @property
     def name(self) -> str:
@@ -151,8 +141,7 @@ class StoredRun:
     @property
     def positions(self) -> StateArrays:
         """(V, 3) [m] for each state."""
-        datasets = [state.position for state in self._states]
-        return StateArrays(self.folder, "positions", datasets, (len(self.rest), 3))
+        return self._arrays("position", (len(self.rest), 3))
 
     @property
     def velocities(self) -> StateArrays:
@@ -163,7 +152,7 @@ class StoredRun:
         """A field of the states by its name; (V,), (V, 3), (F,) or (F, 6) for each state.
 
         ``stress`` and ``green_strain`` are (F, 6), uu, uv, uw, vv, vw, ww in material axes (u along the warp,
-        w normal to the sheet); in older folders (F, 3), uu, vv, uv.
+        w normal to the sheet).
 
         Raises
         ------
@@ -175,22 +164,24 @@ class StoredRun:
             raise InputError(
                 f"no field {name!r}, {hint}; a scene's output.fields names them", file=self.folder
             )
-        first = self._states[0].fields[name]
-        datasets = [state.fields[name].dataset for state in self._states]
-        rows = self.rest if first.on == "vertex" else self.triangles
-        return StateArrays(self.folder, name, datasets, (len(rows), *first.columns))
+        rows = self.rest if self._fields[name].on == "vertex" else self.triangles
+        return self._arrays(name, (len(rows), *self._fields[name].shape[1:]))
+
+    def _arrays(self, name: str, shape: tuple[int, ...]) -> StateArrays:
+        datasets = [(state.file, f"{group_name(state.number)}/{name}") for state in self._states]
+        return StateArrays(self.folder, name, datasets, shape)
 
     def field_units(self, name: str) -> str:
         """Unit of a field, as in ``N/m``; ``1`` for dimensionless fields."""
         from lyra_petsc.scene.schema import FIELD_UNITS
 
         if name not in {"position", *FIELD_UNITS}:
-            raise InputError(f"is damaged: no run writes a field {name!r}", file=self.folder / XDMF_FILE)
+            raise InputError(f"is damaged: no run writes a field {name!r}", file=self.folder)
         return "m" if name == "position" else FIELD_UNITS[name]
 
     def field_on(self, name: str) -> str:
         """``vertex`` or ``triangle``: what the rows of a field belong to, in the order of the mesh file."""
-        return self._states[0].fields[name].on
+        return self._fields[name].on
 
     def at(self, time: float) -> int:
         """Index of the state nearest to a time [s]."""
@@ -213,13 +204,14 @@ class StoredRun:
 
         content = {"position": variable("position", ("axis",), self.positions)}
         for name in self.fields:
-            last = "axis" if name in VECTOR_SHAPES else "component" if name in TENSORS else ""
-            content[name] = variable(name, (last,) if last else (), self.field(name))
+            shape = self._fields[name].shape
+            last = ("component",) if is_tensor(shape) else ("axis",) if len(shape) == 2 else ()
+            content[name] = variable(name, last, self.field(name))
         content["rest"] = (("vertex", "axis"), self.rest, {"units": "m"})
         content["triangles"] = (("triangle", "corner"), self.triangles, {})
         axes = {"axis": list("xyz")}
-        if tensors := [content[name][1] for name in self.fields if name in TENSORS]:
-            axes["component"] = list(COMPONENTS[tensors[0].shape[-1]])
+        if any(is_tensor(field.shape) for field in self._fields.values()):
+            axes["component"] = list(COMPONENTS)
         time = ("state", self.times[::every], {"units": "s"})
         whole = xarray.Dataset(content, {"time": time, **axes}, {"title": self.scene.title})
         return whole.swap_dims(state="time")
@@ -284,109 +276,38 @@ class StoredRun:
         return bool(self.summary.get("outcome") == "done")
 
 
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Time stamp, size and inode of a file, which change when the file is replaced or changed."""
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Inode and time stamp of a file, which change when the file is replaced."""
     try:
         status = path.stat()
     except OSError:
         return None
-    return status.st_mtime_ns, status.st_size, status.st_ino
+    return status.st_ino, status.st_mtime_ns
 
 
-@dataclass(frozen=True)
-class AnnouncedField:
-    """A field of a state: its dataset, what the rows belong to (``vertex``, ``triangle``), a row's shape."""
-
-    dataset: DatasetPath
-    on: str
-    columns: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class AnnouncedState:
-    """A written state.
-
-    Attributes
-    ----------
-    time : float
-        [s], or the load factor of a static analysis.
-    position : tuple of str
-        File and dataset of the positions.
-    fields : mapping of str to AnnouncedField
-        The other arrays of the state.
-    """
-
-    time: float
-    position: DatasetPath
-    fields: Mapping[str, AnnouncedField]
-
-
-def read_announced_states(folder: Path) -> list[AnnouncedState]:
-    """The states that states.xdmf lists, in the order of time.
+def stored_states(folder: Path) -> list[WrittenState]:
+    """The states of a run, ordered by number.
 
     Raises
     ------
     InputError
-        If the folder is not one of a run, no state is written yet, or states.xdmf is damaged.
+        If the folder is not one of a run, no state is written yet, or a states file is damaged.
     """
-    path = folder / XDMF_FILE
     check_folder(folder)
+    if not folder.exists():
+        raise InputError("no such folder; give the folder of a run, as in runs/flag", file=folder)
+    if not folder.is_dir():
+        raise InputError("is a file; give the folder of a run, as in runs/flag", file=folder)
     try:
-        root = parse(path).getroot()
-        states = [_state(grid) for grid in root.iterfind("./Domain/Grid/Grid")]
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(_missing_reason(folder), file=folder) from None
+        states = [state for path in state_files(folder) for state in states_of(path)]
+        begun = bool(states) or any((folder / name).exists() for name in (MESH_FILE, LOCK_FILE))
     except OSError as error:
-        raise InputError(f"cannot be read: {reason(error)}", file=path) from None
-    except (ParseError, ValueError, LookupError, AttributeError, RecursionError):
-        raise InputError("is damaged, or was not written by a run", file=path) from None
+        raise InputError(f"cannot be read: {reason(error)}", file=folder) from None
+    if not begun:
+        raise InputError(f"is not the folder of a run (no {MESH_FILE})", file=folder)
     if not states:
         raise InputError("no state is written yet", file=folder)
-    for state in states:
-        for name, _ in (state.position, *(field.dataset for field in state.fields.values())):
-            check_file_name(name, path)
     return states
-
-
-def _missing_reason(folder: Path) -> str:
-    if not folder.exists():
-        return "no such folder; give the folder of a run, as in runs/flag"
-    if not folder.is_dir():
-        return "is a file; give the folder of a run, as in runs/flag"
-    if (folder / "run.lock").exists():
-        return f"no state is written yet (no {XDMF_FILE})"
-    return f"is not the folder of a run (no {XDMF_FILE})"
-
-
-def _state(grid: Element) -> AnnouncedState:
-    time, geometry = grid.find("Time"), grid.find("Geometry")
-    if time is None or geometry is None:
-        raise ValueError
-    seconds = float(time.attrib["Value"])
-    if not math.isfinite(seconds):
-        raise ValueError
-    attributes = {each.attrib["Name"]: each for each in grid.iterfind("Attribute")}
-    fields = {name: _field(name, each) for name, each in attributes.items() if name != "rest"}
-    return AnnouncedState(seconds, _dataset_path(geometry), fields)
-
-
-def _field(name: str, element: Element) -> AnnouncedField:
-    columns = VECTOR_SHAPES.get(name, ())
-    if name in TENSORS:
-        item = element.find("DataItem")
-        columns = (int(item.attrib["Dimensions"].split()[-1]) if item is not None else 0,)
-        if columns[0] not in COMPONENTS:
-            raise ValueError
-    return AnnouncedField(
-        _dataset_path(element), "triangle" if element.get("Center") == "Cell" else "vertex", columns
-    )
-
-
-def _dataset_path(element: Element) -> DatasetPath:
-    file, colon, dataset = (element.findtext("DataItem") or "").strip().rpartition(":")
-    if not colon:
-        raise ValueError
-    return file, dataset
 
 
 class StateArrays(Sequence[NDArray[Any]]):
@@ -406,7 +327,7 @@ class StateArrays(Sequence[NDArray[Any]]):
     """
 
     def __init__(
-        self, folder: Path, name: str, datasets: Sequence[DatasetPath], shape: tuple[int, ...]
+        self, folder: Path, name: str, datasets: Sequence[tuple[str, str]], shape: tuple[int, ...]
     ) -> None:
         self._folder, self._name, self._datasets, self._shape = folder, name, datasets, shape
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time as clock
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import Checkpoint, TermArrays, checkpoint_file, read_checkpoint
+from lyra_petsc.output.checkpoint import Checkpoint, CheckpointWriter, TermArrays, read_checkpoint
 from lyra_petsc.output.fields import Field, chosen_fields
-from lyra_petsc.output.file_operations import replace_text
-from lyra_petsc.output.hdf5 import Background, NewFile, read_slab, write_collective
+from lyra_petsc.output.file_operations import reason, replace_text, writing
+from lyra_petsc.output.hdf5 import read_slab
 from lyra_petsc.output.history import (
     HISTORY_COLUMNS,
     OBSTACLE_COLUMNS,
@@ -27,9 +28,9 @@ from lyra_petsc.output.history import (
 )
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.run_folder import CHECKPOINT
 from lyra_petsc.output.states import FailureState, StateWriter, remove_failure, write_failure
-from lyra_petsc.output.stored import read_stored
-from lyra_petsc.output.tensors import plane_components
+from lyra_petsc.output.stored import open_stored, read_stored
 from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, dump_scene, obstacle_motions, scene_changes
@@ -85,7 +86,8 @@ class Recorder:
             own = elements.index[: elements.n_owned].astype(np.int64)
             self._triangles = FileOrder(points.comm, own, problem.whole.n_triangles)
         self._comm = points.comm
-        self._background = Background(points.comm)
+        self._disk = ThreadPoolExecutor(max_workers=1)
+        self._synced: Future[None] | None = None  # of rank 0
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
         self._last_state = -1
@@ -120,7 +122,13 @@ class Recorder:
         check_same_mesh(folder, problem.mesh, _used_groups(scene), self._comm)
         checkpoint = read_checkpoint(folder, self._vertices, self._edges, self._term_arrays())
         on_root(self._comm, lambda: self._check_continuable(folder, checkpoint))
-        self._restore(checkpoint)
+        try:
+            self._restore(checkpoint)
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise InputError(
+                f"does not hold what this program writes ({reason(error)}): run without --resume",
+                file=checkpoint.file,
+            ) from error
         on_root(self._comm, lambda: self._refuse_crossings(checkpoint))
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
@@ -211,7 +219,8 @@ class Recorder:
         from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
         from lyra_petsc.mesh.obstacles import build_obstacles
 
-        positions = read_stored(checkpoint.file, "vertices/position", (mesh.n_vertices, 3), kinds="f")
+        with open_stored(checkpoint.file) as file:
+            positions = file["vertices/position"][()]
         obstacles = build_obstacles(scene, mesh.obstacles, Motion)
         refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
 
@@ -268,8 +277,8 @@ class Recorder:
             resume_after=resume_after,
             vtkhdf=self._simulation.scene.output.vtkhdf,
             time_unit="1" if self._simulation.scene.time.static else "s",
-            background=self._background,
         )
+        self._checkpoints = CheckpointWriter(folder, self._vertices, self._edges)
         self._tables = {
             name: History(folder / name, columns, self._comm, resume_after=resume_after)
             for name, columns in self._table_columns().items()
@@ -360,28 +369,18 @@ class Recorder:
             self.write_checkpoint()
             return
         problem = simulation.problem
-        values = {field: field.compute(problem) for field in self._fields}
-        for field in values:
-            if field.name in self._states.in_plane:
-                values[field] = plane_components(values[field])
-        with self._checkpoint(last_state=simulation.step_number) as checkpoint:
-            self._states.write(
-                simulation.step_number,
-                simulation.time,
-                problem.system.x[: problem.points.n_vertices],
-                {field.name: (field.on, value) for field, value in values.items()},
-                other_files=[checkpoint],  # so a run resumed after a kill does not write the state again
-            )
+        began = clock.monotonic()
+        self._states.write(
+            simulation.step_number,
+            simulation.time,
+            problem.system.x[: problem.points.n_vertices],
+            {field.name: (field.on, field.compute(problem)) for field in self._fields},
+        )
         self._last_state = simulation.step_number
+        self.write_checkpoint(began)
 
-    def write_checkpoint(self) -> None:
-        """Write a checkpoint of the present state."""
-        with self._checkpoint(self._last_state) as checkpoint:
-            write_collective([checkpoint], self._comm, self._background)
-
-    @contextmanager
-    def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
-        """A context that gives the checkpoint of the present state, in which the caller writes it."""
+    def write_checkpoint(self, began: float | None = None) -> None:
+        """Write a checkpoint of the present state; its duration counts from ``began`` on, if given."""
         simulation = self._simulation
         system, layout = simulation.problem.system, simulation.problem.points
         n, (saved, scalars) = layout.n_owned, simulation.saved_state()
@@ -392,10 +391,13 @@ class Recorder:
         arrays |= term_states.vertex_arrays(system)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
         edges |= term_states.edge_arrays(system)
-        scalars["last_state"] = last_state
-        began = clock.monotonic()
+        scalars["last_state"] = self._last_state
+        began = clock.monotonic() if began is None else began
         elements = term_states.element_arrays(system)
-        yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
+        self._wait_for_disk()  # the previous checkpoint is safe before this one takes its place
+        self._checkpoints.write(arrays, scalars, edges, elements)
+        if self._comm.rank == 0:
+            self._synced = self._disk.submit(_sync, self._folder / CHECKPOINT)
         self._last_checkpoint = clock.monotonic()
         self._steps_since_checkpoint = 0
         self._checkpoint_seconds = self._last_checkpoint - began
@@ -420,21 +422,35 @@ class Recorder:
         )
 
     def flush(self) -> None:
-        """Wait until all states and checkpoints are on disk and announced.
+        """Wait until the last checkpoint is on disk, and announce all states.
 
         Raises
         ------
         OutputError
             If a file could not be written; states announced before are kept.
         """
-        self._background.wait()
+        self._wait_for_disk()
         self._states.finish()
 
+    def _wait_for_disk(self) -> None:
+        def work() -> None:
+            synced, self._synced = self._synced, None
+            if synced is not None:
+                synced.result()
+
+        on_root(self._comm, work)
+
     def close(self) -> None:
-        """Close the tables; not collective. Errors of files in the background are raised by `flush` only."""
-        self._background.close()
+        """Close the tables; not collective."""
+        self._disk.shutdown()
         for table in self._tables.values():
             table.close()
+
+
+def _sync(path: Path) -> None:
+    """Write a file from the memory of the operating system to disk."""
+    with writing(path), open(path, "rb") as file:
+        os.fsync(file.fileno())
 
 
 def _obstacle_row(report: StepReport, name: str, load: Array) -> dict[str, float | str]:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.file_operations import HDF5_ERRORS, open_regular_file, possible_path, reason
-from lyra_petsc.output.stored import check_folder, open_contained
+from lyra_petsc.output.file_operations import open_regular_file, possible_path, reason
+from lyra_petsc.output.stored import OutsideFolderError, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -51,8 +51,13 @@ def _check_resumable(folder: Path) -> None:
     """Refuse to resume if files of the run are links or checkpoints take data from other files."""
     check_folder(folder)
     for file in checkpoint_files(folder):
-        with suppress(*HDF5_ERRORS), open_contained(file):  # if one is damaged, the previous one is read
-            pass
+        try:
+            with open_stored(file):
+                pass
+        except OutsideFolderError:
+            raise
+        except InputError:  # if one is damaged, the previous one is read
+            continue
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """States of a run: files states-NNNN.h5, each for several states from number NNNN on, and states.xdmf.
 
 A file is created with preallocated datasets for several states. To write a state is to write its rows into
-these datasets, and then its row in the file's table. HDF5's metadata do not change, so the file can be read
-at any time. A new file can hold as many states as exist already, within bounds, so that there are few files
-and little unused space. A state is announced, that is, listed in states.xdmf, when it is complete on disk.
+these datasets, and then its row in the file's table. A new file can hold as many states as exist already,
+within bounds, so that there are few files and little unused space. A state is announced, that is, listed in
+states.xdmf, when it is complete.
 
 failure.xdmf, failure.h5 and failure.txt hold the state before a failed step, the failing iterate and the
 cause.
@@ -12,32 +12,32 @@ cause.
 from __future__ import annotations
 
 import json
+import math
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.file_operations import (
-    HDF5_ERRORS,
     cannot_write,
-    open_output,
     reason,
     replace_text,
-    writing,
 )
-from lyra_petsc.output.hdf5 import Background, NewFile, preallocate, write_collective
+from lyra_petsc.output.hdf5 import Attributes, Empty, create_file, rows_writable, write_rows
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_attribute
-from lyra_petsc.output.tensors import TENSORS
+from lyra_petsc.output.stored import (
+    TABLE,
+    OutsideFolderError,
+    check_sums,
+    state_files,
+    states_of,
+)
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import (
     XDMF_FILE,
@@ -62,14 +62,12 @@ MAX_LAG = 0.1
 UNITS = {**FIELD_UNITS, "position": "m", "residual": "N"}
 """Units of the datasets of a state by name, stored as their attribute ``units``."""
 
-STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
-
 Fields = Mapping[str, tuple[str, NDArray[Any]]]
 """Fields by name: what the rows belong to (``vertex`` or ``triangle``), and this rank's rows."""
 
 
 class StateWriter:
-    """Writes states in the order of the mesh file; a state is announced only when it is complete on disk.
+    """Writes states in the order of the mesh file; a state is announced only when it is complete.
 
     Parameters
     ----------
@@ -88,14 +86,6 @@ class StateWriter:
         Announce the states in ``states.vtkhdf``, too.
     time_unit : str
         Unit of the states' times.
-    background : Background, optional
-        Completes and announces states while the run continues.
-
-    Attributes
-    ----------
-    in_plane : frozenset of str
-        Tensor fields that existing states hold with three components, as older versions wrote them; new
-        states must do so, too.
 
     Raises
     ------
@@ -113,37 +103,27 @@ class StateWriter:
         resume_after: int | None = None,
         vtkhdf: bool = False,
         time_unit: str = "s",
-        background: Background | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.vertices = vertices
+        self._comm = vertices.comm
         self._orders = {"vertex": vertices} | ({} if triangles is None else {"triangle": triangles})
         self.n_triangles = n_triangles
-        self._file: _PreallocatedFile | None = None
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
         self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
         self._n_in_vtkhdf = 0
         self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
-        self._vtkhdf, self._time_unit, self._background = vtkhdf, time_unit, background
+        # the newest file: its path, the numbers of its states, and their fields
+        self._path, self._numbers = Path(), range(0)
+        self._fields: tuple[StoredField, ...] = ()
+        self._vtkhdf, self._time_unit = vtkhdf, time_unit
         if vtkhdf:
             on_root(self._comm, lambda: write_cells(self.folder))
-        self.in_plane: frozenset[str] = frozenset()
         if resume_after is not None:
-            self._next, self.in_plane = on_root(self._comm, lambda: self._truncate(resume_after))
+            self._next = on_root(self._comm, lambda: self._truncate(resume_after))
 
-    @property
-    def _comm(self) -> MPI.Comm:
-        return self.vertices.comm
-
-    def write(
-        self,
-        step: int,
-        time: float,
-        position: Array,
-        fields: Fields,
-        other_files: Sequence[NewFile] = (),
-    ) -> int:
+    def write(self, step: int, time: float, position: Array, fields: Fields) -> int:
         """Write and announce one state; collective. Returns its number.
 
         Parameters
@@ -157,14 +137,11 @@ class StateWriter:
         fields : mapping of str to (str, (n_owned, ...) array)
             Further fields on this rank's vertices or triangles: floats or integers; names, types and
             trailing shapes are the same on every rank.
-        other_files : sequence of NewFile
-            Files that are completed before the state is announced.
 
         Raises
         ------
         OutputError
-            On every rank, if a file cannot be written; states announced before are kept. With a background,
-            the error may be that of the previous state.
+            On every rank, if a file cannot be written; states announced before are kept.
         """
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
         slabs |= {name: self._orders[on].to_slab(rows) for name, (on, rows) in fields.items()}
@@ -173,20 +150,17 @@ class StateWriter:
             for name, (on, _) in fields.items()
         )
         number = self._next
-        file = self._file
-        if file is None or file.fields != described or number >= file.first + len(file.offsets):
-            file = self._file = self._preallocate(slabs, described)
-        state = WrittenState(number, int(step), float(time), file.path.name, described)
-        record = partial(file.record_written, state, check_sums(slabs.values(), self._comm))
-        datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
-        offsets = file.offsets[number - file.first].tolist()
-        new = NewFile(file.path, datasets, {}, lambda: self._announce(state), offsets, record)
-        write_collective([new, *other_files], self._comm, self._background)
+        if number not in self._numbers or described != self._fields:
+            self._begin_file(described)
+        state = WrittenState(number, int(step), float(time), self._path.name, described)
+        sums = check_sums(slabs.values(), self._comm)
+        rows = {f"{group_name(number)}/{name}": slab for name, slab in slabs.items()}
+        write_rows(self._path, rows, self._comm, publish=lambda: self._announce(state, sums))
         self._next += 1
         return number
 
     def finish(self) -> None:
-        """List all announced states in ``states.vtkhdf``; collective, when the background is idle.
+        """List all announced states in ``states.vtkhdf``; collective.
 
         Raises
         ------
@@ -196,47 +170,43 @@ class StateWriter:
         if self._vtkhdf:
             on_root(self._comm, lambda: self._write_vtkhdf(complete=True))
 
-    def _preallocate(
-        self, slabs: Mapping[str, NDArray[Any]], fields: tuple[StoredField, ...]
-    ) -> _PreallocatedFile:
+    def _begin_file(self, fields: tuple[StoredField, ...]) -> None:
         """Create a file for the next states; collective."""
-        first, names = self._next, list(slabs)
-        rows = [self.vertices.n_global, *(field.shape[0] for field in fields)]
-        widths = [slab.itemsize * int(np.prod(slab.shape[1:], dtype=int)) for slab in slabs.values()]
-        size = sum(n * width for n, width in zip(rows, widths, strict=True))
+        first = self._next
+        position = StoredField("position", "vertex", (self.vertices.n_global, 3), "float64")
+        empty = {field.name: Empty(field.shape, np.dtype(field.dtype)) for field in (position, *fields)}
+        size = sum(each.dtype.itemsize * math.prod(each.shape) for each in empty.values())
         slots = max(1, min(max(first, MIN_STATES), MAX_STATES, MAX_BYTES // max(size, 1)))
         path = self.folder / f"states-{first:04d}.h5"
-        table: dict[str, NDArray[Any]] = {
-            f"{TABLE}/step": np.empty(0, np.int64),
-            f"{TABLE}/time": np.empty(0, np.float64),
-            f"{TABLE}/sums": np.empty((0, len(names)), np.uint64),
-        }
-        planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
-        columns = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
-        attributes: dict[str, dict[str, int | float | str]] = {
-            TABLE: {"first": first, "columns": columns},
-            f"{TABLE}/time": {"units": self._time_unit},
-            **_units(planned),
-        }
 
-        def work() -> list[int]:
-            part = path.with_name(path.name + ".part")
-            try:
-                offsets = preallocate(part, table | planned, [slots] * len(table) + rows * slots, attributes)
-                with open_output(part, "r+b", buffering=0) as file:
-                    os.pwrite(file.fileno(), np.full(slots, -1, np.int64).tobytes(), offsets[0])
-                    os.fsync(file.fileno())
-                os.replace(part, path)
-            except HDF5_ERRORS as error:
-                part.unlink(missing_ok=True)
-                raise cannot_write(path, error) from error
-            return offsets
+        def create() -> None:
+            table = {
+                f"{TABLE}/step": np.full(slots, -1, np.int64),
+                f"{TABLE}/time": np.zeros(slots),
+                f"{TABLE}/sums": np.zeros((slots, len(empty)), np.uint64),
+            }
+            planned = {
+                f"{group_name(first + i)}/{name}": each for i in range(slots) for name, each in empty.items()
+            }
+            columns = json.dumps([(field.name, field.on) for field in (position, *fields)])
+            attributes: Attributes = {
+                TABLE: {"first": first, "columns": columns},
+                f"{TABLE}/time": {"units": self._time_unit},
+                **_units(planned),
+            }
+            create_file(path, {**table, **planned}, attributes)
 
-        offsets = np.array(on_root(self._comm, work), dtype=np.int64)
-        return _PreallocatedFile(path, first, fields, offsets[:3], offsets[3:].reshape(slots, len(names)))
+        on_root(self._comm, create)
+        self._path, self._numbers, self._fields = path, range(first, first + slots), fields
 
-    def _announce(self, state: WrittenState) -> None:
-        """List a state in states.xdmf and, unless too few are new, states.vtkhdf (rank 0)."""
+    def _announce(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
+        """List a state in its file, in states.xdmf and, unless too few are new, states.vtkhdf (rank 0)."""
+        row = state.number - self._numbers.start
+        with rows_writable(self._path) as file:
+            table = file[TABLE]
+            table["time"][row], table["sums"][row] = state.time, sums
+            file.flush()
+            table["step"][row] = state.step  # which makes the row valid
         grid = self._series.grid(state)
         try:
             if state.number == 0:
@@ -246,7 +216,7 @@ class StateWriter:
         except FileNotFoundError:  # removed or changed by somebody: write it again from the states' files
             if not self.folder.is_dir():
                 raise cannot_write(self._document.path, FileNotFoundError()) from None
-            self._document.replace(map(self._series.grid, stored_states(self.folder)))
+            self._document.replace(map(self._series.grid, _undamaged_states(self.folder)))
         if self._vtkhdf:
             self._states.append(state)
             self._write_vtkhdf()
@@ -262,13 +232,12 @@ class StateWriter:
         write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles)
         self._n_in_vtkhdf = len(self._states)
 
-    def _truncate(self, last_step: int) -> tuple[int, frozenset[str]]:
-        """Announce the states up to ``last_step``, and only then remove the later ones.
+    def _truncate(self, last_step: int) -> int:
+        """Announce the states up to ``last_step``, and only then remove the later ones (rank 0).
 
-        Returns the number of the next state, and the tensor fields that have three components.
+        Returns the number of the next state.
         """
-        found = stored_states(self.folder)
-        keep = [state for state in found if state.step <= last_step]
+        keep = [state for state in _undamaged_states(self.folder) if state.step <= last_step]
         self._document.replace(map(self._series.grid, keep))
         if self._vtkhdf:
             self._states = keep
@@ -280,45 +249,14 @@ class StateWriter:
                 if path.name not in kept:
                     path.unlink()
                 else:
-                    _discard_states_after(path, last_step)
+                    with rows_writable(path) as file:
+                        steps = file[TABLE]["step"]
+                        steps[...] = np.where(steps[...] > last_step, -1, steps[...])
             for path in stale:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: a later state cannot be removed: {reason(error)}") from error
-        fields = [field for state in keep for field in state.fields]
-        older = frozenset(field.name for field in fields if field.name in TENSORS and field.shape[1:] == (3,))
-        return max((state.number for state in keep), default=-1) + 1, older
-
-
-@dataclass(frozen=True)
-class _PreallocatedFile:
-    """A file with preallocated datasets for several states.
-
-    Attributes
-    ----------
-    path : Path
-    first : int
-        Number of the first state in the file.
-    fields : tuple of StoredField
-        Fields of each state.
-    table : (3,) int64
-        Offsets in the file of the table's columns [bytes].
-    offsets : (slots, datasets) int64
-        Offsets in the file of each state's datasets [bytes].
-    """
-
-    path: Path
-    first: int
-    fields: tuple[StoredField, ...]
-    table: Ints
-    offsets: Ints
-
-    def record_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
-        """Write a state's row of the table (rank 0)."""
-        entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
-        with writing(self.path), open_output(self.path, "r+b", buffering=0) as file:
-            for offset, entry in zip(self.table.tolist(), entries, strict=True):
-                os.pwrite(file.fileno(), entry.tobytes(), offset + index * entry.nbytes)
+        return max((state.number for state in keep), default=-1) + 1
 
 
 def _units(datasets: Iterable[str]) -> dict[str, dict[str, int | float | str]]:
@@ -327,24 +265,7 @@ def _units(datasets: Iterable[str]) -> dict[str, dict[str, int | float | str]]:
     return {path: {"units": UNITS[name]} for path, name in names.items() if name in UNITS}
 
 
-def _discard_states_after(path: Path, last_step: int) -> None:
-    """Mark the states after ``last_step`` in a file as not written."""
-    with open_stored(path) as file:
-        if TABLE not in file:
-            return
-        steps, offset = file[TABLE]["step"][()], file[TABLE]["step"].id.get_offset()
-    steps[steps > last_step] = -1
-    with open_output(path, "r+b", buffering=0) as raw:
-        os.pwrite(raw.fileno(), steps.tobytes(), offset)
-
-
-def state_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """The states files of a run's folder, ordered by number."""
-    numbered = [(STATE_FILE.fullmatch(path.name), path) for path in Path(folder).iterdir()]
-    return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
-
-
-def stored_states(folder: Path) -> list[WrittenState]:
+def _undamaged_states(folder: Path) -> list[WrittenState]:
     """The states in a run's folder, ordered by number; damaged files are skipped.
 
     Raises
@@ -355,46 +276,12 @@ def stored_states(folder: Path) -> list[WrittenState]:
     found: list[WrittenState] = []
     for path in state_files(folder):
         try:
-            found += _states_of(path)
+            found += states_of(path)
         except OutsideFolderError:
             raise
         except InputError:
             continue
-    return sorted(found, key=lambda state: state.number)
-
-
-def _states_of(path: Path) -> list[WrittenState]:
-    """The states of a file; in older folders, a file holds one state.
-
-    Raises
-    ------
-    InputError
-        If the file is damaged.
-    """
-    with open_stored(path) as file:
-        if TABLE not in file:
-            (name,) = file["states"]
-            group = file["states"][name]
-            on = {key: text_attribute(data, "on") for key, data in group.items() if key != "position"}
-            step, time = int(group.attrs["step"]), float(group.attrs["time"])
-            return [WrittenState(int(name), step, time, path.name, _fields(group, on))]
-        table = file[TABLE]
-        first, on = int(table.attrs["first"]), dict(json.loads(text_attribute(table, "columns")))
-        fields = _fields(file[group_name(first)], on)
-        rows = zip(table["step"][()].tolist(), table["time"][()].tolist(), strict=True)
-        return [
-            WrittenState(first + i, step, time, path.name, fields)
-            for i, (step, time) in enumerate(rows)
-            if step >= 0
-        ]
-
-
-def _fields(group: Any, on: Mapping[str, str]) -> tuple[StoredField, ...]:
-    return tuple(
-        StoredField(name, kind, group[name].shape, group[name].dtype.name)
-        for name, kind in on.items()
-        if name != "position"
-    )
+    return found
 
 
 FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failure.txt"
@@ -465,7 +352,10 @@ def write_failure(
         )
         written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
     attributes |= _units(datasets)
-    write_collective([NewFile(folder / FAILURE_DATA, datasets, attributes)], vertices.comm)
+    n = vertices.n_global
+    empty = {name: Empty((n, *rows.shape[1:]), rows.dtype) for name, rows in datasets.items()}
+    file = folder / FAILURE_DATA
+    write_rows(file, datasets, vertices.comm, lambda lengths: create_file(file, empty, attributes))
     document = TimeSeries(vertices.n_global, n_triangles).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
 

@@ -9,12 +9,13 @@ Datasets therefore have check sums, in an attribute or in the table of the state
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.mesh import Group, TriangleSurface
 from lyra_petsc.output.file_operations import reason
-from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.output.xdmf import MESH_FILE, StoredField, WrittenState, group_name
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -42,23 +43,6 @@ def import_h5py() -> Any:
     import h5py
 
     return h5py
-
-
-@cache
-def hdf5_properties() -> tuple[Any, Any, Any, Any]:
-    """HDF5 property lists for creating datasets, their groups and files, and the dataspace of attributes."""
-    h5py = import_h5py()
-    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    early.set_layout(h5py.h5d.CONTIGUOUS)
-    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
-    links.set_create_intermediate_group(True)
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-    # older formats of groups and headers have no check sums, and HDF5 crashes if they are damaged
-    access.set_libver_bounds(h5py.h5f.LIBVER_V18, h5py.h5f.LIBVER_V18)
-    return early, links, access, h5py.h5s.create(h5py.h5s.SCALAR)
 
 
 def import_h5py_in_background() -> None:
@@ -117,39 +101,6 @@ def check_file(path: Path) -> None:
         raise InputError("is no plain file", file=path)
 
 
-def check_file_name(name: str, file: Path) -> None:
-    """Check that ``name``, which ``file`` refers to, is the name of a file in the same folder.
-
-    Raises
-    ------
-    InputError
-    """
-    if name in ("", ".", "..") or "\\" in name or os.path.basename(name) != name or not name.isprintable():
-        raise OutsideFolderError(f"names {name[:80]!r}, which is no file in its folder; {_REMEDY}", file=file)
-
-
-@contextmanager
-def open_contained(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """A context with an HDF5 file open for reading that contains all of its data.
-
-    Yields
-    ------
-    h5py.File
-
-    Raises
-    ------
-    InputError
-        If the file has links to other files or data in them.
-    OSError and other exceptions of h5py
-        If the file cannot be read.
-    """
-    path = Path(path)
-    check_file(path)
-    with import_h5py().File(path, "r") as file:
-        _check_content(file.id, path)
-        yield file
-
-
 _checked_files: dict[Path, tuple[int, ...]] = {}
 
 
@@ -186,15 +137,15 @@ def _check_content(file: Any, path: Path) -> None:
 
 
 SUM = "sum"
-"""Attribute of a dataset with its check sum as text."""
+"""Attribute of a dataset with its check sum."""
+
+STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
 TABLE = "written"
 """Group of a states file: a table with one row for each state that the file can hold.
 
 Datasets ``step`` (−1: not written), ``time`` and ``sums``; the attribute ``columns`` names the columns of
 ``sums``, and the attribute ``first`` is the number of the state in row 0."""
-
-STATE = re.compile(r"/?states/(\d+)/[^/]+")
 
 
 def check_sum(array: NDArray[Any]) -> int:
@@ -213,15 +164,22 @@ def check_sums(slabs: Iterable[NDArray[Any]], comm: MPI.Comm) -> NDArray[np.uint
 
 @contextmanager
 def open_stored(path: Path) -> Iterator[Any]:
-    """A context with a file open for reading, as `open_contained`.
+    """A context with an HDF5 file open for reading that contains all of its data.
+
+    Yields
+    ------
+    h5py.File
 
     Raises
     ------
     InputError
-        For any failure to read the file, also within the context.
+        If the file has links to other files or data in them, or for any failure to read it, also within the
+        context.
     """
+    check_file(path)
     try:
-        with open_contained(path) as file:
+        with import_h5py().File(path, "r") as file:
+            _check_content(file.id, path)
             yield file
     except LyraError:
         raise
@@ -255,23 +213,17 @@ def read_stored(
         if stored.dtype.kind not in kinds or not _shape_matches(stored.shape, shape):
             required = " × ".join("any" if n is None else str(n) for n in shape or ())
             raise InputError(
-                f"is damaged: {dataset.lstrip('/')} holds {stored.dtype} of shape {stored.shape}"
+                f"is damaged: {dataset} holds {stored.dtype} of shape {stored.shape}"
                 + (f", not numbers of shape {required}" if required else ""),
                 file=path,
             )
         array: NDArray[Any] = stored[()]
         expected = _expected_check_sum(file, stored, dataset)
-    if expected is not None and check_sum(array) != expected:
-        raise InputError(f"is damaged: the check sum of {dataset.lstrip('/')} does not fit", file=path)
+    if check_sum(array) != expected:
+        raise InputError(f"is damaged: the check sum of {dataset} does not fit", file=path)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise InputError(f"is damaged: {dataset.lstrip('/')} holds numbers that are not finite", file=path)
+        raise InputError(f"is damaged: {dataset} holds numbers that are not finite", file=path)
     return array
-
-
-def text_attribute(owner: Any, name: str) -> str:
-    """A text attribute, of fixed or (in older files) variable length."""
-    value = owner.attrs[name]
-    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _shape_matches(found: tuple[int, ...], shape: tuple[int | None, ...] | None) -> bool:
@@ -280,17 +232,48 @@ def _shape_matches(found: tuple[int, ...], shape: tuple[int | None, ...] | None)
     return len(found) == len(shape) and all(n in (None, m) for n, m in zip(shape, found, strict=True))
 
 
-def _expected_check_sum(file: Any, stored: Any, dataset: str) -> int | None:
-    """The stored check sum of a dataset; None if an older version wrote none."""
+def _expected_check_sum(file: Any, stored: Any, dataset: str) -> int:
+    """The stored check sum of a dataset: its attribute or, of a state's array, in the table."""
     if SUM in stored.attrs:
-        return int(text_attribute(stored, SUM))
-    state = STATE.fullmatch(dataset)
-    if state is None or TABLE not in file:
-        return None
+        return int(stored.attrs[SUM])
+    _, number, name = dataset.split("/")
     table = file[TABLE]
-    row = int(state[1]) - int(table.attrs["first"])
-    columns = [name for name, _ in json.loads(text_attribute(table, "columns"))]
-    return int(table["sums"][row, columns.index(dataset.rpartition("/")[2])])
+    columns = [column for column, _ in json.loads(table.attrs["columns"].decode())]
+    return int(table["sums"][int(number) - int(table.attrs["first"]), columns.index(name)])
+
+
+def state_files(folder: Path) -> list[Path]:
+    """The states files of a run's folder, ordered by number."""
+    numbered = [(STATE_FILE.fullmatch(path.name), path) for path in folder.iterdir()]
+    return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
+
+
+def states_of(path: Path) -> list[WrittenState]:
+    """The states that are written in a states file.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    with open_stored(path) as file:
+        table = file[TABLE]
+        first, columns = int(table.attrs["first"]), json.loads(table.attrs["columns"].decode())
+        group = file[group_name(first)]
+        fields = tuple(
+            StoredField(name, on, group[name].shape, group[name].dtype.name)
+            for name, on in columns
+            if name != "position"
+        )
+        rows = zip(table["step"][()].tolist(), table["time"][()].tolist(), strict=True)
+        states = [
+            WrittenState(first + i, step, time, path.name, fields)
+            for i, (step, time) in enumerate(rows)
+            if step >= 0
+        ]
+        if not all(math.isfinite(state.time) for state in states):
+            raise ValueError("a time is not finite")
+        return states
 
 
 class StoredMesh:
@@ -321,11 +304,8 @@ class StoredMesh:
         return self._indices("mesh/triangles", (None, 3), len(self.rest))
 
     @cached_property
-    def start(self) -> Array | None:
-        """(V, 3) start positions [m]; None if an older version wrote none."""
-        with open_stored(self.path) as file:
-            if "start" not in file:
-                return None
+    def start(self) -> Array:
+        """(V, 3) start positions [m]."""
         return read_stored(self.path, "start", (len(self.rest), 3), "f")
 
     @cached_property
@@ -353,7 +333,7 @@ class StoredMesh:
         """The groups by name; their dimension is not stored."""
         with open_stored(self.path) as file:
             stored = file.get("groups", {})
-            names = {number: text_attribute(group, "name") for number, group in stored.items()}
+            names = {number: group.attrs["name"].decode() for number, group in stored.items()}
             datasets = {f"groups/{number}/{array}" for number, group in stored.items() for array in group}
 
         def indices(dataset: str, width: tuple[int, ...], end: int) -> Ints:
@@ -377,7 +357,7 @@ class StoredMesh:
         """The surfaces at t = 0 of the obstacles that are meshes, by name."""
         with open_stored(self.path) as file:
             stored = file.get("obstacles", {})
-            names = {number: text_attribute(group, "name") for number, group in stored.items()}
+            names = {number: group.attrs["name"].decode() for number, group in stored.items()}
         surfaces = {}
         for number, name in names.items():
             points = read_stored(self.path, f"obstacles/{number}/points", (None, 3), "f")

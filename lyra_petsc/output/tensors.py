@@ -2,7 +2,7 @@
 
 They are plane tensors in material axes: u along the warp, v across it in the sheet, w normal to the sheet.
 States and arrays in Python have the order of XDMF's ``Tensor6``, uu, uv, uw, vv, vw, ww; VTK's order is
-uu, vv, ww, uv, vw, uw. Older run folders hold three components uu, vv, uv.
+uu, vv, ww, uv, vw, uw.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 TENSORS = frozenset({"green_strain", "stress", "curvature_tensor"})
 """Fields that are symmetric tensors."""
 
-COMPONENTS = {6: ("uu", "uv", "uw", "vv", "vw", "ww"), 3: ("uu", "vv", "uv")}
-"""Names of the components of tensors with six components and, in older folders, three."""
+COMPONENTS = ("uu", "uv", "uw", "vv", "vw", "ww")
+"""Names of the components."""
 
 _VTK_ORDER = [0, 3, 5, 1, 4, 2]
 VTK_COLUMNS = ((np.s_[0:5:4], np.s_[0:5:4]), (np.s_[1:3], np.s_[3:6:2]), (np.s_[3:6:2], np.s_[1:3]))
@@ -33,8 +33,8 @@ def six_components(plane: NDArray[Any]) -> NDArray[Any]:
 
 
 def plane_components(tensors: NDArray[Any]) -> NDArray[Any]:
-    """(n, 3) components uu, vv, uv of tensors with six components; three components stay unchanged."""
-    return tensors if tensors.shape[1] == 3 else np.ascontiguousarray(tensors[:, _IN_PLANE])
+    """(n, 3) components uu, vv, uv of plane tensors with six components."""
+    return np.ascontiguousarray(tensors[:, _IN_PLANE])
 
 
 def is_tensor(shape: tuple[int, ...]) -> bool:

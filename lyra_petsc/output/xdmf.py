@@ -197,7 +197,6 @@ class GrowingXdmf:
                 return
             with open_output(self.path, "r+b", buffering=0) as file:
                 os.pwrite(file.fileno(), text + SEAM, begin)
-                os.fdatasync(file.fileno())  # must be on disk before the write that makes it valid
                 os.pwrite(file.fileno(), b" " * len(SEAM), self._seam)
         except FileNotFoundError:
             raise

@@ -16,7 +16,7 @@ from launch import SCENE, command, done, environment, read_csv, read_json, write
 from patience import Patience
 
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.read_run import stored_states
 from lyra_petsc.scene.load import load_scene
 
 pytestmark = pytest.mark.quick

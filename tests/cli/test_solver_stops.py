@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from launch import DIRECT, SCENE, done, lyra, read_csv, read_json, write_scene
 
-from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.read_run import stored_states
 
 STIFF = SCENE.replace("end: 0.05, step: 0.01", "end: 0.4, step: 0.04").replace("every: 0.02", "every: 0.04")
 

@@ -10,8 +10,7 @@ import pytest
 from launch import DIRECT, REDUNDANT, Left, done, finish, read_csv, read_json, start, wait_until, write_scene
 from numpy.typing import NDArray
 
-from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.read_run import StoredRun, stored_states
 
 LONG = """\
 mesh: {grid: {width: 1.0, height: 1.0, nx: 6, ny: 6}}

@@ -5,8 +5,7 @@ import pytest
 from written_run import ENTRIES
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, checkpoint_file, read_checkpoint
-from lyra_petsc.output.hdf5 import write_collective
+from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, CheckpointWriter, read_checkpoint
 from lyra_petsc.output.ordering import FileOrder
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -19,11 +18,14 @@ def dealt(comm):
     return np.random.default_rng(5).permutation(N)[comm.rank :: comm.size]
 
 
-def write(comm, folder, factor=1.0, **scalars):
+def writer_of(comm, folder):
+    return CheckpointWriter(folder, FileOrder(comm, dealt(comm), N))
+
+
+def write(comm, folder, factor=1.0, writer=None, **scalars):
     mine = dealt(comm)
     arrays = {"position": factor * X[mine], "velocity": -factor * X[mine], "term.mark": 2.0 * X[mine]}
-    file = checkpoint_file(folder, FileOrder(comm, mine, N), arrays, {**ENTRIES, **scalars})
-    write_collective([file], comm)
+    (writer or writer_of(comm, folder)).write(arrays, {**ENTRIES, **scalars})
 
 
 def change(comm, work):
@@ -57,15 +59,18 @@ def test_checkpoints_are_read_with_another_partition(comm, shared_tmp):
     assert (found.file.name, found.note) == (CHECKPOINT, None)
 
 
-def test_the_newest_is_read_and_the_previous_one_is_kept(comm, shared_tmp):
-    for step in (1, 2, 3):
-        write(comm, shared_tmp, factor=step, step=step)
-    order = FileOrder(comm, dealt(comm), N)
-    assert read_checkpoint(shared_tmp, order).scalars["step"] == 3
+@pytest.mark.parametrize("notes", [[], ["x" * 3000]])
+def test_the_newest_is_read_and_the_previous_one_is_kept(comm, shared_tmp, notes):
+    """Also where the files of earlier ones are used again, if these have the same length."""
+    writer, order = writer_of(comm, shared_tmp), FileOrder(comm, dealt(comm), N)
+    for step in range(1, 7):
+        write(comm, shared_tmp, step, writer, step=step, notes=notes * step)
+        assert read_checkpoint(shared_tmp, order).scalars["step"] == step
+    assert sorted(path.name for path in shared_tmp.iterdir()) == [PREVIOUS, CHECKPOINT]
     change(comm, (shared_tmp / CHECKPOINT).unlink)
     found = read_checkpoint(shared_tmp, order)
-    assert found.scalars["step"] == 2
-    np.testing.assert_array_equal(found.arrays["position"], 2 * X[dealt(comm)])
+    assert found.scalars["step"] == 5
+    np.testing.assert_array_equal(found.arrays["position"], 5 * X[dealt(comm)])
 
 
 @pytest.mark.parametrize(

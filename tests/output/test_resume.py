@@ -19,9 +19,8 @@ from physics import CLOTH, direct_solver, grid, options, scene_of
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.output.read_run import StoredRun, stored_states
 from lyra_petsc.output.run_folder import FolderChoice
-from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.scene.schema import INTEGRATORS
 from lyra_petsc.show.obstacle_surfaces import run_obstacles
@@ -106,7 +105,7 @@ def summary(folder: Path) -> dict[str, Any]:
 def last(folder: Path) -> tuple[int, float]:
     """Step and time of the checkpoint."""
     with import_h5py().File(folder / "checkpoint.h5", "r") as file:
-        scalars = json.loads(file.attrs["scalars"])
+        scalars = json.loads(file["entries"][64:].tobytes())["scalars"]
     return scalars["step"], scalars["time"]
 
 

@@ -1,4 +1,4 @@
-"""The time series of states: files, announcement, resumption, older folders."""
+"""The time series of states: files, announcement, resumption."""
 
 import os
 import xml.etree.ElementTree as ElementTree
@@ -7,12 +7,13 @@ import meshio
 import numpy as np
 import pytest
 
-from lyra_petsc.errors import OutputError
+from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.output import hdf5, xdmf
+from lyra_petsc.output import xdmf
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateWriter, stored_states
+from lyra_petsc.output.read_run import stored_states
+from lyra_petsc.output.states import StateWriter
 from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.output.xdmf import XDMF_FILE
 
@@ -100,9 +101,7 @@ def on_first(comm, check):
         comm.Barrier()
 
 
-@pytest.mark.parametrize("one_machine", [True, False])
-def test_states_read_back_as_a_time_series(comm, shared_tmp, run, monkeypatch, one_machine):
-    monkeypatch.setattr("lyra_petsc.output.hdf5.on_one_machine", lambda comm: one_machine)
+def test_states_read_back_as_a_time_series(comm, shared_tmp, run):
     assert [run.write(step) for step in (0, 4, 9)] == [0, 1, 2]
 
     def check():
@@ -157,14 +156,12 @@ def test_vtk_reads_the_time_series(comm, shared_tmp, run):
 
 def test_an_incomplete_state_is_never_listed(comm, shared_tmp, run, monkeypatch):
     run.write(0)
-    write_rows = hdf5._write_rows
 
-    def write_and_fail(*arguments):
-        write_rows(*arguments)
+    def disk_full(self, *given):
         raise OSError(28, "disk full")
 
     with monkeypatch.context() as broken:
-        broken.setattr(hdf5, "_write_rows", write_and_fail)
+        broken.setattr(h5py.Dataset, "__setitem__", disk_full)
         with pytest.raises(OutputError, match=r"states-0000\.h5: cannot be written: No space left"):
             run.write(1)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0]))
@@ -205,38 +202,12 @@ def test_resume_skips_a_damaged_file(comm, shared_tmp, run):
     if comm.rank == 0:
         (shared_tmp / "states-0004.h5").write_bytes(b"")
     comm.Barrier()
+    with pytest.raises(InputError, match=r"states-0004\.h5: cannot be read, or is damaged"):
+        stored_states(shared_tmp)
+    comm.Barrier()
     assert Run(comm, shared_tmp, resume_after=9).writer._next == 10
+    assert [state.number for state in stored_states(shared_tmp)] == [0, 1, 2, 3, 8, 9]
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3, 0.8, 0.9]))
-
-
-def old_file(folder, number, step):
-    """A state in a file of its own, as written by older versions."""
-    with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
-        group = file.create_group(f"states/{number:06d}")
-        group.attrs.update({"time": 0.1 * step, "step": step})
-        for name, on, rows in (
-            ("position", "vertex", position(step)),
-            ("velocity", "vertex", -position(step)),
-            ("green_strain", "triangle", strain(step)),
-        ):
-            group[name] = rows
-            group[name].attrs["on"] = on
-
-
-def test_a_folder_of_an_older_version_is_resumed(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    on_first(comm, lambda: [old_file(shared_tmp, i, 3 * i) for i in range(4)])
-    resumed = Run(comm, shared_tmp, resume_after=6)
-    assert resumed.writer._next == 3
-    resumed.write(8)
-
-    def check():
-        assert_times(shared_tmp, [0.0, 0.3, 0.6, 0.8])
-        for step, (_, mesh) in zip((0, 3, 6, 8), announced(shared_tmp), strict=True):
-            np.testing.assert_array_equal(mesh.points, position(step))
-            np.testing.assert_array_equal(mesh.cell_data["green_strain"][0], strain(step))
-
-    on_first(comm, check)
 
 
 def test_the_number_of_files_stays_small_and_the_xdmf_file_grows_in_place(comm, shared_tmp, run, monkeypatch):

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from vtkhdf_reader import read
-from written_run import REST, TRIANGLES, position, ring, stress, velocity
+from written_run import REST, TRIANGLES, position, ring, tensor, velocity
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.output import states as states_module
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateWriter, stored_states
+from lyra_petsc.output.read_run import stored_states
+from lyra_petsc.output.states import StateWriter
+from lyra_petsc.output.tensors import in_vtk_order
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE
 
 pytestmark = pytest.mark.parallel(3)
@@ -35,7 +37,7 @@ class Writer:
             {
                 "velocity": ("vertex", velocity(i)[self.vertices]),
                 "rank": ("vertex", 0 * self.vertices + i),
-                "stress": ("triangle", stress(i)[self.triangles]),
+                "stress": ("triangle", tensor(i)[self.triangles]),
             }
             if fields
             else {},
@@ -59,7 +61,7 @@ def check(path, numbers):
         np.testing.assert_array_equal(arrays["vertex"]["rest"], REST)
         np.testing.assert_array_equal(arrays["vertex"]["velocity"], velocity(i))
         np.testing.assert_array_equal(arrays["vertex"]["rank"], i)
-        np.testing.assert_array_equal(arrays["triangle"]["stress"], stress(i))
+        np.testing.assert_array_equal(arrays["triangle"]["stress"], in_vtk_order(tensor(i)))
 
 
 def on_rank_0(comm, work):

@@ -53,7 +53,7 @@ PLACES = {
     "assembly": ("linear.discretisation", "BlockPattern", 0),
     "residual": ("stepping.stage_equations", "StageEquations.residual", 25),
     "jacobian": ("stepping.stage_equations", "StageEquations.jacobian", 9),
-    "writing a state": ("output.hdf5", "write_slabs", 3),
+    "writing a state": ("output.states", "write_rows", 3),
     "a row of the history": ("output.recorder", "Recorder._write_row", 4),
 }
 

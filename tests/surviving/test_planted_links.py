@@ -158,6 +158,7 @@ def test_the_usual_folder_of_a_scene_is_no_link(stranger: Path, own: Path) -> No
 
 OPENS = {
     "output/file_operations.py": "opens",
+    "output/hdf5.py": "a file that was opened there before",
     "scene/json_schema.py": "the user's cache",
     "mesh/library_file.py": "a temporary folder",
     "mesh/library_process.py": "an open file",

@@ -11,7 +11,7 @@ from launch import UNHURRIED, done, finish, lyra, start, wait_until, write_scene
 from leftovers import ENDLESS, SHEET, announced, wait_for_states
 from patience import Patience
 
-from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.read_run import stored_states
 
 SLOW_SET_UP = """
 import sys, time

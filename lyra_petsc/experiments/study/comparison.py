@@ -25,9 +25,8 @@ from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, StudyQuantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.file_operations import on_every_rank
-from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
-from lyra_petsc.output.states import stored_states
-from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
+from lyra_petsc.output.read_run import ENERGIES, Columns, read_table, stored_states
+from lyra_petsc.output.stored import StoredMesh, open_stored
 from lyra_petsc.parallel import on_root
 
 ROWS_AT_ONCE = 1 << 16
@@ -190,11 +189,7 @@ def read_samples(
 
 def read_local(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
     """As ``read_samples``, on one rank only."""
-    if folder.is_dir():
-        check_folder(folder)
-    states = stored_states(folder) if folder.is_dir() else []
-    if not states:
-        raise InputError("holds no states of a run", file=folder)
+    states = stored_states(folder)
     at = np.array([state.time for state in states])
     files = []
     for time in times:

@@ -173,7 +173,7 @@ def quantity(run: StoredRun, name: str) -> ColourQuantity:
             key="--field",
         )
     principal = name in TENSORS
-    reduce = _largest_principal if principal else _magnitude
+    reduce = (lambda rows: _largest_principal(plane_components(rows))) if principal else _magnitude
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
     on_triangles = run.field_on(name) == "triangle"
     values: Callable[[int], Array] = lambda i: reduce(np.asarray(run.field(name)[i]))  # noqa: E731
@@ -238,8 +238,8 @@ def _edges(corners: Array) -> Array:
 
 
 def _largest_principal(symmetric: Array) -> Array:
-    """(F,) larger in-plane eigenvalue of tensors uu, vv, uv (F, 3), or with six components (F, 6)."""
-    uu, vv, uv = plane_components(symmetric).T
+    """(F,) larger in-plane eigenvalue of tensors uu, vv, uv (F, 3)."""
+    uu, vv, uv = symmetric.T
     return (uu + vv) / 2.0 + np.hypot((uu - vv) / 2.0, uv)
 
 

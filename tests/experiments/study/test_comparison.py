@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -28,6 +27,9 @@ from lyra_petsc.experiments.study.comparison import (
 from lyra_petsc.experiments.study.plan import ENERGY, POSITION, probe_quantity
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.states import StateWriter
 
 pytest.importorskip("scipy")
 
@@ -45,14 +47,11 @@ def write_run(
 ) -> None:
     """Write the files of a run that a comparison reads."""
     folder.mkdir()
-    with h5py.File(folder / "mesh.h5", "w") as file:
-        file["mesh/rest"], file["mesh/triangles"] = mesh.rest, mesh.triangles
-        file["mesh/corner_uv"] = mesh.triangle_uv
+    write_mesh(folder, mesh, MPI.COMM_SELF)
+    order = FileOrder(MPI.COMM_SELF, np.arange(mesh.n_vertices), mesh.n_vertices)
+    writer = StateWriter(folder, order, n_triangles=mesh.n_triangles)
     for number, (time, x) in enumerate(zip(TIME_KEYS, states, strict=True)):
-        with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
-            file[f"states/{number:06d}/position"] = x
-            file[f"states/{number:06d}"].attrs["time"] = time
-            file[f"states/{number:06d}"].attrs["step"] = number
+        writer.write(number, time, x, {})
     names = "kinetic_energy,membrane_energy,bending_energy,potential_energy"
     rows = [f"{n},{TIME_KEYS[n]!r},{','.join(map(repr, row))}" for n, row in enumerate(energies)]
     (folder / "history.csv").write_text("\n".join([f"step,time,{names}", *rows]) + "\n")
@@ -194,7 +193,7 @@ def test_different_meshes_are_recognised(tmp_path: Path) -> None:
 def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:
     with pytest.raises(InputError, match=r"no state at t = 0.05 s, .* output.every = 0.05"):
         read_local(pair[0], [0.0, 0.05, 0.1], 0.05)
-    with pytest.raises(InputError, match="holds no states"):
+    with pytest.raises(InputError, match="no such folder"):
         read_local(pair[0] / "nowhere", TIME_KEYS, 0.1)
     (pair[0] / "mesh.h5").write_bytes(b"no HDF5")
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):

@@ -8,7 +8,7 @@ from written_run import (
     TRIANGLES,
     position,
     scene,
-    stress,
+    tensor,
     velocity,
     written,
     written_with_obstacles,
@@ -130,7 +130,7 @@ def test_usd(tmp_path, vt):
         np.testing.assert_array_equal(mesh.GetPointsAttr().Get(state), single(position(state)))
         np.testing.assert_array_equal(mesh.GetVelocitiesAttr().Get(state), single(velocity(state)))
         found = primvars.GetPrimvar("stress")
-        np.testing.assert_array_equal(found.Get(state), single(stress(state)))
+        np.testing.assert_array_equal(found.Get(state), single(tensor(state)).ravel())
         assert found.GetInterpolation() == "uniform"
         low, high = mesh.GetExtentAttr().Get(state)
         np.testing.assert_array_equal([low, high], single([position(state).min(0), position(state).max(0)]))
@@ -154,7 +154,7 @@ def test_npz(tmp_path, vt):
     np.testing.assert_array_equal(found["time"], StoredRun(tmp_path / "run").times)
     np.testing.assert_array_equal(found["position"], [position(i) for i in range(4)])
     np.testing.assert_array_equal(found["velocity"], [velocity(i) for i in range(4)])
-    np.testing.assert_array_equal(found["stress"], [stress(i) for i in range(4)])
+    np.testing.assert_array_equal(found["stress"], [tensor(i) for i in range(4)])
     np.testing.assert_array_equal(found["triangles"], TRIANGLES)
     np.testing.assert_array_equal(found["rest"], REST)
     expected = {"none": None, "each vertex": "uv", "seam": "corner_uv"}[vt]
