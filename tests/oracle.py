@@ -25,6 +25,7 @@ from lyra_petsc.terms.bending.midedge_shape import (
 )
 from lyra_petsc.terms.loads.wind import Wind
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.stretch_limit import StretchLimit
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 
 Ints = NDArray[np.int64] | NDArray[np.int32]
@@ -246,6 +247,34 @@ def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
     return out
 
 
+def stretch_limit_blocks(term: StretchLimit, x: Array) -> Array:
+    """Element Hessians (E, 3, 3, 3, 3), from the eigenvectors of the Hessian with respect to F."""
+    out, data = np.zeros((term.n_elements, 3, 3, 3, 3)), term.elements.data
+    for e, corners in enumerate(term.stencil):
+        inverse, limit, scale = data["inverse"][e], data["limit"][e], data["area"][e] * data["stiffness"][e]
+        gradients = np.vstack([-inverse.sum(axis=0), inverse])
+        n, stretch, m = np.linalg.svd(x[corners].T @ gradients)
+        width = 0.5 * (limit - 1.0)
+        t = np.minimum((limit - stretch) / width, 1.0)
+        p, q = scale * width * (t**-2 - 3.0 + 2.0 * t), 2.0 * scale * (t**-3 - 1.0)
+
+        def outer(i: int, k: int, n: Array = n, m: Array = m) -> Array:
+            return np.outer(n[:, i], m[k])
+
+        modes = [
+            (q[0], outer(0, 0)),
+            (q[1], outer(1, 1)),
+            ((p[0] - p[1]) / (stretch[0] - stretch[1]), (outer(0, 1) + outer(1, 0)) / np.sqrt(2.0)),
+            ((p[0] + p[1]) / stretch.sum(), (outer(0, 1) - outer(1, 0)) / np.sqrt(2.0)),
+            (p[0] / stretch[0], outer(2, 0)),
+            (p[1] / stretch[1], outer(2, 1)),
+        ]
+        for value, mode in modes:
+            forces = gradients @ mode.T
+            out[e] += value * np.einsum("ai,bj->abij", forces, forces)
+    return out
+
+
 def blocks_of(
     term: Elastic | Viscous,
     at: Array,
@@ -258,6 +287,8 @@ def blocks_of(
         return membrane_blocks(term, at, blend, predicted)
     if isinstance(term, Bending):
         return bending_blocks(term, at, blend)
+    if isinstance(term, StretchLimit):
+        return stretch_limit_blocks(term, at)
     if isinstance(term, Wind):
         return wind_blocks(term, at, frozen)
     assert isinstance(term, Elastic)

@@ -34,13 +34,10 @@ from lyra_petsc.mesh.symmetry import symmetry_walls
 from lyra_petsc.mesh.topology import connected_pieces, edge_table
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
-from lyra_petsc.terms.protocols import LimitsStep
+from lyra_petsc.terms.protocols import KEPT_FRACTION, LimitsStep
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Offsets, UpcomingStep
-
-KEPT_FRACTION = 0.2
-"""Part of its distance less offset, or of the gap if less, which a pair keeps in a Newton iteration."""
 
 TARGET_FRACTION = 0.7
 """Part of the gap at which pairs that become active in a Newton iteration shall be after it."""
@@ -427,6 +424,9 @@ class ContactBarrier(LimitsStep):
 
     def acts(self, x: Array, frozen: ObstaclePositions) -> bool:
         return bool(self.active_elements(x, frozen).any())
+
+    def overrun(self, x: Array, frozen: ObstaclePositions) -> tuple[float, str]:
+        return 0.0, ""
 
     def active_elements(self, x: Array, frozen: ObstaclePositions) -> NDArray[np.bool_]:
         """Which pairs (E,) have a non-zero Hessian at positions x (n_local, 3), springs included."""

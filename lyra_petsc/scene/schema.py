@@ -55,6 +55,7 @@ from lyra_petsc.scene.values import (
     Seed,
     Share,
     StepLength,
+    StretchRatio,
     Text,
     Until,
     UvScale,
@@ -402,6 +403,9 @@ class Material(Block):
         Force per width of internal friction against shear, half of 2HG. Scaled as membrane.
     kes : KesReport or None
         Numbers of a KES report, instead of bending, c33, friction_moment and friction_force.
+    stretch_limit : float or None
+        Largest ratio of a length in the sheet to that at rest, in every direction, which no step exceeds:
+        1.05 lets it stretch by up to 5 %. From half of that on the sheet resists more and more.
     """
 
     conditional_defaults = frozenset({"bending_model"})
@@ -426,6 +430,7 @@ class Material(Block):
     friction_moment: Pair | None = None
     friction_force: NonNegative | None = None
     kes: KesReport | None = None
+    stretch_limit: StretchRatio | None = None
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:

@@ -459,6 +459,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     for term in system.active.stateful:
         term.initialise(system.x)
     system.hold_targets(0.0)
+    refuse_overrun(system, scene, "at the start")
     refuse_contact(system, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)
     probes = {name: _owned_vertices(part, f"probe {name}") for name in scene.probes}
     return Problem(
@@ -474,6 +475,21 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         data.get("tag"),
         system.x[rows].copy() if "displacement" in scene.output.fields else None,
     )
+
+
+def refuse_overrun(system: StageEquations, scene: Scene, when: str) -> None:
+    """Refuse a state, described by ``when``, that is beyond the limit of a term; collective.
+
+    Raises
+    ------
+    InputError
+        Names the worst element.
+    """
+    frozen = system.active.frozen
+    worst = max((term.overrun(system.x, frozen[term]) for term in system.active.limiting), default=(0.0, ""))
+    _, text = max(system.points.comm.allgather(worst))
+    if text:
+        raise InputError(f"{when} {text}; raise it, or change the start", file=scene.source, key="material")
 
 
 def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: float = 0.0) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.stepping import term_states
-from lyra_petsc.stepping.problem import refuse_contact
+from lyra_petsc.stepping.problem import refuse_contact, refuse_overrun
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.simulation import SteppedScene
@@ -66,6 +66,7 @@ def resume(
     # loads and handles that only the changed scene starts earlier start now; the others have started
     system.set_references(run.time)
     system.hold_targets(run.time)
+    refuse_overrun(system, run.scene, f"at {run.time_text()}")
     refuse_contact(system, run.scene, f"at {run.time_text()}")
     run.energy_balance.restore(arrays, scalars["budget"])
     run.control.restore(scalars)

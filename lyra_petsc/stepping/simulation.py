@@ -234,7 +234,8 @@ class SteppedScene:
         self.last_integrator = system.integrator
         if system.integrator is system.in_contact is not system.usual and system.usual.iterates:
             name = system.in_contact.name
-            self.run_notes.once("in contact", f"{name} takes the steps in which something touches")
+            note = f"{name} takes the steps in which something touches or nears a limit"
+            self.run_notes.once("in contact", note)
         if self.accuracy is not None:
             self.accuracy.record_step(v_owned, dt, self.step_number, self.time, self.run_notes)
         system.follow_step(v_owned)

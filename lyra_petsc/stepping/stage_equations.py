@@ -98,6 +98,8 @@ class StageEquations:
         Whether the edges' unknowns are being solved for at the end of the step.
     usual, in_contact : Integrator
         The scene's integrator, and the one that takes the steps in which something touches.
+    nears_limit : bool
+        Whether a term that limits steps acts at the positions of the state; contact is apart.
     has_active_pairs : bool
         Whether any pair of a term with changing stencils acted when the block rows were last renewed.
     prescribed_force : (n_owned, 3) or None
@@ -124,7 +126,9 @@ class StageEquations:
         self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
         self.active = active = ActiveTerms(terms)
         self.contact = contact
-        self.usual, self.in_contact = integrator, integrator.for_contact() if contact else integrator
+        self.usual = self.in_contact = integrator
+        if contact is not None or active.limiting:
+            self.in_contact = integrator.for_contact()
         discretisation.when_ghosts_change(self._follow_ghosts)
         self.held = held
         following = [term.reference_rows for term in terms if isinstance(term, FollowsHandles)]
@@ -181,6 +185,7 @@ class StageEquations:
         self.update_stencils(self.x)  # energies at the start of a run need all stencils
         if self.contact is not None:
             self.contact.initialise(self.x, self.active.frozen)
+        self.nears_limit = self.limits_act(self.x)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -303,7 +308,10 @@ class StageEquations:
         if not self.evaluates_iterates and not self.active.moving:
             # the stage is at the end, and the next step is linearised there
             self.evaluated = self.state.evaluation = Evaluation(self.x, solution.v)
-        if not self.integrator.dynamic or self.contact is None:
+        if not self.integrator.dynamic:
+            return
+        self.nears_limit = self.limits_act(self.x)
+        if self.contact is None:
             return
         if self.stage.offset < self.dt:  # pairs that come near between the stage and the end
             self.update_stencils(self.evaluated.x, self.x - self.evaluated.x)
@@ -341,8 +349,8 @@ class StageEquations:
 
     @property
     def touches(self) -> bool:
-        """Whether anything touches at the positions of the state."""
-        return self.contact is not None and self.contact.touches
+        """Whether anything touches, or a term acts that limits steps, at the positions of the state."""
+        return self.nears_limit or (self.contact is not None and self.contact.touches)
 
     @property
     def suits_contact(self) -> bool:
@@ -351,7 +359,11 @@ class StageEquations:
 
     @property
     def touches_at_stage(self) -> bool:
-        """Whether anything touches at the stage of the step just accepted; collective."""
+        """Whether anything touches, or a term acts that limits steps, at the stage of the step just accepted,
+        or its end is beyond such a limit; collective.
+        """
+        if self.limits_act(self.evaluated.x) or not self.is_within_limits(self.x):
+            return True
         return self.contact is not None and self.contact.is_touching(self.evaluated.x, self.active.frozen)
 
     def resolves_contact(self) -> bool:
@@ -756,9 +768,10 @@ class StageEquations:
 
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
-        """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
-        fixed = [term for term in self.active.elastic if not term.registration.of_contact]
-        return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}
+        """Force over displacement [N/m] of the owned elements of each term for which it is constant."""
+        active = self.active
+        constant = [t for t in active.elastic if not (t.registration.of_contact or t in active.limiting)]
+        return {term: term.force_scale(1.0)[: term.n_owned] for term in constant}
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
@@ -777,6 +790,19 @@ class StageEquations:
         fixed, every = numbers.astype(np.int64)
         pairs = self.contact.summary(self.evaluated.x, self.active.frozen)
         return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({pairs})"]
+
+    def limits_act(self, x: Array) -> bool:
+        """Whether any term that limits steps acts at positions x (n_local, 3): its forces change too abruptly
+        for one linear solve; collective.
+        """
+        terms, frozen = self.active.limiting, self.active.frozen
+        return bool(terms) and any(self.points.global_max(any(term.acts(x, frozen[term]) for term in terms)))
+
+    def is_within_limits(self, x: Array) -> bool:
+        """Whether positions x (n_local, 3) are within the limits of all terms; collective."""
+        terms, frozen = self.active.limiting, self.active.frozen
+        beyond = any(term.overrun(x, frozen[term])[1] for term in terms)
+        return not terms or not any(self.points.global_max(beyond))
 
     def update_pattern(self) -> bool:
         """Update the pattern of the block rows to the pairs that act at the positions last evaluated.

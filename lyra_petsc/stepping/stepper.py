@@ -35,7 +35,7 @@ from lyra_petsc.stepping.newton.conditioning import expected_iterations
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
-from lyra_petsc.stepping.newton.initial_guess import first_guess
+from lyra_petsc.stepping.newton.initial_guess import first_guess, has_start
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
@@ -77,6 +77,9 @@ FIRST_DT_FRACTION = 1e-3
 
 MAX_SOLVES = 8
 """Largest number of solves of a step in which friction takes the contacts that the one before has found."""
+
+BEYOND_LIMIT = "the handles would stretch the sheet beyond material.stretch_limit"
+"""Message of an attempt whose prescribed motion leaves no start within the limits of all terms."""
 
 WOULD_CROSS = "something would pass through the sheet"
 """Message of an attempt whose step would lead through a contact."""
@@ -327,10 +330,11 @@ class Stepper:
         before = system.x[: self._shape[0]].copy() if system.solves_edges_at_end else None
         rate_before = system.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        if not system.find_start():
+        blocked = WOULD_CROSS if not system.find_start() else BEYOND_LIMIT if not has_start(system) else ""
+        if blocked:
             self._trace.begin_solve()
             failed = self._trace.failed_solve(system.stationary_velocity())
-            return Attempt(False, 0, 0, math.inf, message=WOULD_CROSS, failed_solve=failed)
+            return Attempt(False, 0, 0, math.inf, message=blocked, failed_solve=failed)
         n = self._shape[0]
         solution, message = self._solve(t0)
         newton = linear = 0

@@ -17,6 +17,10 @@ LARGEST_ROTATION = 1.0
 """Largest angle [rad] by which a Newton iteration may rotate a director relative to its triangles."""
 
 
+KEPT_FRACTION = 0.2
+"""Part of the distance to a limit, in contact of at most the gap, that a Newton iteration keeps."""
+
+
 class Place(Enum):
     """Where numbers of a term's state belong to."""
 
@@ -88,6 +92,12 @@ class LimitsStep(Elastic):
     @abstractmethod
     def acts(self, x: Array, frozen: Any) -> bool:
         """Whether any element of this rank has an energy at positions x (n_local, 3)."""
+
+    @abstractmethod
+    def overrun(self, x: Array, frozen: Any) -> tuple[float, str]:
+        """How far this rank's worst element is beyond the limit at positions x (n_local, 3), and a text that
+        says so; 0 and no text within the limit.
+        """
 
 
 class FollowsHandles(Elastic):

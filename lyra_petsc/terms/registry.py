@@ -7,6 +7,7 @@ the rank's part). A module is imported, hence its kernels compiled, only when a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -138,6 +139,12 @@ REGISTRY: list[Registration] = [
     Registration(
         "shear_friction",
         lambda scene, shells: any(shell.friction_force > 0.0 for shell in shells),
+        Role.ELASTIC,
+        "membrane_energy",
+    ),
+    Registration(
+        "stretch_limit",
+        lambda scene, shells: any(shell.stretch_limit < math.inf for shell in shells),
         Role.ELASTIC,
         "membrane_energy",
     ),

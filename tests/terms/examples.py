@@ -19,6 +19,7 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "bending": {},
     "midedge": {"material": BENDING | {"bending_model": "midedge"}},
     "midedge_friction": {"material": BENDING | {"friction_moment": [3.0e-3, 1.0e-3]}},
+    "stretch_limit": {"material": BENDING | {"stretch_limit": 1.8}},
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},

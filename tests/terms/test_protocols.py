@@ -160,6 +160,10 @@ def test_no_step_passes_a_limit(name: str, tmp_path: Path) -> None:
         assert isinstance(term, LimitsStep)
         frozen, dx = frozen_by(term, simulation.system), 3.0 * x
         assert not term.acts(x, frozen)
+        assert term.overrun(x, frozen) == (0.0, "")
+        excess, text = term.overrun(x + dx, frozen)
+        assert excess > 0.0
+        assert text
         assert np.isinf(term.energies(x + dx, frozen)).any()
         fraction = term.largest_step(x, dx, frozen)
         assert 0.0 < fraction < 1.0
@@ -219,6 +223,9 @@ class IdleLimit(Idle, LimitsStep):
         self.calls.add("acts")
         return False
 
+    def overrun(self, x: Array, frozen: Any) -> tuple[float, str]:
+        return 0.0, ""
+
 
 class IdleState(Idle, Stateful):
     """The same with a state of vertices, edges and elements by which each can be told from the others."""
@@ -254,7 +261,7 @@ class IdleState(Idle, Stateful):
 
 INTERFACES: dict[str, tuple[type[Idle], set[str]]] = {
     "MovingTargets": (IdleTargets, {"freeze"}),
-    "LimitsStep": (IdleLimit, set()),
+    "LimitsStep": (IdleLimit, {"acts"}),
     "Stateful": (IdleState, {"accept"}),
 }
 """A term with each interface, and the methods that the program must call with every integrator."""

@@ -23,7 +23,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
-from lyra_petsc.terms.protocols import Dissipates
+from lyra_petsc.terms.protocols import Dissipates, LimitsStep
 from lyra_petsc.terms.registry import needed_terms
 
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
@@ -95,11 +95,11 @@ class Model:
         self.mesh: Mesh | None = None
         self.shape: Array | None = None
         self.runs = 0
-        # there are no tangents for friction within the fabric or terms with changing stencils
+        # there are no tangents for friction, limits of a step, or changing stencils
         shells = [resolve_material(block, file=scene.source)[0] for block in scene.material]
         entries = needed_terms(scene, shells)
         self._needs_differences = any(
-            entry.of_contact or issubclass(entry.kind, Dissipates) for entry in entries
+            entry.of_contact or issubclass(entry.kind, (Dissipates, LimitsStep)) for entry in entries
         )
 
         def check_vertices() -> None:

@@ -83,6 +83,8 @@ class ShellMaterial:
         Moment [N m/m] of internal friction against bending of warp and weft.
     friction_force : float
         Force [N/m] of internal friction against shear.
+    stretch_limit : float
+        Upper bound of the principal stretches; infinite without a limit.
     """
 
     density: float
@@ -102,6 +104,7 @@ class ShellMaterial:
     plate: Plate = (0.0, 0.0, 0.0, 0.0)
     friction_moment: tuple[float, float] = (0.0, 0.0)
     friction_force: float = 0.0
+    stretch_limit: float = math.inf
 
     @property
     def plate_matrix(self) -> tuple[Triple, Triple, Triple]:
@@ -235,6 +238,8 @@ def resolve_material(
         if strain > 1.0:
             notes.append(f"{key}.law: strains up to {strain:g}; if they are percent, give fractions")
     shell = _scaled(_with_friction(shell, material), material)
+    if material.stretch_limit is not None:
+        shell = replace(shell, stretch_limit=material.stretch_limit)
     if max(shell.friction_moment) > 0.0 and not shell.bends_with(shell.model):
         raise InputError(
             "friction needs a bending stiffness; give bending, too",

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
-from lyra_petsc.stepping.newton.roundoff import contact_roundoff
+from lyra_petsc.stepping.newton.roundoff import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Reason = PETSc.SNES.ConvergedReason
@@ -169,9 +169,9 @@ class Convergence:
         return None
 
     def _raise_floor(self) -> None:
-        """Include the round-off of contact at the positions last evaluated in the floor; collective."""
-        if self._system.near:
-            self._floor = max(self._minimum_floor, contact_roundoff(self._system))
+        """Include the round-off of limits at the positions last evaluated in the floor; collective."""
+        if self._system.near or self._system.active.limiting:
+            self._floor = max(self._minimum_floor, limit_roundoff(self._system))
 
     def _needs_finer_solve(self, tolerance: float) -> bool:
         """Whether a solve that meets the tolerances needs one more iteration because parts may collide.

@@ -36,10 +36,27 @@ def first_guess(system: StageEquations, out: Array) -> bool:
     if system.limits_steps:
         fraction = system.largest_step(still, moving - still)
         moving = moving if fraction == 1.0 else still + fraction * (moving - still)
-    if integrator.order > 1 and system.contact is None:
+    if integrator.order > 1 and system.contact is None and not system.active.limiting:
         out[:] = moving
         return False
     energies = [system.objective(system.evaluate(each))[0] for each in (still, moving)]
     use_still = energies[0] < energies[1]
     out[:] = still if use_still else moving
+    return False
+
+
+def has_start(system: StageEquations) -> bool:
+    """Whether one of the first guesses of a solve is within the limits of all terms; collective."""
+    n, integrator = system.points.n_owned, system.integrator
+    if not (system.active.limiting and integrator.iterates):  # one linear solve starts from the state
+        return True
+    guesses = [system.start_velocity()]
+    if isinstance(integrator, Static):
+        guesses += [] if integrator.predicted is None else [integrator.predicted / integrator.pseudo_dt]
+    else:
+        guesses.append(system.v[:n].copy())
+    for guess in guesses:
+        system.prescribe(guess)
+        if system.is_within_limits(system.evaluate(guess).x):
+            return True
     return False

@@ -20,14 +20,16 @@ def residual_roundoff(system: StageEquations, size: float) -> float:
     return _norm(system, vertex_scales(system, size))
 
 
-def contact_roundoff(system: StageEquations) -> float:
-    """The same for contact at the positions last evaluated; its stiffness grows without bound; collective."""
+def limit_roundoff(system: StageEquations) -> float:
+    """The same for terms that limit steps, at the positions last evaluated: their stiffness grows without
+    bound; collective.
+    """
     points, x = system.points, system.evaluated.x
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
-    if system.contact is not None:
-        term = system.contact.barrier
+    contact = [] if system.contact is None else [system.contact.barrier]
+    for term in (*contact, *system.active.limiting):
         amount = term.stiffness(x, system.active.frozen[term]) * term.coordinate_scale(size)
-        scale += np.bincount(term.stencil.ravel(), np.repeat(amount, 4), points.n_local)
+        scale += np.bincount(term.stencil.ravel(), np.repeat(amount, term.stencil.shape[1]), points.n_local)
     return _norm(system, scale[: points.n_owned])
 
 

@@ -30,6 +30,7 @@ from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
+from lyra_petsc.stepping.newton.roundoff import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.buckled_shape import BuckledShape
 from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
@@ -554,7 +555,7 @@ class Equilibrium:
         """
         if force <= self._tolerances.force_tolerance * self._largest_force():
             return True
-        return PROGRESS * last <= force <= self._floor
+        return PROGRESS * last <= force <= max(self._floor, limit_roundoff(self._system))
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))

@@ -50,7 +50,7 @@ class WholeStiffness:
         Returns None, with the state restored, if Newton's method fails or the equilibrium is unstable.
         """
         system, n = self._system, self._system.points.n_owned
-        if system.active.viscous or system.contact is not None:
+        if system.active.viscous or system.active.limiting or system.contact is not None:
             return None
         x = system.x[:n].copy()
         system.begin_step(before, factor)
