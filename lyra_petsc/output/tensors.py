@@ -18,9 +18,8 @@ TENSORS = frozenset({"green_strain", "stress", "curvature_tensor"})
 COMPONENTS = ("uu", "uv", "uw", "vv", "vw", "ww")
 """Names of the components."""
 
-_VTK_ORDER = [0, 3, 5, 1, 4, 2]
 VTK_COLUMNS = ((np.s_[0:5:4], np.s_[0:5:4]), (np.s_[1:3], np.s_[3:6:2]), (np.s_[3:6:2], np.s_[1:3]))
-"""The same permutation as pairs of ascending slices of columns, VTK's and XDMF's."""
+"""Pairs of ascending slices of columns in VTK's and XDMF's order."""
 
 _IN_PLANE = [0, 3, 1]
 
@@ -40,8 +39,3 @@ def plane_components(tensors: NDArray[Any]) -> NDArray[Any]:
 def is_tensor(shape: tuple[int, ...]) -> bool:
     """Whether an array of this shape holds tensors of six components."""
     return len(shape) == 2 and shape[1] == 6
-
-
-def in_vtk_order(rows: NDArray[Any]) -> NDArray[Any]:
-    """Tensors of six components in VTK's order; other arrays unchanged."""
-    return np.ascontiguousarray(rows[:, _VTK_ORDER]) if is_tensor(rows.shape) else rows

@@ -9,7 +9,7 @@ import pytest
 from written_run import TRIANGLES, stress, tensor, written
 
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.tensors import in_vtk_order, plane_components, six_components
+from lyra_petsc.output.tensors import plane_components, six_components
 from lyra_petsc.output.xdmf import XDMF_FILE
 from lyra_petsc.show.export import export_run
 
@@ -17,7 +17,6 @@ NUMBERED = np.arange(6.0)[None]
 
 
 def test_orders_of_components() -> None:
-    np.testing.assert_array_equal(in_vtk_order(NUMBERED), [[0, 3, 5, 1, 4, 2]])
     np.testing.assert_array_equal(six_components(np.array([[1.0, 2.0, 3.0]])), [[1, 3, 0, 2, 0, 0]])
     np.testing.assert_array_equal(plane_components(NUMBERED), [[0, 3, 1]])
 

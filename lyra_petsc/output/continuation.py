@@ -1,0 +1,158 @@
+"""Continuing a run from a checkpoint: restoring the simulation, and what the scene has changed since."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.checkpoint import Checkpoint, TermArrays
+from lyra_petsc.output.file_operations import reason
+from lyra_petsc.output.hdf5 import read_slab
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.stored import open_stored, read_stored
+from lyra_petsc.output.xdmf import group_name
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.dump import Change, obstacle_motions, scene_changes
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping import term_states
+from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.handles.motion import Motion
+
+MAX_LISTED_CHANGES = 12
+"""Maximum number of a resumed scene's changes that are listed one by one."""
+
+
+def used_groups(scene: Scene) -> set[str]:
+    """Names of the mesh's groups that a scene uses."""
+    selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
+    names = {block.group for block in scene.material} | {selector.group for selector in selectors}
+    return {name for name in names if name is not None}
+
+
+def term_arrays(simulation: SteppedScene) -> TermArrays:
+    """The arrays of the scene's terms in checkpoints; collective."""
+    system, terms = simulation.problem.system, simulation.problem.terms
+    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(system).items()}
+    elements = {name: (terms[name].stencil.shape[1], n) for name, n in widths.items()}
+    vertices, edges = term_states.vertex_arrays(system), term_states.edge_arrays(system)
+    return TermArrays(vertices.keys(), edges.keys(), elements)
+
+
+def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
+    """Restore a simulation from a checkpoint; collective.
+
+    Raises
+    ------
+    InputError
+        On every rank, if the scene cannot continue from the checkpoint, or another program has written it.
+    """
+    try:
+        before, now = checkpoint.scalars["scheme"], simulation.scene.time.scheme
+        if "static" in (now, before) and now != before:
+            raise InputError(
+                "a motion does not go on as a static analysis, nor the other way round: run without --resume",
+                file=checkpoint.file,
+                key="time.analysis",
+            )
+        _restore(simulation, checkpoint, vertices)
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(
+            f"does not hold what this program writes ({reason(error)}): run without --resume",
+            file=checkpoint.file,
+        ) from error
+    on_root(vertices.comm, lambda: _refuse_crossings(simulation, checkpoint.file))
+
+
+def _restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
+    scalars, terms = checkpoint.scalars, simulation.problem.terms
+    system, layout = simulation.problem.system, simulation.problem.points
+    arrays = {
+        name: layout.join(values, checkpoint.edges.get(name)) for name, values in checkpoint.arrays.items()
+    }
+    for number, start in enumerate(scalars["late_starts"]):
+        system.reference.restore(float(start), arrays[f"start_{number}"])
+    system.state.set(arrays["position"], arrays["velocity"])
+    own = layout.start + np.arange(layout.n_vertices)
+
+    def changing_elements(n: int, rows: Array) -> tuple[Ints, Array]:
+        """Global numbers (E, n) of vertices, which the first columns give as in the file; other columns."""
+        numbers = rows[:, :n].astype(np.int64)
+        return vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
+
+    elements = {
+        name: changing_elements(terms[name].stencil.shape[1], rows)
+        for name, rows in checkpoint.elements.items()
+    }
+    simulation.resume(arrays, scalars, checkpoint.edges, elements)
+
+
+def _refuse_crossings(simulation: SteppedScene, checkpoint: Path) -> None:
+    """Refuse a scene that is changed so that sheets cross each other or obstacles now (rank 0)."""
+    scene, mesh = simulation.scene, simulation.problem.mesh
+    if scene.contact is None or mesh is None:
+        return
+    from lyra_petsc.contact.overlaps import refuse_crossings  # with kernels
+    from lyra_petsc.mesh.obstacles import build_obstacles
+
+    with open_stored(checkpoint) as file:
+        positions = file["vertices/position"][()]
+    obstacles = build_obstacles(scene, mesh.obstacles, Motion)
+    refuse_crossings(scene, mesh, positions, obstacles, simulation.time, f"at {simulation.time_text()}")
+
+
+def first_positions(folder: Path, order: FileOrder, *, otherwise: Array) -> Array:
+    """Positions [m] of this rank's vertices in state 0, or ``otherwise`` if state 0 cannot be read."""
+    file, name = folder / "states-0000.h5", f"{group_name(0)}/position"
+
+    def readable() -> bool:
+        with suppress(InputError):
+            read_stored(file, name, (order.n_global, 3), kinds="f")
+            return True
+        return False
+
+    if not on_root(order.comm, readable):
+        return otherwise
+    return order.from_slab(read_slab(file, name, order))
+
+
+def note_changes(simulation: SteppedScene, before: Path) -> tuple[list[Change], dict[str, Any]]:
+    """Add notes for the user on the keys in which the scene differs from that of the file ``before``.
+
+    Collective.
+
+    Returns
+    -------
+    changes : list of Change
+    earlier_motions : dict of str to dict
+        By name, how the run moved obstacles until now, if it does so otherwise from now on.
+    """
+    scene, notes, comm = simulation.scene, simulation.notes, simulation.problem.points.comm
+    earlier_motions: dict[str, Any] = {}
+    try:
+        changes = on_root(comm, lambda: scene_changes(before, scene))
+    except InputError as error:
+        notes.append(f"{error}; what has changed since the run was begun is not known")
+        return [], {}
+    if any(change.key.startswith(("obstacles", "motions")) for change in changes):
+        with suppress(InputError):  # what is no scene is compared as text only
+            earlier = on_root(comm, lambda: obstacle_motions(load_scene(before, meshes_needed=False)))
+            now = obstacle_motions(scene)
+            earlier_motions = {n: each for n, each in earlier.items() if n in now and each != now[n]}
+    for change in changes[:MAX_LISTED_CHANGES]:
+        if change.key == "time.end":
+            notes.append(str(change))
+        elif change.key == "time.integrator":
+            notes.append(
+                f"changed since the run was begun: {change} (begins without memory of earlier steps)"
+            )
+        else:
+            notes.append(f"changed since the run was begun: {change}")
+    if len(changes) > MAX_LISTED_CHANGES:
+        notes.append(f"and {len(changes) - MAX_LISTED_CHANGES} more changes, listed in summary.json")
+    return changes, earlier_motions

@@ -1,0 +1,140 @@
+"""The tables of a run: history.csv, and others that the scene requests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from mpi4py import MPI
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.output.history import (
+    HISTORY_COLUMNS,
+    OBSTACLE_COLUMNS,
+    History,
+    check_columns,
+    vector_columns,
+)
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+
+Row: TypeAlias = Mapping[str, float | str]
+
+
+class RunTables:
+    """The tables that a scene requests.
+
+    Parameters
+    ----------
+    simulation : SteppedScene
+
+    Attributes
+    ----------
+    columns : dict of str to tuple of str
+        Columns of each table by file name.
+    """
+
+    def __init__(self, simulation: SteppedScene) -> None:
+        self._simulation = simulation
+        scene, held = simulation.scene, simulation.problem.system.held
+        term_columns = tuple(simulation.energy_balance.column_names)
+        self.columns: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *term_columns)}
+        if scene.probes:
+            self.columns["probes.csv"] = vector_columns(list(scene.probes))
+        if scene.output.reactions and scene.handles:
+            moments = [f"handle{n}_m{axis}" for n in held.with_slopes for axis in "xyz"]
+            forces = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
+            self.columns["reactions.csv"] = (*forces, *moments)
+        if scene.obstacles:
+            self.columns["obstacles.csv"] = OBSTACLE_COLUMNS
+        self._files: dict[str, History] = {}
+
+    def check(self, folder: Path) -> None:
+        """Check that the tables in a folder can be continued (rank 0).
+
+        Raises
+        ------
+        InputError
+            If one has other columns.
+        """
+        for name, columns in self.columns.items():
+            check_columns(folder / name, columns)
+
+    def open(self, folder: Path, resume_after: int | None) -> None:
+        """Create the files, or continue them after a step; collective. Notes rows that are lost."""
+        comm = self._simulation.problem.points.comm
+        self._files = {
+            name: History(folder / name, columns, comm, resume_after=resume_after)
+            for name, columns in self.columns.items()
+        }
+        history = self._files["history.csv"]
+        if resume_after is not None and history.kept_until != resume_after:
+            lost = f"the rows of steps {history.kept_until + 1} to {resume_after} are lost"
+            self._simulation.notes.append(f"{history.path}: {lost}")
+
+    def rows(self, report: StepReport) -> dict[str, Sequence[Row]]:
+        """The rows of a step for each table; collective."""
+        budget, energy_balance = self._simulation.budget, self._simulation.energy_balance
+        history: Row = {
+            **asdict(report),
+            "kinetic_energy": budget.kinetic,
+            "membrane_energy": budget.membrane,
+            "bending_energy": budget.bending,
+            "potential_energy": budget.potential,
+            "external_work": budget.external_work,
+            "dissipation": budget.dissipation,
+            **energy_balance.columns(),
+        }
+        rows: dict[str, Sequence[Row]] = {"history.csv": [history]}
+        if "probes.csv" in self.columns:
+            means = {f"{name}_": mean for name, mean in self._probe_means().items()}
+            rows["probes.csv"] = [_vector_row(report, means)]
+        if "reactions.csv" in self.columns:
+            handle_forces = energy_balance.handle_forces(len(self._simulation.scene.handles))
+            forces = {f"handle{n}_": force for n, force in enumerate(handle_forces)}
+            moments = {f"handle{n}_m": moment for n, moment in energy_balance.handle_moments().items()}
+            rows["reactions.csv"] = [_vector_row(report, forces | moments)]
+        if names := list(self._simulation.scene.obstacles or {}):
+            loads = zip(names, energy_balance.obstacle_forces(len(names)), strict=True)
+            rows["obstacles.csv"] = [
+                dict(zip(OBSTACLE_COLUMNS, (report.step, report.time, name, *map(float, load)), strict=True))
+                for name, load in loads
+            ]
+        return rows
+
+    def append(self, rows: Mapping[str, Sequence[Row]]) -> None:
+        """Write the rows of a step (rank 0).
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
+        """
+        for name, lines in rows.items():
+            self._files[name].append(*lines)
+
+    def close(self) -> None:
+        """Close the files; not collective."""
+        for table in self._files.values():
+            table.close()
+
+    def _probe_means(self) -> dict[str, Array]:
+        """Mean position [m] of each probe's vertices."""
+        problem = self._simulation.problem
+        local = np.zeros((len(problem.probes), 4))
+        for row, vertices in enumerate(problem.probes.values()):
+            local[row, :3] = problem.system.x[vertices].sum(axis=0)
+            local[row, 3] = len(vertices)
+        total = np.empty_like(local)
+        problem.points.comm.Allreduce(local, total, MPI.SUM)
+        return {name: total[row, :3] / total[row, 3] for row, name in enumerate(problem.probes)}
+
+
+def _vector_row(report: StepReport, vectors: Mapping[str, Array]) -> Row:
+    """A table row with the components of vectors; a column's name is the vector's and the axis."""
+    row: dict[str, float | str] = {"step": report.step, "time": report.time}
+    for name, vector in vectors.items():
+        row |= {f"{name}{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
+    return row
