@@ -68,13 +68,13 @@ def _fill_cells(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _find_pairs(low, high, others, radius, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
+def _find_pairs(low, high, others, cells, other_cells, n, first, items, out):  # type: ignore[no-untyped-def]
     """Write near pairs to out (m, 2), as many as fit; returns their number.
 
     The others, low and high corners (2, k, 3), are in cells of a grid: ``first`` (cells + 1,) and ``items``.
     A pair is found in the first cell that both overlap.
     """
-    n_found, square = 0, radius * radius
+    n_found = 0
     for a in range(len(low)):
         for i in range(cells[a, 0, 0], cells[a, 1, 0] + 1):
             for j in range(cells[a, 0, 1], cells[a, 1, 1] + 1):
@@ -83,17 +83,15 @@ def _find_pairs(low, high, others, radius, cells, other_cells, n, same, first, i
                     for at in range(first[cell], first[cell + 1]):
                         b = items[at]
                         if (
-                            (same and b <= a)
-                            or i != max(cells[a, 0, 0], other_cells[b, 0, 0])
+                            i != max(cells[a, 0, 0], other_cells[b, 0, 0])
                             or j != max(cells[a, 0, 1], other_cells[b, 0, 1])
                             or k != max(cells[a, 0, 2], other_cells[b, 0, 2])
                         ):
                             continue
-                        margin = square
+                        apart = False
                         for m in range(3):
-                            distance = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
-                            margin -= distance * distance
-                        if margin < 0.0:
+                            apart |= others[0, b, m] > high[a, m] or low[a, m] > others[1, b, m]
+                        if apart:
                             continue
                         if n_found < len(out):
                             out[n_found, 0], out[n_found, 1] = a, b
@@ -101,31 +99,25 @@ def _find_pairs(low, high, others, radius, cells, other_cells, n, same, first, i
     return n_found
 
 
-def near_pairs(
-    boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, radius: float = 0.0
-) -> Ints:
-    """Pairs (m, 2) of boxes and other boxes at most ``radius`` [m] apart, by a grid.
+def overlapping_pairs(boxes: tuple[Array, Array], others: tuple[Array, Array]) -> Ints:
+    """Pairs (m, 2) of boxes and others that overlap, by a grid.
 
-    Parameters
-    ----------
-    boxes, others : pairs of (n, 3), (k, 3)
-        Low and high corners [m] of the boxes. Without others: pairs of boxes, the lower number first.
+    Each are low and high corners [m], (n, 3) and (k, 3).
     """
-    same = others is None
     low, high = boxes
-    other_low, other_high = boxes if others is None else others
+    other_low, other_high = others
     if not len(low) or not len(other_low):
         return np.empty((0, 2), dtype=np.int64)
     origin, end = other_low.min(axis=0), other_high.max(axis=0)
     extent = np.maximum(end - origin, 1e-300)
-    size = np.maximum((other_high - other_low).mean(axis=0) + radius, extent * 1e-6)
+    size = np.maximum((other_high - other_low).mean(axis=0), extent * 1e-6)
     n = np.maximum(extent / size, 1.0)
     while np.prod(np.floor(n)) > min(MAX_CELLS, 8 * len(other_low) + 64):
         n[np.argmax(n)] *= 0.5
     n = np.floor(n).astype(np.int64)
     size = extent / n
     other_cells = _cell_ranges(other_low, other_high, origin, size, n)
-    cells = _cell_ranges(low - radius, high + radius, origin, size, n)
+    cells = _cell_ranges(low, high, origin, size, n)
     first = np.zeros(int(np.prod(n)) + 1, dtype=np.int64)
     _fill_cells(other_cells, n, first, np.empty(0, dtype=np.int64), False)
     np.cumsum(first, out=first)
@@ -134,7 +126,7 @@ def near_pairs(
     _fill_cells(other_cells, n, next_item, items, True)
     out = np.empty((4 * len(low) + 64, 2), dtype=np.int64)
     stacked = np.stack([other_low, other_high])
-    arguments = low, high, stacked, radius, cells, other_cells, n, same, first, items
+    arguments = low, high, stacked, cells, other_cells, n, first, items
     n_found = _find_pairs(*arguments, out)
     if n_found > len(out):
         out = np.empty((n_found, 2), dtype=np.int64)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import contact_pairs
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
-from lyra_petsc.contact.near import near_pairs, swept_boxes
+from lyra_petsc.contact.near import overlapping_pairs, swept_boxes
 from lyra_petsc.contact.obstacle_points import Obstacles
 from lyra_petsc.contact.sheet_search import SheetSearch, Simplices
 
@@ -86,11 +86,11 @@ class ObstacleSearch:
             boxes = swept.min(axis=(0, 2)) - margin, swept.max(axis=(0, 2)) + margin
             kept = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
             others, boxes = others[kept], (boxes[0][kept], boxes[1][kept])
-            near_patches = near_pairs(patches, boxes)
+            near_patches = overlapping_pairs(patches, boxes)
             if not len(near_patches):
                 return
             corners = sheet.corners_of(np.unique(near_patches[:, 0]))
-            pairs = near_pairs(swept_boxes(x, dx, corners), boxes)
+            pairs = overlapping_pairs(swept_boxes(x, dx, corners), boxes)
             own, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([own, theirs] if sheet_first else [theirs, own], axis=1)
             rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)

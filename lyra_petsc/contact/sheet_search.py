@@ -58,14 +58,13 @@ class SheetSearch:
     def __init__(self, surface: Ints, uv: Array) -> None:
         patch = patches.split_into_patches(uv.mean(axis=1), connected_pieces(surface))
         patch = connected_pieces(surface, patch)
-        self._patch, self._flat = patch, patches.flat_patches(surface, uv, patch)
-        self._n = len(self._flat.first) - 1
+        self._patch, self._n = patch, int(patch.max(initial=-1)) + 1
         # the vertices of each patch once, as places among the corners of all triangles
         patch_corners = np.column_stack([np.repeat(patch, 3), surface.ravel()])
         found, corner = np.unique(patch_corners, axis=0, return_index=True)
         self._corners, self._n_own = corner, len(corner)
         self._own_first = np.searchsorted(found[:, 0], np.arange(self._n + 1))
-        self._bounds = DistanceBounds(self._flat.neighbours, self._own_first)
+        self._bounds = DistanceBounds(patches.neighbouring_patches(surface, uv, patch), self._own_first)
         self._same_patch = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
         self._triangles: Ints | None = None
         self._capacity = 1024
@@ -136,9 +135,6 @@ class SheetSearch:
         patch_pairs, row, known = self._bounds.select(patch_pairs, path_bounds, *radii)
         if not len(patch_pairs):
             return np.empty((0, 7), dtype=np.int64)
-        if np.count_nonzero(row >= 0) > self._n:  # then gradients take less time than simplices
-            known = np.maximum(known, self.bending_bounds(x, dx, patch_pairs, radii[1])[:, None])
-            self._bounds.raise_to(row, known)
         close = (known < radii).any(axis=1)
         patch_pairs, row, known = patch_pairs[close], row[close], known[close]
         if not len(patch_pairs):
@@ -163,21 +159,6 @@ class SheetSearch:
                 self._bounds.raise_to(row, new_bounds)
                 return out[:n_found]
             self._capacity = n_found + n_found // 4
-
-    def bending_bounds(self, x: Array, dx: Array, patch_pairs: Ints, radius: float) -> Array:
-        """Lower bounds (n,) [m] of the distances of simplices without a common vertex in pairs of patches (n,
-        2), by the deformation gradients; 0 if the bound is below ``radius`` [m].
-        """
-        flat, n, out = self._flat, self._n, np.empty(len(patch_pairs))
-        gradients: tuple[Array, Array, Array] = np.empty((n, 6)), np.empty(n), np.empty(n)
-        rows, needed = np.empty(len(patch_pairs), dtype=np.int64), np.zeros(n, dtype=np.bool_)
-        patches.mark_needed(patch_pairs, flat.pairs, flat.around, flat.reached, rows, needed)
-        triangles = self._triangles, flat.order, flat.first, flat.inverse
-        patches.deformation_gradients(x, dx, *triangles, needed, *gradients)
-        first = np.ascontiguousarray(patch_pairs[:, 0])
-        regions = flat.around, flat.height, flat.reached
-        patches.distance_bounds(rows, radius, *regions, first, *gradients, out)
-        return out
 
 
 @kernel()

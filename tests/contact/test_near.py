@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.contact.near import near_pairs, near_pairs_by_tree, swept_boxes
+from lyra_petsc.contact.near import near_pairs_by_tree, overlapping_pairs, swept_boxes
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,
@@ -40,12 +40,9 @@ def test_pairs_agree_with_brute_force(n: int, size: str) -> None:
     rng = np.random.default_rng(n)
     low, high = boxes(rng, n, SIZES[size])
     others = boxes(rng, n + 7, SIZES[size])
-    assert as_set(near_pairs((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
+    assert as_set(overlapping_pairs((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
     mutual = np.argwhere(np.triu(brute(low, high, low, high), 1))
-    assert as_set(near_pairs((low, high))) == as_set(mutual)
     assert as_set(near_pairs_by_tree(low, high, 0.0)) == as_set(mutual)
-    radius = 0.1
-    assert as_set(near_pairs_by_tree(low, high, radius)) == as_set(near_pairs((low, high), radius=radius))
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
@@ -55,7 +52,7 @@ def test_boxes_in_one_plane_up_to_rounding(thickness: float) -> None:
     low = rng.random((400, 3)) * [1.0, 1.0, thickness]
     high = low + rng.random((400, 3)) * [0.05, 0.05, 0.0]
     mine = rng.random((60, 3)) * [1.0, 1.0, 0.2]
-    found = near_pairs((mine - 0.1, mine + 0.1), (low, high))
+    found = overlapping_pairs((mine - 0.1, mine + 0.1), (low, high))
     assert as_set(found) == as_set(np.argwhere(brute(mine - 0.1, mine + 0.1, low, high)))
     assert len(found) > 60
 
@@ -63,37 +60,34 @@ def test_boxes_in_one_plane_up_to_rounding(thickness: float) -> None:
 def test_one_box_among_many_is_far_away() -> None:
     low = np.vstack([np.random.default_rng(2).random((500, 3)), [[1e6, -1e6, 1e6]]])
     high = low + 0.05
-    assert as_set(near_pairs((low, high))) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
+    both = np.argwhere(brute(low, high, low, high))
+    assert as_set(overlapping_pairs((low, high), (low, high))) == as_set(both)
 
 
 def test_touching_boxes_overlap() -> None:
     low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
-    assert near_pairs((low, high)).tolist() == [[0, 1]]
+    assert overlapping_pairs((low, high), (low + 1.0, high + 1.0)).tolist() == [[0, 0], [1, 0], [1, 1]]
 
 
 def test_more_pairs_than_the_first_capacity() -> None:
     low = np.zeros((200, 3))
-    assert len(near_pairs((low, low + 1.0))) == 200 * 199 // 2
+    assert len(overlapping_pairs((low, low + 1.0), (low, low + 1.0))) == 200 * 200
+    assert len(near_pairs_by_tree(low, low + 1.0, 0.0)) == 200 * 199 // 2
 
 
 @pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
 def test_no_boxes(n: tuple[int, int]) -> None:
     mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
-    assert near_pairs((mine, mine), (others, others)).shape == (0, 2)
+    assert overlapping_pairs((mine, mine), (others, others)).shape == (0, 2)
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.05, 0.4])
 def test_boxes_within_a_radius(radius: float) -> None:
     rng = np.random.default_rng(3)
     low, high = boxes(rng, 80, 1.0)
-    other_low, other_high = boxes(rng, 90, 0.8)
-    gaps = np.maximum(np.maximum(other_low - high[:, None], low[:, None] - other_high), 0.0)
-    close = np.linalg.norm(gaps, axis=2) <= radius
-    found = near_pairs((low, high), (other_low, other_high), radius=radius)
-    assert as_set(found) == as_set(np.argwhere(close))
     dx = np.maximum(low[:, None] - high, 0.0)
     close = np.linalg.norm(np.maximum(dx, dx.transpose(1, 0, 2)), axis=2) <= radius
-    assert as_set(near_pairs((low, high), radius=radius)) == as_set(np.argwhere(np.triu(close, 1)))
+    assert as_set(near_pairs_by_tree(low, high, radius)) == as_set(np.argwhere(np.triu(close, 1)))
 
 
 def test_swept_boxes_of_simplices() -> None:

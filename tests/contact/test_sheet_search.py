@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
-from lyra_petsc.contact.near import near_pairs as near_patches
+from lyra_petsc.contact.patches import neighbouring_patches, split_into_patches
 from lyra_petsc.contact.sheet_search import SheetSearch
 
 Array = NDArray[np.float64]
@@ -189,29 +189,13 @@ def test_a_rank_without_triangles_finds_nothing() -> None:
     assert len(search.pairs(np.zeros((4, 3)), np.ones((4, 3)), np.arange(4), RADIUS)) == 0
 
 
-@pytest.mark.parametrize("which", ["plain", "jittered"])
-def test_parts_of_a_sheet_that_hardly_bends_are_not_compared(which: str) -> None:
-    triangles, corners = sheet(which)
-    x = moved("flat", corners, triangles, np.random.default_rng(0))
-    search = SheetSearch(triangles, corners)
-    search.set_triangles(x, np.arange(len(x)), triangles)
-    n = len(search.triangles.first) - 1
-    alone = np.repeat(np.arange(n)[:, None], 2, axis=1)
-    kept = search.bending_bounds(turned(x, 0.9), 0.02 * x, alone, 0.05)
-    assert (kept >= 0.1).all()
-    crumpled = np.random.default_rng(1).normal(size=x.shape)
-    assert not search.bending_bounds(crumpled, 0.0 * x, alone, 0.05).any()
-
-
-def test_patches_beside_each_other_keep_their_distance_without_a_common_vertex() -> None:
+def test_patches_with_a_common_vertex_or_a_common_neighbour_beside_them_are_neighbours() -> None:
     uv, triangles = grid(30, 20)
-    search, x = SheetSearch(triangles, uv[triangles]), np.column_stack([uv, 0.0 * uv[:, 0]])
-    search.set_triangles(x, np.arange(len(x)), triangles)
-    low, high, *_ = search.boxes(x, 0.0 * x)
-    pairs = near_patches((low, high), radius=0.1)
-    patch = [
-        set(search.triangles.corners_of(np.array([n])).ravel())
-        for n in range(len(search.triangles.first) - 1)
-    ]
-    assert any(not patch[i] & patch[j] for i, j in pairs)
-    assert (search.bending_bounds(x, 0.0 * x, pairs, 0.05) >= 0.1).all()
+    patch = split_into_patches(uv[triangles].mean(axis=1))
+    pairs = {(int(i), int(j)) for i, j in neighbouring_patches(triangles, uv[triangles], patch)}
+    corners = [set(triangles[patch == n].ravel()) for n in range(patch.max() + 1)]
+    common = {(i, j) for j in range(len(corners)) for i in range(j + 1) if corners[i] & corners[j]}
+    assert common < pairs
+    for i, j in pairs - common:
+        assert any(corners[i] & each and corners[j] & each for each in corners)
+    assert len(pairs) < 12 * len(corners)
