@@ -119,25 +119,3 @@ def test_coarse_meshes_do_not_depend_on_the_partition(
                 each.mat.destroy()
             hierarchy.destroy()
     np.testing.assert_allclose(*there_and_back, rtol=0.0, atol=1e-10 * np.abs(there_and_back[0]).max())
-
-
-@pytest.mark.parallel
-def test_prescribed_coordinates_are_not_interpolated(comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
-        points = simulation.problem.points
-        between = interpolations(points, simulation.problem.surface, 2)
-        hierarchy = Hierarchy(points, simulation.problem.pattern, between)
-        mask = np.zeros((points.n_local, 3), dtype=bool)
-        mask[points.global_number % 3 == 0, 1] = True
-        interpolation = Interpolation(between[0], *hierarchy.levels)
-        for held in (~mask, mask):
-            rows = np.zeros((simulation.problem.pattern.n_blocks, 3, 3))
-            _, free = next(hierarchy.block_rows(rows, held))
-            interpolation.set(free)
-            ones, out = interpolation.mat.createVecs()
-            ones.set(1.0)
-            interpolation.mat.mult(ones, out)
-            expected = np.where(held[: points.n_owned], 0.0, 1.0)
-            np.testing.assert_allclose(out.getArray().reshape(-1, 3), expected, atol=1e-12)
-        interpolation.mat.destroy()
-        hierarchy.destroy()

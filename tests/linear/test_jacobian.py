@@ -112,11 +112,10 @@ def test_matrix_is_the_derivative_of_the_residual(comm: MPI.Comm, kind: str) -> 
         matrix.destroy()
 
 
-@pytest.mark.parametrize("blend", [0.0, 0.5, 1.0])
-def test_formats_agree_and_the_matrix_is_symmetric(comm: MPI.Comm, blend: float) -> None:
+def test_formats_agree_and_the_matrix_is_symmetric(comm: MPI.Comm) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        values = jacobian(simulation, v, blend)
+        values = jacobian(simulation, v, 0.5)
         products = []
         for kind in ("aij", "baij", "sbaij", "python"):
             matrix = matrix_of(simulation, kind)
@@ -151,23 +150,7 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
         assert slope == pytest.approx(numeric, rel=1e-8)
 
 
-def test_product_of_rows_needs_no_petsc(comm: MPI.Comm) -> None:
-    with Simulation(EVERYTHING, comm) as simulation:
-        v, direction = bent_state(simulation)
-        values = jacobian(simulation, v, 0.0)
-        matrix = matrix_of(simulation, "aij")
-        matrix.set(values)
-        points = simulation.problem.points
-        local = np.zeros((points.n_local, 3))
-        local[: points.n_owned] = direction
-        points.update_ghosts(local)
-        by_rows = simulation.system.discretisation.rows.product(values, local)
-        expected = product(matrix, direction)
-        assert largest(comm, by_rows - expected) <= 1e-13 * largest(comm, expected)
-        matrix.destroy()
-
-
-@pytest.mark.parametrize("blend", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("blend", [0.0, 0.5])
 def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         bent_state(simulation)

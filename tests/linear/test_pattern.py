@@ -106,31 +106,6 @@ def test_products_of_rows_and_columns_beyond_32_bits() -> None:
     assert pattern.columns[pattern.offsets["pair"] // 2].tolist() == [n - 1, n - 1]
 
 
-def test_the_same_elements_have_one_table_of_offsets() -> None:
-    stencil = random_stencil(np.random.default_rng(4), 6, 3)
-    stencils = {"one": stencil, "alike": stencil.copy(), "other": stencil[::-1]}
-    offsets = BlockPattern(stencils, N_OWNED, N_LOCAL).offsets
-    assert offsets["alike"] is offsets["one"]
-    np.testing.assert_array_equal(offsets["other"], offsets["one"][::-1])
-
-
-def test_pairs_couple_all_points_or_only_both_sides() -> None:
-    stencil = np.array([[1, 2], [3, 0]], dtype=np.int32)
-    pattern = BlockPattern({"pair": stencil, "across": OffDiagonal(stencil)}, 4, 4)
-    assert pattern.offsets["pair"].shape == (2, 3)
-    assert pattern.offsets["across"].shape == (2,)
-    np.testing.assert_array_equal(pattern.offsets["pair"][:, 1], pattern.offsets["across"])
-    # (0, 0), (0, 1), (1, 1) of each
-    values, rng = np.zeros((pattern.n_blocks, 3, 3)), np.random.default_rng(6)
-    blocks = symmetric(rng.random((2, 2, 2, 3, 3)))
-    add_elements(np.ones(2), blocks, pattern.offsets["pair"], values)
-    expected = np.zeros((4, 4, 3, 3))
-    for (a, b), block in zip(stencil, blocks, strict=True):
-        expected[np.ix_([a, b], [a, b])] += block
-    np.testing.assert_allclose(expanded(pattern, values, 4), expected.transpose(0, 2, 1, 3))
-    assert BlockPattern({"across": OffDiagonal(stencil)}, 4, 4).columns.tolist() == pattern.columns.tolist()
-
-
 @pytest.mark.parametrize("largest", [block_pattern.LARGEST_INT32, 80])
 def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
     monkeypatch.setattr(block_pattern, "LARGEST_INT32", largest)
@@ -175,20 +150,6 @@ def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
         expected[np.ix_(places, places)] += weight[e] * blocks[e]
     found = expanded(pattern, values, 8).reshape(3 * n_owned, 24)
     np.testing.assert_allclose(found, expected[: 3 * n_owned])
-
-
-def test_no_elements_leave_the_diagonal() -> None:
-    pattern = BlockPattern({"none": np.empty((0, 3), np.int32)}, 2, 3)
-    assert pattern.columns.tolist() == [0, 1]
-    assert BlockPattern({}, 0, 0).n_blocks == 0
-
-
-def test_patterns_of_keys() -> None:
-    keys = block_pattern.union(block_pattern.diagonal_keys(2, 4), np.array([3, 1, 7]))
-    pattern = BlockPattern.of_keys(keys, 2, 4)
-    assert pattern.indptr.tolist() == [0, 3, 5]
-    assert pattern.columns.tolist() == [0, 1, 3, 1, 3]
-    assert pattern.offsets == {}
 
 
 @pytest.mark.parallel

@@ -74,20 +74,6 @@ def test_hinges_couple_opposite_vertices_too(comm: MPI.Comm) -> None:
     assert len(bent) > 1.5 * len(stencil_pairs(triangles))
 
 
-@pytest.mark.parallel
-def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, NX, NY)}, comm) as simulation:
-        assert list(simulation.problem.terms) == ["membrane"]
-        system = simulation.system
-        assert not system.held
-        assert not system.active.viscous
-        assert not system.active.loads
-        assert not system.damping.active
-        assert system.damping._values is None
-        assert len(system.prescribed.goal) == len(system.prescribed.constrained.changed) == 0
-        assert simulation.problem.probes == {}
-
-
 SCRIPT = """
 import json, sys
 import petsc4py

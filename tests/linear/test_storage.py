@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-import weakref
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,76 +52,6 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("kind", ["baij", "sbaij"])
-def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.problem.points, simulation.problem.pattern
-        matrix = AssembledMatrix(points, pattern, kind)
-        matrix.set(symmetric(points, pattern, 0.5))
-        copy = matrix.mat.duplicate(copy=True)
-        copy.scale(3.0)
-        x, y = matrix.mat.createVecs()
-        z = y.duplicate()
-        x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
-        matrix.mat.mult(x, y)
-        copy.mult(x, z)
-        np.testing.assert_allclose(z.getArray(), 3.0 * y.getArray(), rtol=0.0, atol=1e-11)
-        for item in (matrix, copy):
-            item.destroy()
-
-
-@pytest.mark.parallel
-def test_products_of_block_rows_agree_with_petscs(comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.problem.points, simulation.problem.pattern
-        assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
-        received = []
-        ours.observers.append(lambda rows: received.append(rows.copy()))
-        x, y = ours.mat.createVecs()
-        z, t = y.duplicate(), y.duplicate()
-        x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
-        for shift in (0.5, 1.5):
-            state = ours.mat.stateGet()
-            for matrix in (assembled, ours):
-                matrix.rows[:] = symmetric(points, pattern, shift)
-                matrix.set(matrix.rows)
-            assert ours.mat.stateGet() > state  # or preconditioners would not be set up again
-            np.testing.assert_array_equal(received[-1], symmetric(points, pattern, shift))
-            assembled.mat.mult(x, y)
-            ours.mat.mult(x, z)
-            ours.mat.multTranspose(x, t)
-            np.testing.assert_allclose(z.getArray(), y.getArray(), rtol=0.0, atol=1e-12)
-            np.testing.assert_array_equal(z.getArray(), t.getArray())
-        for item in (assembled, ours, x, y, z, t):
-            item.destroy()
-
-
-@pytest.mark.parallel
-def test_a_viewed_matrix_keeps_no_objects_alive(comm: MPI.Comm, shared_tmp: Path) -> None:
-    # PETSc would free it at the end, when MPI is gone
-    class Teller:
-        def lines(self) -> list[str]:
-            return ["one line more"]
-
-    def seen(name: str) -> str:
-        viewer = PETSc.Viewer().createASCII(str(shared_tmp / name), comm=comm)
-        viewer.pushFormat(PETSc.Viewer.Format.ASCII_INFO)
-        matrix.mat.view(viewer)
-        viewer.destroy()
-        return (shared_tmp / name).read_text() if comm.rank == 0 else ""
-
-    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        teller = Teller()
-        matrix = BlockMatrix(simulation.problem.points, simulation.problem.pattern, teller.lines)
-        assert ("one line more" in seen("with")) == (comm.rank == 0)
-        kept = weakref.ref(teller)
-        del teller
-        assert kept() is None
-        assert "one line more" not in seen("without")
-        matrix.destroy()
-
-
-@pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "aij", "sbaij"])
 def test_an_enlarged_diagonal_is_that_of_the_enlarged_rows(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
@@ -142,22 +70,6 @@ def test_an_enlarged_diagonal_is_that_of_the_enlarged_rows(kind: str, comm: MPI.
         np.testing.assert_allclose(ours.rows, enlarged, rtol=1e-15)
         for item in (matrix, larger, ours):
             item.destroy()
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("kind", ["baij", "aij"])
-def test_a_diagonal_matrix_stores_diagonal_blocks_only(kind: str, comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.problem.points, simulation.problem.pattern
-        values = symmetric(points, pattern, 0.5)
-        part = AssembledMatrix(points, pattern, kind, diagonal=True)
-        assert part.rows.shape == values.shape
-        for _ in range(2):  # through MatSetValues, and straight into the arrays
-            part.set(values)
-        found = part.mat.getDiagonalBlock().getValuesCSR()[2].reshape(-1, 3, 3)
-        # PETSc stores blocks by rows, the program by columns
-        np.testing.assert_array_equal(found, values[pattern.indptr[:-1]].transpose(0, 2, 1))
-        assert part.mat.getInfo()["nz_used"] == 9 * points.n_global
 
 
 SCRIPT = """
