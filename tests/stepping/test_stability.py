@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
 from physics import CLOTH, finished, grid, scene_of, shape
 
@@ -14,7 +13,6 @@ from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics import equilibrium
 from lyra_petsc.stepping.statics.stability import Examination, add_exact_hessian
-from lyra_petsc.terms import registry
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -74,30 +72,6 @@ def test_an_equilibrium_that_remains_unstable_is_noted(
         assert simulation.stability == STABLE | {"stable": False, "negative_pivots": 1}
         assert "unstable" in notes(simulation)[0]
         assert "followed 0 times" in notes(simulation)[0]
-
-
-def test_unknowns_on_edges_do_not_change_the_counts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(equilibrium, "MAX_DESCENTS", 0)
-    counts = []
-    for terms in (registry.REGISTRY, IN_PLACE_OF_HINGES):
-        monkeypatch.setattr(registry, "REGISTRY", terms)
-        with finished(comm, strip(12.0)) as simulation:  # its second mode is critical at 7.1 times
-            counts.append(simulation.stability)
-            assert (simulation.problem.points.n_edges_global > 0) == (terms is IN_PLACE_OF_HINGES)
-    assert counts[0] == counts[1]
-    assert counts[0]["negative_pivots"] == 2
-
-
-@pytest.mark.parallel(1)
-def test_the_strip_also_falls_over_with_unknowns_on_edges(
-    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with finished(comm, strip(1.2)) as simulation:
-        hinges = np.abs(shape(simulation))
-    monkeypatch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
-    with finished(comm, strip(1.2)) as simulation:
-        assert simulation.stability["stable"]
-        np.testing.assert_allclose(np.abs(shape(simulation)), hinges, rtol=0, atol=1e-5)
 
 
 PRESSED = {

@@ -11,7 +11,6 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.terms.bending.hinge import Bending
-from lyra_petsc.terms.bending.hinge_triangles import triangles_of
 from lyra_petsc.terms.registry import registration_of
 
 
@@ -103,47 +102,7 @@ def alone(name: str, limit: float = 0.0) -> list[Bending]:
 
 
 @every_sheet
-def test_sides_and_hinges_refer_to_each_other(name: str) -> None:
-    stencil, opposite = SHEETS[name]
-    corners, sides, found = triangles_of(stencil.astype(np.int32), opposite)
-    n = len(stencil)
-    assert sides.shape == (n + 1, 2)
-    assert found.shape == corners.shape
-    for hinge, (a, b, c, d) in enumerate(stencil):
-        for second, points in enumerate(((a, b, c), (a, b, d))):
-            triangle, corner = divmod(sides[hinge, second], 4)
-            assert corner == opposite[hinge, second]
-            around = corners[triangle, [(corner + 1) % 3, (corner + 2) % 3, corner]].tolist()
-            assert around == [points[second], points[1 - second], points[2]]
-            assert found[triangle, corner] == 2 * hinge + second
-    assert np.count_nonzero(found < 2 * n) == 2 * n
-
-
-def count(name: str) -> int:
-    stencil, opposite = SHEETS[name]
-    return len(triangles_of(stencil.astype(np.int32), opposite).corners)
-
-
-def test_consistently_oriented_triangles_are_found_once() -> None:
-    assert count("octahedron") == 8
-    assert count("band") == 14
-    assert count("Möbius band") > 14
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("most", [14, 100_000])  # the square of the numbers passes 32 bits
-def test_triangles_do_not_depend_on_the_numbering(seed: int, most: int) -> None:
-    names = np.random.default_rng(seed).choice(most, 14, replace=False)
-    mesh = strip(7, twisted=False)
-    stencil, opposite = hinges_of(mesh)
-    corners, _, _ = triangles_of(names[stencil].astype(np.int32), opposite)
-    # the same corners in the same order, and in the order in which ranks have their elements
-    assert sorted(corners.tolist()) == sorted(names[mesh].tolist())
-    assert np.sort(corners, axis=1).tolist() == sorted(np.sort(corners, axis=1).tolist())
-
-
-@every_sheet
-@pytest.mark.parametrize("limit", [0.0, 0.3, 10.0])  # none fades, some do, all do
+@pytest.mark.parametrize("limit", [0.0, 0.3])  # none fades, some do
 def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> None:
     term, x = bending(name, limit), shape(14)
     singly = alone(name, limit)
@@ -156,16 +115,9 @@ def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> No
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
 
 
-def test_some_hinges_fade() -> None:
-    weights = bending("band", 0.3).weights(shape(14))
-    assert 0.0 <= weights.min() < 1.0 == weights.max()
-    assert bending("band", 10.0).weights(shape(14)).max() < 1.0
-
-
 @every_sheet
-@pytest.mark.parametrize("limit", [0.0, 0.3, 10.0])
-@pytest.mark.parametrize("blend", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("n_owned", [14, 5])
+@pytest.mark.parametrize("limit", [0.0, 0.3])
+@pytest.mark.parametrize(("blend", "n_owned"), [(0.0, 14), (0.4, 5)])
 def test_block_rows_are_those_of_the_element_hessians(
     name: str, limit: float, blend: float, n_owned: int
 ) -> None:

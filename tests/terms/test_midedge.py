@@ -38,9 +38,8 @@ from lyra_petsc.experiments.verification.cases.shells import (
 )
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
-from lyra_petsc.terms.bending import midedge, midedge_energy
 from lyra_petsc.terms.bending.midedge import MidEdge
-from lyra_petsc.terms.bending.midedge_shape import BATCH, tangents, unit
+from lyra_petsc.terms.bending.midedge_shape import unit
 from lyra_petsc.terms.loads.moment import Moment
 
 Array = NDArray[np.float64]
@@ -113,22 +112,6 @@ def test_moments_and_forces_balance_under_rotation(tmp_path: Path) -> None:
         assert np.abs(torque).max() < 1e-13 * np.abs(pull).max()
 
 
-def test_frames_survive_a_checkpoint(tmp_path: Path) -> None:
-    content = {
-        "mesh": curved_sheet(tmp_path / "sheet.obj"),
-        "material": BENDING | {"bending_model": "midedge"},
-    }
-    with Simulation(content, MPI.COMM_SELF) as simulation:
-        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
-        x = simulation.system.x.copy()
-        x[:n] = x[:n] @ rotation([1.0, 2.0, 0.5], 0.9).T
-        term.accept(x, term.frames)
-        frames, state = term.frames, term.state()
-        term.frames = type(frames)(np.zeros_like(frames.direction), np.zeros_like(frames.reference))
-        term.restore({name: entry.values for name, entry in state.items()}, x)
-        np.testing.assert_allclose(term.frames.reference, frames.reference, rtol=0.0, atol=1e-15)
-
-
 @pytest.mark.parametrize("degrees", [40, 50, 85, 95, 140, 175])
 def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
     """Gradient and Hessian at large angles between directors and normals."""
@@ -165,114 +148,6 @@ def test_energy_is_continuous_at_all_angles() -> None:
         assert energy(0.25 * np.pi - 1e-9) == pytest.approx(energy(0.25 * np.pi + 1e-9), rel=1e-7)
         values = [energy(turn) for turn in np.linspace(0.0, np.pi, 20)]
         assert (np.diff(values) > 0.0).all()
-
-
-def test_triangles_of_one_batch_do_not_affect_each_other() -> None:
-    """With any triangles of a batch folded beyond 45° or fading, and for any size of the last batch."""
-    with Simulation(SHEET, MPI.COMM_SELF) as simulation:
-        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
-        rows = simulation.system.discretisation.rows
-        random = np.random.default_rng(4)
-        x = simulation.system.x.copy()
-        x[:n] += random.normal(0.0, 0.05, (n, 3))
-        x[term.stencil[7, 2]] = x[term.stencil[7, :2]].mean(axis=0) + 1e-4
-        x.ravel()[term.of_edges.indices] = directors_along_normals(term, x)
-        frames, director = term.frames, term._directors(x, term.frames)
-        tangent = term.angle_tangents(x, frames)
-        length, weight = term.of_edges.length, np.ones(term.n_elements)
-        data, offsets = term.elements.data, rows.pattern.offsets
-        assert 0.1 < np.mean(np.abs(tangent[:, :3]) > 1.0) < 0.9
-        assert term.n_elements % BATCH
-
-        def computed(size: int) -> list[Array]:
-            """Energies, gradient and Hessian, computed for so many triangles at a time."""
-            energies, pull, values = np.empty(term.n_elements), np.zeros_like(x), rows.zeros()
-            for first in range(0, term.n_elements, size):
-                part = slice(first, first + size)
-                triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
-                sign, at = data["sign"][part], term.edges[part]
-                bent = np.empty((len(triangles), 4))
-                tangents(x, triangles, edges, director, midedge.NO_REST_ROTATION, bent)
-                constants = (
-                    data["stiffness"][part],
-                    midedge.NO_REST_TANGENTS,
-                    data["limit"][part],
-                    midedge.NO_FRICTION,
-                )
-                midedge_energy.energies(bent, *constants, energies[part])
-                given = edges, at, sign, frames.direction, bent, *constants, length
-                midedge_energy.add_gradient(x, triangles, *given, pull)
-                corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
-                numbers = frames.direction, bent, *constants, length, weight[part], corners, mixed, values
-                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, *numbers)
-            return [energies, pull, values]
-
-        for whole, apart in zip(computed(term.n_elements), computed(1), strict=True):
-            np.testing.assert_allclose(whole, apart, rtol=1e-12, atol=1e-12 * np.abs(apart).max())
-
-
-def test_frames_follow_edges_that_turn_far() -> None:
-    """Frames of free edges that turn by more than 90° are reset, with the same unknowns and energy."""
-    with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
-        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
-        x = simulation.system.x.copy()
-        x.ravel()[term.of_edges.indices] = 0.1 * np.random.default_rng(1).standard_normal(
-            len(term.edge_indices)
-        )
-        x[:n] = x[:n] @ rotation([0.0, 1.0, 0.0], 2.0).T
-        none = np.zeros(x.shape, dtype=bool)
-        before, frames = term.energies(x, term.frames), term.frames
-        nearer = term.updated_frames(x, frames, none)
-        assert nearer is not None
-        assert term.updated_frames(x, nearer, none) is None
-        assert term.updated_frames(x, frames, ~none) is None
-        turned = np.flatnonzero((nearer.direction != frames.direction).any(axis=1))
-        assert 0 < len(turned) < len(frames.direction)
-        np.testing.assert_allclose(term.energies(x, nearer), before, rtol=1e-9)
-
-
-def test_directors_follow_triangles_that_turn_far() -> None:
-    """An increment tangential to a rotation by 1.5 rad turns triangles by atan 1.5; directors must follow."""
-    with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
-        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
-        x, axis = simulation.system.x.copy(), np.array([0.6, 0.8, 0.0])
-        increment = np.zeros_like(x)
-        increment[:n] = np.cross(1.5 * axis, x[:n])
-        places, length = term.of_edges.indices, term.of_edges.length
-        increment.ravel()[places] = 1.5 * length * (term.frames.direction @ axis)
-        assert len(term.edge_increments(x, 0.5 * increment, term.frames)[0]) == 0
-        followed, values = term.edge_increments(x, increment, term.frames)
-        far = np.isin(places, followed)
-        np.testing.assert_array_equal(far, np.abs(increment.ravel()[places]) > length)
-        assert 0 < far.sum() < len(far)
-        y = x + increment
-        before = term.energies(y, term.frames).sum()
-        y.ravel()[followed] = values
-        y.ravel()[places[~far]] = directors_along_normals(term, y)[~far]
-        assert term.energies(y, term.frames).sum() < 1e-20 * before
-
-
-def test_directors_follow_to_first_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = {
-        "mesh": curved_sheet(tmp_path / "sheet.obj"),
-        "material": BENDING | {"bending_model": "midedge"},
-    }
-    with Simulation(content, MPI.COMM_SELF) as simulation:
-        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
-        random = np.random.default_rng(2)
-        x = simulation.system.x.copy()
-        x[:n] = (x[:n] + random.uniform(-0.1, 0.1, (n, 3))) @ rotation([1.0, 2.0, 0.5], 0.4).T
-        x.ravel()[term.edge_indices] = directors_along_normals(term, x)
-        increment, size, apart = random.uniform(-1.0, 1.0, x.shape), 1.0, []
-        for _ in range(3):
-            size *= 0.01
-            monkeypatch.setattr(midedge, "LARGEST_ROTATION", 0.0)  # so that all edges are corrected
-            clip = np.clip
-            monkeypatch.setattr(np, "clip", lambda values, low, high: values)
-            places, values = term.edge_increments(x, size * increment, term.frames)
-            monkeypatch.setattr(np, "clip", clip)
-            apart.append(np.abs(values - size * increment.ravel()[places]).max())
-        assert np.log(np.array(apart[:-1]) / apart[1:]).min() > 1.5 * np.log(100.0)
 
 
 @pytest.mark.parallel
@@ -379,13 +254,13 @@ def test_order_with_a_turning_clamp(scheme: str) -> None:
     assert np.log2(moved[0] / moved[1]) > 1.8
 
 
-@pytest.mark.parametrize("start", [{}, {"initial": {"velocity": [0, 0, 1]}}], ids=["at rest", "moving"])
 @pytest.mark.parametrize("scheme", ["midpoint", "bdf2", "alpha2"])
-def test_order_with_damping(scheme: str, start: dict[str, Any]) -> None:
+def test_order_with_damping(scheme: str) -> None:
     """Order of convergence, from runs with half the step; damping acts on directors, which have no mass.
 
     Accelerations at the start of a moving sheet need the rates of its directors.
     """
+    start = {"initial": {"velocity": [0, 0, 1]}}
     ends = [
         outcome(MPI.COMM_SELF, start | {"time": {"end": 0.04, "step": step, "integrator": scheme}})
         for step in (0.004, 0.002, 0.001)
@@ -684,12 +559,6 @@ def test_vertices_of_four_triangles_in_a_curved_shell_are_noted(tmp_path: Path) 
     assert not noted(ball | finer, "triangles of a curved shell")
 
 
-def test_creases_are_not_noted(tmp_path: Path) -> None:
-    """The walls of a box are flat, however thin and whatever their triangles."""
-    content = {"mesh": fan(tmp_path / "b.obj", 0, 90), "material": STIFF | {"bending": PLATE}}
-    assert not coarse(content)
-
-
 def coarse(content: dict[str, Any]) -> list[str]:
     """Notes on triangles that are too large."""
     return noted(content, "large for the curvature")
@@ -860,10 +729,8 @@ def test_symmetry_needs_vertices_in_a_plane_and_directors(tmp_path: Path) -> Non
     ("arc", "cells", "incline", "off"),
     [
         (np.pi / 2, 2, 0, 0),  # at the plane a cell is off by half the angle between two cells
-        (np.pi / 2, 3, 5, 0),
         (1e-9, 3, 9, 0),
         (1e-9, 3, 11, 11),
-        (1e-9, 3, 40, 40),
         (0.7, 8, 20, 22.5),
         (0, 3, 5, 0),
         (0, 3, 30, 22.2),
@@ -1138,7 +1005,7 @@ def jittered(n: int, m: int) -> tuple[Array, NDArray[np.int64]]:
     return np.column_stack([vertices, np.zeros(len(vertices))]), triangles
 
 
-@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "jittered"])
+@pytest.mark.parametrize("pattern", ["diagonal", "jittered"])
 @pytest.mark.parametrize("weight", [0.0, 10.0])
 def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path: Path) -> None:
     """Under a tip load 4 B/L² (Bisshopp & Drucker 1945), or their weight 10 B/L³, without a factor on B."""
@@ -1167,13 +1034,15 @@ def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path:
 # -- extremes ------------------------------------------------------------------------------------------
 
 
-SCHEMES = ["beuler", "semi-implicit", "alpha2"]
-
-
 @pytest.mark.parametrize(
     ("kind", "scheme"),
-    [(kind, scheme) for kind in ("spin", "noise") for scheme in SCHEMES]
-    + [("pressed", scheme) for scheme in ("beuler", "alpha2")],  # one linear solve a step is not enough
+    [
+        ("spin", "beuler"),
+        ("spin", "alpha2"),
+        ("noise", "semi-implicit"),
+        ("noise", "alpha2"),
+        ("pressed", "alpha2"),
+    ],
 )
 def test_extreme_cases_give_finite_results(kind: str, scheme: str) -> None:
     """Finite results for edges turning by 230° in a step, a crumpled start, edges pressed together."""
