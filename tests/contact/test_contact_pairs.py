@@ -212,21 +212,6 @@ def test_distances_of_simplices(kind: int) -> None:
         assert distance - 1e-12 <= sampled <= np.hypot(distance, spacing) + 1e-12
 
 
-@pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
-def test_distances_of_simplices_without_extent(kind: int) -> None:
-    """A vertex or edge of an obstacle may be stored as a triangle or edge with equal corners."""
-    pairs = among_sheets(kind, 20)
-    x = pairs.x.copy().reshape(-1, 4, 3)
-    x[:10, 2] = x[:10, 3]
-    x[10:, 1 if kind == VERTEX_TRIANGLE else 2 :] = x[10:, 1:2]
-    pairs = replace(pairs, x=x.reshape(-1, 3))
-    for p, distance in zip(pairs.places[:10], pairs.distances()[:10], strict=True):
-        assert distance == pytest.approx(sampled_distance(kind, p), rel=5e-3)
-    # a point and a triangle that is one, and edges of which the second and one end of the first are one
-    expected = np.linalg.norm(x[10:, 0] - x[10:, 1], axis=1) if kind == VERTEX_TRIANGLE else np.zeros(10)
-    np.testing.assert_allclose(pairs.distances()[10:], expected, atol=1e-15)
-
-
 def test_distances_of_planes_and_containers() -> None:
     pairs = planes(200)
     p = pairs.places
@@ -273,17 +258,6 @@ def test_derivatives(name: str) -> None:
     # second derivatives jump where another corner or edge becomes the nearest
     assert np.median(error[usable]) < 1e-7
     assert np.percentile(error[usable], 99) < 1e-4
-
-
-def test_mollifier_does_not_depend_on_lengths() -> None:
-    pairs = nearly_parallel(100)
-    p = pairs.x.reshape(-1, 4, 3).copy()
-    p[:, 3] = p[:, 2] + 30.0 * (p[:, 3] - p[:, 2])
-    longer = replace(pairs, x=p.reshape(-1, 3))
-    for parallel in (1e-3, 1e-6):
-        faded = [each.energies(each.x, parallel) / each.energies(each.x) for each in (pairs, longer)]
-        np.testing.assert_allclose(*faded, rtol=1e-6)
-        assert 0.1 < (faded[0] < 1.0).mean() < 0.9
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -357,93 +331,6 @@ def test_free_fractions(name: str, speed: float) -> None:
     assert pairs.free_fraction(dx, obstacle_dx, most=0.5 * min(found)) == 0.5 * min(found)
 
 
-def test_target_distances_have_the_expected_force() -> None:
-    pairs = KINDS["vertex and triangle"][0]()
-    n, gap, force = len(pairs), np.full(len(pairs), GAP), 3.0 * GAP
-    target, before, loaded = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    numbers = pairs.kind, pairs.points, pairs.offset, gap
-    still = np.zeros_like(pairs.x)
-    contact_pairs.target_distances(
-        pairs.x, pairs.obstacle_x, still, *numbers, 0.7, np.full(n, force), target, before, loaded
-    )
-    left = pairs.distances() - pairs.offset
-    touch = (left > 0.0) & (left < GAP)
-    assert touch.any()
-    assert loaded[touch].all()
-    np.testing.assert_allclose(
-        [-contact_pairs.barrier(each, GAP)[1] for each in target[touch]], force, rtol=1e-6
-    )
-
-
-def test_springs_have_the_force_of_the_barrier_and_its_tangent_below() -> None:
-    least = 0.5 * GAP
-    delta = GAP * np.linspace(-2.0, 1.2, 65)
-    gap, below = np.full(len(delta), GAP), np.full(len(delta), least)
-    force, stiffness = np.empty((2, len(delta)))
-    contact_pairs.spring_forces(delta, gap, below, force, stiffness)
-    inside, straight = (delta > least) & (delta < GAP), delta < least
-    _, slope, second = contact_pairs.barrier(delta[inside], GAP)
-    np.testing.assert_allclose(force[inside], -slope)
-    np.testing.assert_allclose(stiffness[inside], second)
-    _, slope, second = contact_pairs.barrier(least, GAP)
-    np.testing.assert_allclose(force[straight], second * (least - delta[straight]) - slope)
-    assert not force[delta >= GAP].any()
-    # chords lead from any of these distances to that of the expected force
-    for expected in (0.0, 0.1 * GAP, 2.0 * GAP, 40.0 * GAP):
-        slopes, there, of = np.empty((3, len(delta)))
-        contact_pairs.secant_stiffness(delta, gap, below, force, np.full(len(delta), expected), slopes)
-        some = (np.abs(force - expected) > 0.05 * GAP) & (slopes > 0.0)
-        assert some.sum() > len(delta) // 3
-        there = delta + (force - expected) / np.where(some, slopes, 1.0)
-        contact_pairs.spring_forces(there, gap, below, of, stiffness)
-        np.testing.assert_allclose(of[some], expected, atol=1e-6 * GAP)
-        assert (slopes >= 0.0).all()
-
-
-@pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
-def test_corrections_lead_to_the_force_of_the_linear_model(name: str) -> None:
-    pairs = KINDS[name][0]()
-    n, gap, most = len(pairs), np.full(len(pairs), GAP), 0.7
-    dx = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
-    numbers = pairs.kind, pairs.points, pairs.offset, gap
-    target, before, loaded = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    contact_pairs.target_distances(
-        pairs.x, pairs.obstacle_x, dx, *numbers, most, np.full(n, np.nan), target, before, loaded
-    )
-
-    def slopes(delta: Array) -> Array:
-        return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])
-
-    left, step = pairs.distances() - pairs.offset, 1e-6
-    touch = (left > 0.0) & (left < GAP)
-    rate = (pairs.distances(pairs.x + step * dx) - pairs.distances(pairs.x - step * dx)) / (2.0 * step)
-    second = np.array([contact_pairs.barrier(each, GAP)[2] for each in left[touch]])
-    linear = slopes(left[touch]) + second * rate[touch]
-    pressed = linear < slopes(np.array([most * GAP]))
-    assert pressed.any()
-    alike = np.isclose(slopes(target[touch][pressed]), linear[pressed], rtol=1e-4)
-    assert alike.mean() > 0.99  # nearest points of a few jump within the difference
-    assert (target[touch][~pressed] == most * GAP).all()
-    assert (loaded[touch] == (linear < 0.0)).mean() > 0.99
-    assert not loaded[~touch].any()
-    assert loaded.any()
-    # each pair alone, by as much as it lacks, and back if it is loaded and would leave
-    x, obstacle_x = pairs.x, pairs.obstacle_x
-    outside = pairs.kind != VERTEX_INSIDE
-    for e in np.flatnonzero(outside | (target + pairs.offset < 0.0))[::7]:
-        one, at = slice(e, e + 1), np.unique(pairs.points[e][pairs.points[e] >= 0])
-        of = tuple(part[one] for part in (*numbers, target, before, loaded))
-        moved = dx.copy()
-        for _ in range(50):
-            out, count = np.zeros_like(x), np.zeros((len(x), 1))
-            if not contact_pairs.add_corrections(x, obstacle_x, moved, *of, 1e-3, out, count):
-                break
-            moved[at] += out[at] / np.maximum(count[at], 1e-9)
-        else:
-            raise AssertionError("is not apart")
-        assert not loaded[e] or pairs.distances(x + moved)[e] - pairs.offset[e] < GAP
-
-
 def test_a_common_motion_of_both_is_free() -> None:
     for make in (lambda: among_sheets(VERTEX_TRIANGLE, 50), lambda: planes(50), lambda: balls(50)):
         pairs = make()
@@ -453,14 +340,6 @@ def test_a_common_motion_of_both_is_free() -> None:
         if len(pairs.obstacle_x) and pairs.kind[0] == VERTEX_PLANE:
             obstacle_dx[1::2] = 0.0
         assert pairs.free_fraction(dx, obstacle_dx) == 1.0
-
-
-def test_long_displacements_past_each_other_take_no_time() -> None:
-    pairs = among_sheets(VERTEX_TRIANGLE, 50)
-    pairs = pairs.part(pairs.distances() > pairs.offset)
-    dx = np.zeros_like(pairs.x)
-    dx[:, 0] = 1e12 * (1.0 + np.arange(len(dx)) % 2)
-    assert 0.0 <= pairs.free_fraction(dx, np.zeros_like(pairs.obstacle_x)) < 1.0
 
 
 def test_planes_that_turn() -> None:
@@ -497,8 +376,8 @@ def two_layers(noise: float) -> Pairs:
     return Pairs(kind, points, x, np.zeros((0, 3)), np.zeros(len(kind)))
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-4, 0.05])
-@pytest.mark.parametrize("parallel", [NOWHERE, 1e-3, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize("parallel", [NOWHERE, 0.3])
 @pytest.mark.parametrize("alike", [True, False])
 def test_pairs_with_the_same_nearest_vertices_are_counted_once_with_a_weight(
     noise: float, parallel: float, alike: bool
@@ -607,29 +486,3 @@ def test_force_in_front_of_a_bent_surface_is_smooth() -> None:
     along = np.array([energy(x + t * ahead) for t in np.linspace(0.0, 1.0, 2001)])
     assert np.abs(np.diff(along)).max() < 20.0 * np.abs(np.diff(along)).mean()
     assert np.abs(np.diff(along, 2)).max() < 0.1 * np.abs(np.diff(along)).max()
-
-
-def test_an_obstacle_repels_a_vertex_as_a_sheet_does() -> None:
-    """Points of obstacles have negative numbers, which edges are identified by."""
-    pairs, x, _, shares = before_a_surface(0.1)
-    x[25:, :2], x[25:, 2] = [[2, 2], [2.01, 2.02], [1.98, 2], [1.99, 1.99], [3.01, 2.01]], 0.2
-    found, _, _ = active_before(x, pairs, shares)
-    places = np.column_stack([pairs[:, :1] - 25, ~pairs[:, 1:]])
-    n = len(pairs)
-    of = np.full(n, VERTEX_TRIANGLE), places, np.zeros(n), np.full(n, 0.5), np.full(n, STIFFNESS), NOWHERE
-    active = found_active(x[25:].copy(), x[:25].copy(), *of, shares, counted=n, capacity=999)
-    assert len(active["at"]) == len(found["at"])
-    for vertex in range(5):
-        here, there = (each["weight"][pairs[each["at"], 0] == 25 + vertex] for each in (active, found))
-        np.testing.assert_allclose(np.sort(here), np.sort(there), atol=1e-12)
-    assert active["weight"] @ active["energy"] == pytest.approx(found["weight"] @ found["energy"], rel=1e-12)
-
-
-def test_negative_normal_forces_are_subtracted_on_the_same_side() -> None:
-    up, down = [0.0, 0.0, 1.0], [0.0, 0.1, -1.0]
-    # two vertices; the first one is between two layers, and that below it is hollow
-    normal = np.array([up, up, [0.1, 0.0, 1.0], down, down, up, down])
-    force = np.array([0.9, -0.4, 0.6, 0.5, -0.1, 2.0, -3.0])
-    vertex, kind = np.array([4, 4, 4, 4, 4, 7, 7]), np.full(7, VERTEX_TRIANGLE)
-    contact_pairs.cancel_negative(kind, vertex, normal, force)
-    np.testing.assert_allclose(force, [0.9 * 11 / 15, 0.0, 0.6 * 11 / 15, 0.4, 0.0, 2.0, 0.0], rtol=1e-14)

@@ -121,13 +121,6 @@ def test_no_energy_is_above_that_of_regularised_springs(x: Array, state: tuple[A
         assert (energies(x + dx.reshape(-1, 3), state) <= bound + 1e-12 * np.abs(bound)).all()
 
 
-def test_tangents_lie_across_the_normals(pairs: Pairs) -> None:
-    for normal in (pairs.normal, -pairs.normal, np.tile([0.0, 0.0, -1.0], (N, 1))):
-        frames = np.concatenate([normal[:, None], pairs._replace(normal=normal).unpacked[0]], axis=1)
-        products = np.einsum("eik,ejk->eij", frames, frames)
-        np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-14)
-
-
 def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, pairs: Pairs) -> None:
     stencil, beta, normal, rotation, _, _ = pairs
     gradients, limit = gradient(x, pairs.state())[stencil], pairs.state()[-1]
@@ -178,18 +171,6 @@ def test_rounding_does_not_decide_which_sliding_pair_is_continued() -> None:
     assert place[0] == 0
 
 
-def test_a_vertex_of_a_sheet_does_not_continue_the_contact_of_an_obstacles_vertex() -> None:
-    """Of which the first number is that of any vertex of the triangle."""
-    keys = np.zeros((2, 10), dtype=np.int64)
-    keys[:, :4], keys[:, 4] = [[7, 7, 7, 7], [7, 7, 1, 2]], VERTEX_TRIANGLE
-    keys[0, 7:], keys[1, 6] = (-4, -5, -6), -4
-    data, place = np.zeros((1, COLUMNS)), np.empty(1, dtype=np.int64)
-    data[0, SLIP] = 1e-5
-    for old in (0, 1):
-        friction_pairs.match_pairs(keys[[1 - old]], keys[[old]], data, place)
-        assert place[0] == -1
-
-
 def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, Pairs]:
     """Points (4 N, 3) and pairs of a vertex and a triangle, or of two edges, some nearest at a corner."""
     points, kind = random.normal(size=(N, 4, 3)), np.where(np.arange(N) < N // 2, VERTEX_TRIANGLE, EDGE_EDGE)
@@ -226,46 +207,3 @@ def test_a_common_rotation_of_two_sheets_is_no_slip() -> None:
     start = np.einsum("ei,eik->ek", pairs.beta, x[pairs.stencil])
     without = rest._replace(rotation=np.zeros((N, 4, 3)), start=start)
     assert np.sqrt(energies(turned, without.state(np.inf))).max() > 1e-7
-
-
-def test_levers() -> None:
-    """The lever is small for nearly parallel edges and a vertex beside a triangle, and 0 on a line."""
-    rotation, up = np.empty((4, 3)), np.array([0.0, 0.0, 1.0])
-    edges = np.array([[-1.0, 0.0, 0.1], [1.0, 0.0, 0.1], [-1.0, -0.01, 0.0], [1.0, 0.01, 0.0]])
-    assert 0.0 < friction_pairs.rotation_vectors(edges, EDGE_EDGE, up, rotation) < 2e-4
-    assert np.isfinite(rotation).all()
-    edges[:, 1] = 0.0
-    assert friction_pairs.rotation_vectors(edges, EDGE_EDGE, up, rotation) == 0.0
-    assert not rotation.any()
-    triangle = np.array([[0.0, 0.0, 0.1], [0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
-    assert friction_pairs.rotation_vectors(triangle, VERTEX_TRIANGLE, up, rotation) == 0.0
-    triangle[3, 0] = 0.3
-    assert friction_pairs.rotation_vectors(triangle, VERTEX_TRIANGLE, up, rotation) == pytest.approx(0.06)
-
-
-def test_triangle_that_defines_the_rotation_at_an_edge_or_vertex() -> None:
-    """Of several the one farthest along a direction, in any order; else the one with the nearest normal."""
-    x = np.array([[0.2, 0.0, 0.1], [0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, -1.0]])
-    triangles = [[1, 2, 3], [4, 2, 1], [2, 1, 5]]
-    cases = [
-        ({1: -0.8, 2: -0.2}, [1, 0], (0, 0, 1), 0),
-        ({1: -0.8, 2: -0.2}, [0, 1], (0, 0, 1), 0),
-        ({1: -0.8, 2: -0.2}, [2, 1, 0], (0, 0, 1), 0),
-        ({1: -0.8, 2: -0.2}, [1, 2], (0, 1, 0), 2),
-        ({2: -1.0}, [2, 1], (0, 0, 1), 1),
-        ({1: -0.5, 2: -0.3, 4: -0.2}, [0, 1], (0, 0, 1), 1),
-    ]
-    for share, order, normal, expected in cases:
-        rows = np.array([[0, *triangles[t]] for t in order], dtype=np.int64)
-        for first in range(len(order)):
-            if not set(share) <= set(rows[first]):
-                continue
-            beta = np.array([[1.0, *(share.get(v, 0.0) for v in rows[first, 1:])]])
-            at, flat = np.array([first]), np.zeros(len(order), dtype=np.int64)
-            towards = np.array([normal], dtype=float)
-            pairs = rows.astype(np.int32), rows, rows, flat + VERTEX_TRIANGLE, flat - 1
-            friction_pairs.choose_triangles(x, *pairs, beta, towards, at)
-            assert order[at[0]] == expected
-            assert dict(zip(rows[at[0]].tolist(), beta[0].tolist(), strict=True)) == {
-                **dict.fromkeys(rows[at[0]].tolist(), 0.0), 0: 1.0, **share,
-            }  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.contact.near import near_pairs_by_tree, overlapping_pairs, swept_boxes
+from lyra_petsc.contact.near import near_pairs_by_tree, overlapping_pairs
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,
@@ -57,30 +57,6 @@ def test_boxes_in_one_plane_up_to_rounding(thickness: float) -> None:
     assert len(found) > 60
 
 
-def test_one_box_among_many_is_far_away() -> None:
-    low = np.vstack([np.random.default_rng(2).random((500, 3)), [[1e6, -1e6, 1e6]]])
-    high = low + 0.05
-    both = np.argwhere(brute(low, high, low, high))
-    assert as_set(overlapping_pairs((low, high), (low, high))) == as_set(both)
-
-
-def test_touching_boxes_overlap() -> None:
-    low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
-    assert overlapping_pairs((low, high), (low + 1.0, high + 1.0)).tolist() == [[0, 0], [1, 0], [1, 1]]
-
-
-def test_more_pairs_than_the_first_capacity() -> None:
-    low = np.zeros((200, 3))
-    assert len(overlapping_pairs((low, low + 1.0), (low, low + 1.0))) == 200 * 200
-    assert len(near_pairs_by_tree(low, low + 1.0, 0.0)) == 200 * 199 // 2
-
-
-@pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
-def test_no_boxes(n: tuple[int, int]) -> None:
-    mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
-    assert overlapping_pairs((mine, mine), (others, others)).shape == (0, 2)
-
-
 @pytest.mark.parametrize("radius", [0.0, 0.05, 0.4])
 def test_boxes_within_a_radius(radius: float) -> None:
     rng = np.random.default_rng(3)
@@ -88,12 +64,3 @@ def test_boxes_within_a_radius(radius: float) -> None:
     dx = np.maximum(low[:, None] - high, 0.0)
     close = np.linalg.norm(np.maximum(dx, dx.transpose(1, 0, 2)), axis=2) <= radius
     assert as_set(near_pairs_by_tree(low, high, radius)) == as_set(np.argwhere(np.triu(close, 1)))
-
-
-def test_swept_boxes_of_simplices() -> None:
-    rng = np.random.default_rng(4)
-    x, dx, simplices = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.integers(0, 9, (5, 3))
-    low, high = swept_boxes(x, dx, simplices)
-    both = np.concatenate([x[simplices], (x + dx)[simplices]], axis=1)
-    np.testing.assert_array_equal(low, both.min(axis=1))
-    np.testing.assert_array_equal(high, both.max(axis=1))

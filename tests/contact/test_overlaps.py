@@ -114,16 +114,6 @@ def test_spheres_that_touch_and_that_do_not(turn: np.ndarray, shift: float) -> N
     assert counts(outside_ball(triangle, ONE, over, np.sqrt(6.0) - 1e-9)) == (2, 3, 1)
 
 
-def test_a_rod_through_the_middle_of_a_triangle() -> None:
-    triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]])
-    rod = np.array([[0.0, 0, -5], [0, 0, 9]])
-    assert counts(inside_ball(triangle, ONE, rod, 1e-3)) == (0, 0, 1)
-    assert counts(inside_ball(triangle, ONE, rod + [9, 0, 0], 1e-3)) == (0, 0, 0)
-    lying = np.array([[-5.0, 0, 0.5], [5, 0, 0.5]])  # parallel to the triangle and to one side
-    assert counts(inside_ball(triangle, ONE, lying, 0.5)) == (0, 0, 0)
-    assert counts(inside_ball(triangle, ONE, lying, 0.5 + 1e-9)) == (0, 2, 1)
-
-
 @pytest.mark.parametrize("turn", [np.eye(3), rotation()])
 def test_sheets_on_and_in_a_box(turn: np.ndarray) -> None:
     box = CUBE @ turn.T + 3.0
@@ -143,15 +133,3 @@ def test_sheets_on_and_in_a_box(turn: np.ndarray) -> None:
     assert of([1.99, 0, -4.5], [0, 1.99, 5.5], [3, 3, 0]) == (0, 1, 1)
     assert of([0.5, 0.5, 0.5], [9, 9, 9], [9, 0, 9]) == (1, 2, 1)
     assert of([0.5, 0.5, 1 - 1e-9], [9, 9, 9], [9, 0, 9]) == (1, 2, 1)
-
-
-def test_planes() -> None:
-    points = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, -1e-9], [5, 5, 1]])
-    triangles = np.array([[0, 1, 2], [0, 1, 3]])
-    floor, up = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
-    found = behind_planes(points, triangles, floor, up)
-    assert found.vertices.tolist() == [2]
-    assert found.edges.tolist() == [[0, 2], [1, 2]]
-    assert found.triangles.tolist() == [0]
-    points[2, 2] = -1e-17
-    assert counts(behind_planes(points, triangles, floor, up)) == (0, 0, 0)

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
-from lyra_petsc.contact.patches import neighbouring_patches, split_into_patches
 from lyra_petsc.contact.sheet_search import SheetSearch
 
 Array = NDArray[np.float64]
@@ -180,22 +179,3 @@ def test_triangles_of_other_ranks_are_compared_one_by_one() -> None:
     touching = {pair for pair in near if mine & set(pair[1:])}  # other ranks find the rest
     assert touching
     assert touching <= {name(row[0], row[2:6]) for row in rows.tolist()}
-
-
-def test_a_rank_without_triangles_finds_nothing() -> None:
-    none = np.empty((0, 3), dtype=np.int64)
-    search = SheetSearch(none, np.empty((0, 3, 2)))
-    search.set_triangles(np.zeros((4, 3)), np.arange(4), none)
-    assert len(search.pairs(np.zeros((4, 3)), np.ones((4, 3)), np.arange(4), RADIUS)) == 0
-
-
-def test_patches_with_a_common_vertex_or_a_common_neighbour_beside_them_are_neighbours() -> None:
-    uv, triangles = grid(30, 20)
-    patch = split_into_patches(uv[triangles].mean(axis=1))
-    pairs = {(int(i), int(j)) for i, j in neighbouring_patches(triangles, uv[triangles], patch)}
-    corners = [set(triangles[patch == n].ravel()) for n in range(patch.max() + 1)]
-    common = {(i, j) for j in range(len(corners)) for i in range(j + 1) if corners[i] & corners[j]}
-    assert common < pairs
-    for i, j in pairs - common:
-        assert any(corners[i] & each and corners[j] & each for each in corners)
-    assert len(pairs) < 12 * len(corners)
