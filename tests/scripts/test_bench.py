@@ -1,7 +1,6 @@
 """``scripts/bench``: its files, comparisons with other programs, one line for each failure."""
 
 import json
-import math
 import shlex
 import signal
 import sys
@@ -15,21 +14,14 @@ import measures
 import numpy as np
 import processes
 import pytest
-from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
+from cases import GRADED, MESHES, corners, hanging_square, on_mesh, square_number
 from launch import FORKS
 from module_of import module_of
 from patience import Patience
 from peers import write_files, write_scene
-from processes import Failed, Limits, run
+from processes import Failed, run
 from tables import (
     against_table,
-    bending_table,
-    document,
-    exponent,
-    growth,
-    meshes_table,
-    number,
-    spread,
 )
 
 from lyra_petsc.mesh.build import build_mesh
@@ -130,28 +122,12 @@ def test_json_has_every_measurement(measured):
             assert step["cpu"] > 0.0
             parts = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
             assert sum(step[part] for part in parts) == pytest.approx(step["seconds"])
-            assert min(step["residual"], step["jacobian"], step["frozen"], step["solve"]) > 0.0
-            assert step["solves"] == step["newton"]
-            if row["who"] == "semi-implicit":
-                assert step["newton"] == 1
-                assert step["energy"] == 0.0
-            else:
-                assert step["newton"] > 1
-                assert step["energy"] > 0.0
-    assert results["overhead"]["triangles"] == 100
-    assert min(results["overhead"]["steps_a_second"]) > 0.0
-    assert len(results["output"]["states_bytes_a_second"]) == len(results["output"]["plain_bytes_a_second"])
-    assert results["output"]["bytes"] > 48 * results["output"]["vertices"]
-    assert 0.0 < results["default_scene"]["output_share"] < 1.0
-    assert len(results["start_up"]["seconds"]) == 1  # the first is not counted
+            assert (step["newton"] == 1) == (row["who"] == "semi-implicit")
+    assert {"overhead", "output", "default_scene", "start_up"} <= set(results)
     assert [row["vertices"] for row in results["weak"]] == [square_number(50), square_number(100)]
     (meshes,) = results["meshes"]
     assert tuple(meshes["meshes"]) == MESHES
-    for found in meshes["meshes"].values():
-        assert min(step["cpu"] for step in found["steps"]) > 0.0
-        assert 25 <= found["vertices"] < 5 * 36  # few vertices do not make edges 1:20
     (apart,) = results["apart"]
-    assert 2 * 2 <= len(apart["step_seconds"]) <= 2 * 3
     assert apart["vertices"] == square_number(18)
     assert [row["problem_class"] for row in results["presets"]] == list(measures.PROBLEM_CLASSES)[:2]
     assert not (folder / "scratch").exists()
@@ -169,19 +145,9 @@ def test_markdown_has_every_measurement(measured):
     assert rows[0][:7] == [
         "vertices", "who", "ranks", "ms a step", "CPU ms", "times the first", "residual ms"
     ]  # fmt: skip
-    assert len(rows[0]) == 22
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
-    assert rows[1][5] == "1.00"
     assert [line[1] for line in meshes[1:]] == list(MESHES)
-    assert meshes[1][4] == "1.00"
-    assert f"times the time a vertex of {MESHES[0]}" in text
-    assert len(weak) == 3
-    assert [line[:2] for line in apart[1:]] == [["36", "2"]]
-    assert apart[1][5] == "2 × 16"
-    assert float(apart[1][4]) == pytest.approx(float(apart[1][2]) / float(apart[1][3]), rel=0.02)
-    assert len(presets) == 3
-    assert {line[0] for line in presets[1:]} == {"block-jacobi"}
-    assert len(single) == 9
+    assert (len(weak), len(apart), len(presets), len(single)) == (3, 2, 3, 9)
 
 
 @pytest.mark.slow
@@ -202,13 +168,10 @@ def test_other_programs_are_compared_and_a_failing_one_is_one_line(measured):
     ("words", "says"),
     [
         (["--vertices", "1e3"], "'1e3' must be whole numbers from 1 on"),
-        (["--ranks", "0"], "'0' must be whole numbers from 1 on"),
         (["--peer", "nothing"], "--peer: must be NAME='command"),
         (["--presets", "magic"], "unknown preset 'magic'"),
-        (["--steps", "0"], "--steps must be at least 1"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
         (["--against", "taken"], "--against: has no scripts/benchmarks/worker.py"),
-        (["--out", "taken/below"], "taken/below: --out: cannot be made"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, words, says):
@@ -238,16 +201,6 @@ def test_files_for_other_programs_describe_the_scene(tmp_path):
     assert list(theirs.handles[0].nodes) == corners(100)
 
 
-def test_held_corners_and_the_small_sheet():
-    for scene in (hanging_square(400), small_sheet()):
-        checked = Scene.model_validate(scene)
-        mesh = build_mesh(checked.mesh)
-        held = mesh.positions[list(checked.handles[0].nodes)]
-        top = mesh.positions[:, 1].max()
-        assert sorted(map(tuple, held)) == [(0.0, top, 0.0), (mesh.positions[:, 0].max(), top, 0.0)]
-    assert mesh.n_triangles == 100
-
-
 @pytest.mark.parametrize("kind", MESHES)
 def test_the_square_on_every_kind_of_mesh(tmp_path, kind):
     scene = Scene.model_validate(on_mesh(kind, 2500, tmp_path))
@@ -259,40 +212,6 @@ def test_the_square_on_every_kind_of_mesh(tmp_path, kind):
     edges = mesh.positions[mesh.triangles] - mesh.positions[np.roll(mesh.triangles, 1, axis=1)]
     sizes = np.sort(np.linalg.norm(edges, axis=2).ravel())
     assert (sizes[-1] / sizes[0] > GRADED / 2) == (kind == "gmsh 1:20")
-
-
-def test_the_worst_mesh_is_named():
-    def found(vertices: int, cpu: float) -> dict:
-        step = {"cpu": cpu, "cg": 7}
-        return {"vertices": vertices, "preset": "multigrid", "set_up_cpu": 1.0, "steps": [step] * 3}
-
-    small = {"meshes": {"diagonal": found(100, 1.0), "gmsh": found(110, 1.32)}}
-    large = {"meshes": {"diagonal": found(1000, 10.0), "gmsh": found(1000, 11.0)}}
-    lines = meshes_table([small, large])
-    assert lines[-1] == "Worst: gmsh, 110 vertices, 1.20 times the time a vertex of diagonal."
-
-
-def test_directors_are_compared_with_hinges():
-    def found(vertices: int, cpu: float, cg: int, peak: int) -> dict:
-        steps = [{"cpu": cpu, "seconds": 2.0 * cpu, "cg": cg, "newton": 1}] * 3
-        return {"vertices": vertices, "preset": "multigrid", "peak_bytes": peak, "steps": steps}
-
-    results = [
-        {
-            "mesh": "gmsh",
-            "who": "beuler",
-            "ranks": 1,
-            "meshes": {"hinge": found(n, 0.1, 7, 100), "midedge": found(n, 0.18, cg, 150)},
-        }
-        for n, cg in ((2500, 5), (50176, 6))
-    ]
-    head, _, first, last = bending_table(results)
-    cells = dict(zip(head.split("|"), last.split("|"), strict=True))
-    found_cells = {name.strip(): cell.strip() for name, cell in cells.items()}
-    assert found_cells["CPU, times hinge"] == found_cells["wall, times hinge"] == "1.80"
-    assert (found_cells["growth"], found_cells["memory, times hinge"]) == ("1.20", "1.50")
-    assert found_cells["CG iterations of both"] == "7.00, 6.00"
-    assert "1.00" in first
 
 
 def test_two_checkouts_are_compared_in_pairs():
@@ -312,82 +231,6 @@ def test_two_checkouts_are_compared_in_pairs():
     assert most == "Median of the rows 1.50, largest 2.00."
 
 
-def test_a_checkout_is_compared_with_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "PAIRS", 1)
-    limits = Limits(steps=2, seconds=0.1, process=120.0)
-    found = measures.against("gmsh", 36, "beuler", 1, [], tmp_path, limits, SCRIPTS.parent)
-    assert [len(found[name]) for name in ("here", "other")] == [1, 1]
-    assert len(against_table([found])) == 5
-
-
-def test_the_order_within_pairs_alternates(tmp_path, monkeypatch):
-    programs = []
-
-    def measure(*_, program, **job):
-        programs.append(program)
-        return {"peak_bytes": [1], "set_up_seconds": 1.0, "steps": [], "vertices": 36}
-
-    monkeypatch.setattr(measures, "PAIRS", 3)
-    monkeypatch.setattr(measures, "measure", measure)
-    limits, other = Limits(steps=2, seconds=0.1, process=120.0), tmp_path / "other"
-    found = measures.against("diagonal", 36, "beuler", 1, [], tmp_path, limits, other)
-    here = processes.HERE
-    assert programs == [here, other, other, here, here, other]
-    assert [len(found[name]) for name in ("here", "other")] == [3, 3]
-
-
-def row(vertices: int, seconds: float) -> dict:
-    step = {"seconds": seconds, "assembly": 1e-6 * vertices, "cg": 20, "newton": 1}
-    return {
-        "vertices": vertices,
-        "who": "semi-implicit",
-        "ranks": 1,
-        "peak_bytes": [vertices],
-        "steps": [step] * 3,
-    }
-
-
-def test_exponents_of_growth():
-    rows = [row(v, 1e-6 * v**1.5) for v in (100, 5000, 20_000, 80_000)]
-    found = growth(rows)
-    assert found["vertices"] == [5000, 20_000, 80_000]
-    assert found["step"] == pytest.approx(1.5)
-    assert found["assembly"] == pytest.approx(1.0)
-    assert found["cg_iterations"] == pytest.approx(0.0, abs=1e-12)
-    assert math.isnan(exponent(rows[:1], lambda each: 1.0))
-
-
-def test_a_file_without_rows_is_complete():
-    results = {
-        "started": "now",
-        "machine": {"processor": "p", "cores": 1, "load": 0.0},
-        "versions": {},
-        "rows": [],
-        "growth": growth([]),
-        "failures": ["a line"],
-    }
-    assert document(results).rstrip().endswith("- a line")
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0.00"), (1234.5, "1234"), (0.01234, "0.0123"), (9.996, "10.00"), (math.nan, "–")],
-)
-def test_numbers_have_three_digits(value, text):
-    assert number(value) == text
-
-
-def test_spread_is_median_and_extremes():
-    assert spread([3.0, 1.0, 2.0], 10.0) == "20.0 (10.0-30.0)"
-
-
-def test_cpu_time_includes_child_processes():
-    program = "import time\nwhile time.process_time() < 0.3: pass"
-    spent = run(f"{sys.executable} -c '{program}'; true", 60.0)
-    assert spent.cpu >= 0.3
-    assert run("sleep 0.3", 60.0).cpu < 0.3 <= spent.wall
-
-
 def test_a_process_that_takes_too_long_is_ended_with_its_children(tmp_path):
     patience = Patience(40.0)
     with pytest.raises(Failed, match=r"not done within 0\.5 s"):
@@ -396,16 +239,3 @@ def test_a_process_that_takes_too_long_is_ended_with_its_children(tmp_path):
     while not patience.over and child.exists() and child.read_text().split()[2] != "Z":
         time.sleep(0.1)
     assert not child.exists() or child.read_text().split()[2] == "Z"
-
-
-@pytest.mark.parametrize(
-    ("command", "says"),
-    [
-        (["/no/such/program"], "cannot be started"),
-        ("exit 7", "exit code 7$"),
-        ("kill -9 $$", "ended by SIGKILL"),
-    ],
-)
-def test_causes_of_failed_processes(command, says):
-    with pytest.raises(Failed, match=says):
-        run(command, 10.0)

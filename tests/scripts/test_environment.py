@@ -1,7 +1,6 @@
 """The set-up scripts in simulated environments: what is used, refused and left unchanged."""
 
 import os
-import re
 import subprocess
 import sys
 import venv
@@ -43,13 +42,6 @@ def test_a_complete_environment_is_used_unchanged(environment, tmp_path):
     assert not (tmp_path / "laid over").exists()
 
 
-def test_python_variable_ranks_and_exit_code(environment, tmp_path):
-    python = str(environment / "bin" / "python")
-    done = call("run.sh", cwd=tmp_path, PYTHON=python, RANKS="5", LAUNCHER_EXIT="3")
-    assert f"-n 5 {BLOCKING}{python} {ROOT}/lyra_petsc run" in done.stdout
-    assert done.returncode == 3
-
-
 def test_waiting_ranks_yield_only_if_they_exceed_the_cores(environment, tmp_path):
     """Otherwise a run would get little time next to busy programs."""
     (environment / "bin" / "mpirun").write_text(f'#!/bin/sh\necho "${YIELD}"\n')
@@ -79,15 +71,6 @@ def test_ranks_must_be_a_number(ranks, environment, tmp_path):
         assert f"RANKS={ranks} is not a number of ranks" in done.stderr
 
 
-def test_an_old_petsc4py_is_refused_in_one_line(environment, tmp_path):
-    metadata = site_packages(environment) / "petsc4py-3.20.1.dist-info"
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: petsc4py\nVersion: 3.15.1\n")
-    done = call("run.sh", cwd=tmp_path, **activated(environment))
-    assert done.returncode == 1
-    assert re.search(r"petsc4py of .* is 3\.15\.1, lyra_petsc needs 3\.18 or newer", done.stderr)
-    assert len(done.stderr.splitlines()) == 1
-
-
 def test_other_folders_are_not_changed(environment, tmp_path):
     (site_packages(environment) / "rich" / "__init__.py").unlink()
     (site_packages(environment) / "rich").rmdir()
@@ -110,12 +93,6 @@ def test_nothing_is_imported_from_the_working_directory(environment, tmp_path):
     done = call("run.sh", cwd=stranger, PYTHONPATH=":", **activated(environment))
     assert "installing from PyPI" in done.stderr
     assert not mark.exists(), mark.read_text()
-
-
-def test_missing_launcher_is_named(environment, tmp_path):
-    done = call("run.sh", cwd=tmp_path, MPIRUN="no-such-mpirun", **activated(environment))
-    assert done.returncode == 1
-    assert "no-such-mpirun not found" in done.stderr
 
 
 def test_old_missing_and_incomplete_packages_are_listed(environment):
@@ -148,14 +125,6 @@ def test_a_layered_environment_uses_and_pins_the_packages_below(environment, tmp
         check=True,
     )
     assert shown.stdout.startswith(str(environment))
-
-
-@pytest.mark.parametrize(
-    "script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", "scripts/lyra.sh", ".ci/run"]
-)
-def test_shell_syntax(script):
-    done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_the_bench_gets_its_arguments_and_the_launcher(environment, tmp_path):

@@ -32,16 +32,6 @@ def test_every_named_test_exists(mutate: ModuleType) -> None:
         assert not name or f"\ndef {name.partition('[')[0]}(" in text, test
 
 
-def test_text_that_is_not_found_is_an_error(
-    mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    changes = [mutate.Change("lyra_petsc/errors.py", "no such text", "", ("tests/test_house.py",))]
-    monkeypatch.setattr(mutate, "CHANGES", changes)
-    monkeypatch.setattr(sys, "argv", ["mutate.py"])
-    assert mutate.main() == 2
-    assert "not found once" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("old", "new", "code"), [("value = 1", "value = 2", 0), ("unused = 3", "unused = 4", 1)]
 )

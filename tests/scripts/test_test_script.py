@@ -117,30 +117,6 @@ def test_a_failure_is_the_last_line_and_the_exit_code(
     assert done.stdout.splitlines()[-1] == line or said.split(";")[0]
 
 
-def test_a_failure_on_some_ranks_is_a_failure(tests: Tests) -> None:
-    assert tests(LAUNCHER_EXIT="3").returncode == 3
-
-
-@pytest.mark.parametrize(
-    ("words", "variables", "workers"),
-    [
-        ((), {"CORES": "1"}, 2),
-        ((), {"CORES": "64"}, 4),
-        (("-s",), {}, 0),
-        (("tests/docs",), {}, 4),
-        (("tests/test_house.py::test_imports_go_in_one_direction",), {}, 0),
-    ],
-)
-def test_number_of_processes(
-    tests: Tests, words: tuple[str, ...], variables: dict[str, str], workers: int
-) -> None:
-    done = tests(*words, **variables)
-    assert done.returncode == 0, done.stderr
-    assert first_part(done).startswith(f"{workers} workers")
-    assert all(f"'{word}'" in first_part(done) for word in words)
-    assert bool(parallel_part(done, 2)) == (not words or words == ("-s",))
-
-
 def at_work(pid: int) -> bool:
     """Whether a process is still running."""
     words = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
