@@ -123,21 +123,6 @@ def test_no_tiny_step_remains_before_an_output_time() -> None:
     assert control.factor * control.step >= 0.0067
 
 
-def test_steps_in_contact_may_be_a_little_longer_than_the_shortest() -> None:
-    """The shortest one follows the velocities, and has changed since the step was planned."""
-    control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
-    assert control.accept(0.01, 5.0, 1, 0.0099, touches=True)
-    assert not control.accept(0.01, 5.0, 1, 0.0099)
-
-
-def test_steps_in_contact_are_not_shortened_in_vain() -> None:
-    control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
-    for touches, ratio, accepted in ((True, 1.5, True), (False, 1.5, False), (True, 2.5, False)):
-        assert not control.accept(0.01, 1.4, 2, touches=touches)
-        assert control.accept(0.007, ratio, 2, touches=touches) is accepted
-        assert control.accept(0.005, 0.5, 2, touches=touches)  # the next step is judged for itself
-
-
 def test_after_a_repeated_step_in_contact_the_next_is_not_longer() -> None:
     for touches in (False, True):
         control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)

@@ -11,9 +11,8 @@ from physics import grid, rotation, scene_of
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
-from lyra_petsc.stepping.newton.arcs import MAX_TURN, MIN_TURN, Arcs
+from lyra_petsc.stepping.newton.arcs import MAX_TURN, Arcs
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.statics import equilibrium
 
 SHEET: dict[str, Any] = {
     "mesh": grid(1.0, 0.8, 6, 5, "alternating"),
@@ -68,29 +67,6 @@ def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(1)
-def test_arcs_equal_the_increment_to_first_order(comm: MPI.Comm) -> None:
-    content = SHEET | {"handles": [{"group": "left", "clamp": True}]}
-    simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_vertices
-    staying, _ = turning(simulation, 0.0)
-    arcs, random = Arcs(system), np.random.default_rng(3)
-    increment = np.where(system.prescribed.free, random.uniform(-1.0, 1.0, staying.shape), 0.0)
-    increment *= 0.01 / (system.stage.c * np.abs(increment[:n]).max())
-    deviations = []
-    for size in (0.1, 0.01):
-        bent, _ = arcs.curve(staying, size * increment)
-        assert not np.any((bent - size * increment)[~system.prescribed.free])
-        deviations.append(np.abs(bent - size * increment).max())
-    assert 0.0 < deviations[1] < 0.02 * deviations[0]
-    far, least = arcs.curve(staying, 1e3 * increment)[1], 1e-6 * MIN_TURN
-    assert np.abs(far).max() < 0.9 * np.abs(1e3 * increment).max()  # cut
-    assert arcs.turns_notably(1e3 * increment)
-    assert not arcs.turns_notably(least * increment)
-    arcs.destroy()
-    simulation.destroy()
-
-
-@pytest.mark.parallel(1)
 @pytest.mark.parametrize(
     ("shell", "most"),
     [
@@ -112,29 +88,3 @@ def test_a_shell_with_large_rotations_takes_few_iterations(shell: Any, most: int
         while not trial.simulation.finished:
             newton += trial.step().newton_iterations
     assert newton <= most
-
-
-def test_a_leap_that_reaches_its_maximum_of_iterations_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench, starts = Bench(MPI.COMM_SELF, direct=False), list[np.ndarray]()
-    content = open_cylinder_scene(bench, 8, "alternating")[0] | {
-        "gravity": [0, 0, 0],
-        "time": {"analysis": "static", "step": 0.1},
-        "petsc": {"ts_adapt_dt_max": 0.1},
-    }
-    solve = equilibrium.Equilibrium._proximal_step
-
-    def watched(self: equilibrium.Equilibrium, before: float, factor: float, most: int | None) -> Any:
-        starts.append(self._system.x.copy())
-        return solve(self, before, factor, most)
-
-    monkeypatch.setattr(equilibrium.Equilibrium, "_proximal_step", watched)
-    found = []
-    for most in (equilibrium.LEAP_ITERATIONS, 3):
-        starts.clear()
-        monkeypatch.setattr(equilibrium, "LEAP_ITERATIONS", most)
-        with bench.simulation(content) as trial:
-            trial.step()
-            found.append(trial.x)
-            moved, n = np.abs(trial.x - trial.start).max(), len(trial.x)
-    assert np.abs(starts[1] - starts[0])[:n].max() > 0.5 * moved
-    np.testing.assert_allclose(found[1], found[0], atol=1e-4 * moved)

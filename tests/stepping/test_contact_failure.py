@@ -132,21 +132,6 @@ def test_a_fast_obstacle_takes_the_sheet_with_it(comm: MPI.Comm, integrator: str
     simulation.destroy()
 
 
-def test_impacts_add_no_energy_to_scenes_of_the_midpoint_rule(comm: MPI.Comm) -> None:
-    scene = BALL | {
-        "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
-        "initial": {"velocity": [0, 0, -5.0]},
-        "time": {"end": 0.06, "step": 0.005, "integrator": "midpoint"},
-    }
-    simulation = SteppedScene(comm, scene_of(scene))
-    start, most = simulation.budget.total, 0.0
-    while not simulation.finished:
-        simulation.step()
-        most = max(most, simulation.budget.total + simulation.budget.dissipation)
-    assert most < 1.001 * start
-    simulation.destroy()
-
-
 ON_A_TABLE: dict[str, Any] = {
     "mesh": grid(1.0, 1.0, 6, 6, "alternating") | {"transform": {"translate": [-0.5, -0.5, 0.05]}},
     "material": {"cloth": "gray-interlock"},

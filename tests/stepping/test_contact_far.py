@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, Simulation, gathered, grid, scene_of
+from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.stepping.simulation import SteppedScene
@@ -72,22 +72,6 @@ def test_falling_by_many_gaps_per_step_needs_no_shorter_steps(integrator: str) -
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | FAR | falls | timed(integrator)))
     assert not sum(simulation.step().rejected for _ in range(STEPS))
     simulation.destroy()
-
-
-def test_damping_is_a_multiple_of_the_stiffness_until_something_is_near() -> None:
-    with Simulation(SCENE | FAR, MPI.COMM_SELF) as simulation:
-        system = simulation.problem.system
-        values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
-        system.damping.freeze(system.x, system.active.frozen)
-        assert system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
-        assert not system.near
-    floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
-    with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
-        system = simulation.problem.system
-        values = system.discretisation.rows.zeros()
-        system.damping.freeze(system.x, system.active.frozen)
-        assert not system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
-        assert system.near
 
 
 @pytest.mark.parallel

@@ -21,9 +21,7 @@ from physics import (
     symmetry_planes,
 )
 
-from lyra_petsc.contact import barrier as contact_barrier
 from lyra_petsc.contact.barrier import ContactBarrier
-from lyra_petsc.contact.contact_model import ContactModel
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -251,127 +249,6 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
         simulation.destroy()
     assert contacts > 10.0
     np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-8 * size)
-
-
-def test_collisions_are_expected_if_parts_are_near_and_approach_fast(comm: MPI.Comm) -> None:
-    """With the floor, and with each other."""
-    with Simulation(falling(0.02), comm) as simulation:
-        system, n = simulation.problem.system, simulation.problem.points.n_owned
-        lower = (simulation.problem.points.mesh_vertices < 4)[:, None]
-
-        def collides(first: float, second: float) -> bool:
-            system.state.set(system.x[:n], np.where(lower, first, second) * [0.0, 0.0, 1.0])
-            system.begin_step(0.0, 0.004)
-            return system.may_collide(0.05)
-
-        assert collides(-15.0, -15.0)
-        assert not collides(-11.0, -11.0)
-        assert collides(8.0, -8.0)
-        assert not collides(5.0, -5.0)
-
-
-def test_points_as_far_from_the_end_of_a_displacement_as_allowed_are_near_its_start() -> None:
-    with Simulation(falling(0.02), MPI.COMM_SELF) as simulation:
-        contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, x = simulation.problem.system.contact.search, simulation.problem.system.x + 1.0
-        reach = 0.5 * contact.approach_limit
-        x_way = np.zeros_like(x)
-        x_way[:, 0] = 1.0
-        known.update(x, 0.3 * reach * x_way)
-        back = x - 0.69 * reach * x_way
-        assert known.fraction_covered(back, -0.1 * reach * x_way) == 1.0
-        assert known.fraction_covered(back, -reach * x_way) == pytest.approx(0.31)
-        assert known.fraction_covered(x, reach * x_way) == 1.0
-        assert known.fraction_covered(x, 2.0 * reach * x_way) == pytest.approx(0.65)
-
-
-@pytest.mark.parallel
-def test_searches_look_ahead_where_the_step_is_expected_to_lead(comm: MPI.Comm) -> None:
-    with Simulation(falling(0.02), comm) as simulation:
-        contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, near = simulation.problem.system.contact.search, simulation.problem.system.x
-        assert known.near
-        step = np.full_like(near, -3.0 * contact.approach_limit)
-        x = near - 5.0 * step
-        known.update(x)
-        assert not known.near
-        known.update(x, step, lambda steps: -steps * step)  # a wrong guess
-        assert known.fraction_covered(x, step) == 1.0
-        assert known.fraction_covered(x, -step) < 0.2
-        x = x + step
-        known.update(x, step, lambda steps: steps * step)
-        assert known.fraction_covered(x, 2.0 * step) == 1.0
-        assert known.fraction_covered(x, 3.0 * step) < 1.0
-        x = x + 2.0 * step
-        known.update(x, step, lambda steps: steps * step)  # to the floor
-        assert not known.near
-        assert known.fraction_covered(x, step) == 1.0
-        assert known.fraction_covered(x, 2.0 * step) < 1.0
-
-
-def test_only_the_start_of_increments_through_many_parts_is_searched(
-    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A Newton increment may move all vertices of a crumpled sheet through each other."""
-    monkeypatch.setattr(contact_barrier, "MAX_PAIRS", 0)
-    layers = [grid(0.3, 0.3, 8, 8) | {"transform": {"translate": [0.0, 0.0, 0.02 * n]}} for n in range(12)]
-    with Simulation({"mesh": layers, "contact": {"gap": 1e-3}}, comm) as simulation:
-        barrier = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
-        known, x = simulation.problem.system.contact.search, simulation.problem.system.x
-        numbers = simulation.problem.points.global_number[: len(x)]
-        results = np.random.default_rng(1).uniform(-0.3, 0.3, (12 * 81, 3))[numbers]
-        known.update(x, results)
-        assert 0 < barrier.n_elements < 200 * len(x)
-        assert 0.01 < known.fraction_covered(x, results) < 0.5
-
-
-@pytest.mark.parallel(alone=False)
-def test_predicted_stress_does_not_depend_on_ghosts_that_contact_adds(comm: MPI.Comm) -> None:
-    """The iterate of the prediction had other ghosts, on some ranks."""
-    layers = [grid(0.3, 0.3, 5, 5) | {"transform": {"translate": [0.0, 0.0, 0.06 * n]}} for n in range(6)]
-    numbers, rng = 6 * 36, np.random.default_rng(1)
-    small, probe = rng.uniform(-2e-3, 2e-3, (numbers, 3)), rng.uniform(-1.0, 1.0, (numbers, 3))
-    near = -small - np.repeat(np.arange(6), 36)[:, None] * [0.0, 0.0, 0.05]
-    products = []
-    for ranks in (MPI.COMM_SELF, comm):
-        with Simulation({"mesh": layers, "contact": {"gap": 0.015}}, ranks) as simulation:
-            system, points = simulation.problem.system, simulation.problem.points
-            order, ghosts = points.mesh_vertices, len(points.ghosts)
-            system.begin_step(0.0, 0.01)
-            for displacement in (small, near):
-                velocity = displacement[order] / system.stage.c
-                system.predicted_stress.set_iterate(system.evaluate(velocity).x)
-            assert any(system.points.global_max(len(system.points.ghosts) > ghosts)) == (ranks.size > 1)
-            linear = simulation.stepper.linear
-            linear.update_pattern()
-            linear.assemble_operator(near[order] / system.stage.c, 0.0)
-            given, product = linear.operator.mat.createVecs()
-            given.setArray(probe[order].ravel())
-            linear.operator.mat.mult(given, product)
-            products.append(gathered(points, product.getArray().reshape(-1, 3)))
-            given.destroy()
-            product.destroy()
-    np.testing.assert_allclose(products[1], products[0], rtol=0.0, atol=1e-9 * np.abs(products[0]).max())
-
-
-@pytest.mark.parallel(alone=False)
-def test_springs_of_parts_at_rest_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
-    """What moves may be on another rank."""
-    gap, heights = 0.01, (0.0, 0.012, 0.3)
-    content = {
-        "mesh": [SQUARE | {"transform": {"translate": [0.01 * z, 0.0, z]}} for z in heights],
-        "contact": {"gap": gap},
-    }
-    numbers = []
-    for ranks in (MPI.COMM_SELF, comm):
-        with Simulation(content, ranks) as simulation:
-            system, points = simulation.problem.system, simulation.problem.points
-            system.begin_step(0.0, 0.01)
-            increment = np.zeros((points.n_owned, 3))
-            increment[points.mesh_vertices >= 8, 2] = gap / system.stage.c
-            springs = ContactModel(*system.contact_at(system.stationary_velocity())).springs_along(increment)
-            numbers.append(points.global_sum(float(springs.counted.sum()))[0])
-    assert numbers[1] == numbers[0] > 0.0
 
 
 def test_ranks_share_the_pairs_of_a_stack(comm: MPI.Comm) -> None:

@@ -33,20 +33,6 @@ def test_damping_plus_stiffness_is_a_multiple_if_all_factors_are_equal(comm: MPI
             assert comm.size > 1  # a rank without an element of a term takes the long way
 
 
-def test_different_factors_give_no_multiple() -> None:
-    scene = {
-        "mesh": grid(0.5, 0.4, 4, 3),
-        "material": MATERIAL,
-        "handles": [{"nodes": [0], "stiffness": 3.0}],
-    }
-    with Simulation(scene, MPI.COMM_SELF) as simulation:
-        system = simulation.problem.system
-        system.damping.freeze(system.x, system.active.frozen)
-        values = system.discretisation.rows.zeros()
-        none = np.empty(0, dtype=np.int64)
-        assert not system.damping.assemble_with_stiffness(0.3, system.mass, values, none)
-
-
 def test_damping_forces_follow_velocities_and_geometry(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
@@ -57,46 +43,3 @@ def test_damping_forces_follow_velocities_and_geometry(comm: MPI.Comm) -> None:
         np.testing.assert_allclose(system.damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
         system.damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.active.frozen)
         assert np.abs(system.damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
-
-
-@pytest.mark.parallel(2)
-def test_damping_forces_if_the_matrix_contains_the_damping(comm: MPI.Comm) -> None:
-    scene = {
-        "mesh": grid(0.5, 0.4, 5, 4),
-        "material": MATERIAL,
-        "gravity": [0.0, 0.0, -9.81],
-        "handles": [{"nodes": [0, 5]}, {"nodes": [20], "axes": ["z"]}],
-        "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
-    }
-    with Simulation(scene, comm) as simulation:
-        system = simulation.problem.system
-        for _ in range(3):
-            simulation.step(0.01)
-        matrix = simulation.stepper.linear.operator.rows.copy()
-        damping, v = system.damping, np.cos(3.0 * system.x)
-        found = damping.product(v)
-        assert (damping._values is None) == (damping._multiple is not None)
-        assert damping._multiple is not None or comm.size > 1
-        assert np.array_equal(
-            matrix, simulation.stepper.linear.operator.rows
-        )  # as a lagged Jacobian needs it
-        system.forget_rows()
-        expected = damping.product(v)
-        scale = comm.allreduce(float(np.abs(expected).max(initial=0.0)), MPI.MAX)
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * scale)
-
-
-def test_rows_are_released_before_they_hold_another_matrix() -> None:
-    scene = {
-        "mesh": grid(0.5, 0.4, 5, 4),
-        "material": MATERIAL,
-        "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
-    }
-    with Simulation(scene, MPI.COMM_SELF) as simulation:
-        system = simulation.problem.system
-        damping, rows, none = system.damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
-        damping.freeze(system.x, system.active.frozen)
-        assert damping.assemble_with_stiffness(0.3, system.mass, rows, none)
-        once = damping.product(v := np.cos(3.0 * system.x))
-        damping.assemble(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may
-        np.testing.assert_allclose(damping.product(v), once, rtol=0.0, atol=1e-12 * np.abs(once).max())

@@ -14,7 +14,6 @@ from physics import CLOTH, direct_solver, gathered, grid, stepped
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
-from lyra_petsc.mesh.points import describe_worst
 from lyra_petsc.stepping.failure.failure_report import Failure
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics import equilibrium
@@ -146,16 +145,6 @@ def test_a_linear_failure_is_distinguished(comm: MPI.Comm) -> None:
         assert "or try -ksp_max_it above 2" in error.details
 
 
-def test_a_velocity_that_is_not_finite_stops_the_run_with_a_message(comm: MPI.Comm) -> None:
-    def lost(simulation: SteppedScene, out: Array) -> None:
-        out[:] = np.inf
-
-    scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}}
-    with failing(comm, scene, lost) as (_, error, failure):
-        assert failure.diagnosis.kind == "overflow"
-        assert "overflow" in str(error)
-
-
 def test_a_failed_load_step(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(equilibrium, "MAX_SOLVES", 2)
     with failing(comm, {"time": {"analysis": "static"}}) as (simulation, error, failure):
@@ -196,19 +185,3 @@ def test_vertices_are_named_by_the_numbers_of_their_files(comm: MPI.Comm, shared
         assert "vertex 12 (vertex 8 of right) around (5, 1, 0) m" in str(error)
     with failing(comm, {"mesh": mesh, "handles": [{"nodes": [0, 4]}]}, pushed(2, 1e6)) as (_, error, _):
         assert "vertex 2 (node 30 of two.msh) around (0, 1, 0) m" in str(error)
-
-
-def test_of_equal_values_the_smallest_vertex_number_is_reported(comm: MPI.Comm) -> None:
-    # ten rows dealt to the ranks backwards; rows 3, 4 and 8 are equal but for round-off
-    numbers = np.arange(10)[::-1][comm.rank :: comm.size]
-    sizes = np.array([0.0, 1, 2, 7 * (1 - 1e-9), 7, 5, 6, 4, 7 * (1 + 1e-9), 3])[numbers]
-    assert describe_worst(comm, sizes, numbers, lambda row: int(numbers[row])) == 3
-    assert (
-        describe_worst(comm, np.where(numbers < 6, sizes, np.inf), numbers, lambda row: int(numbers[row]))
-        == 6
-    )
-    assert describe_worst(comm, np.zeros(len(numbers)), numbers, lambda row: int(numbers[row])) == 0
-    # a rank without rows
-    mine = numbers if comm.rank == comm.size - 1 else numbers[:0]
-    least = int(np.arange(10)[::-1][comm.size - 1 :: comm.size].min())
-    assert describe_worst(comm, np.ones(len(mine)), mine, lambda row: int(mine[row])) == least

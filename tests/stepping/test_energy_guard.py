@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from physics import CLOTH, finished, grid, scene_of, shape
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.energy_gain import Gain
-from lyra_petsc.stepping.energy_guard import GuardState, _append_gain
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
@@ -166,27 +164,6 @@ def test_round_off_of_a_sheet_at_rest_is_no_gain(integrator: str) -> None:
         assert simulation.totals["rejected"] == 0
 
 
-def test_a_gain_that_compensates_a_loss_leaves_the_recent_sum_with_it() -> None:
-    assert _append_gain([-0.2, -0.03], 0.05, 4) == pytest.approx([-0.18, 0.0, 0.0])
-    assert _append_gain([-0.2, 0.0, 0.0, 0.0], 0.05, 4) == [-0.2, 0.0, 0.0, 0.0, 0.05]
-    assert _append_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
-    assert _append_gain([-0.2], 0.05, 1) == [-0.2, 0.05]
-    assert _append_gain([0.1], -0.05, 4) == [0.1, -0.05]
-
-
-def test_a_step_without_gain_is_accepted_after_steps_with_gains() -> None:
-    """As at the start of contact, where the bound of the sum is smaller."""
-    one = simulation(MPI.COMM_SELF, "alpha2", FREE)
-    assert one.guard is not None
-    stood = []
-    for gain in (-1e-6, 1e-6):
-        one.guard.gains = GuardState(start=0.0, scale=1.0, total=0.2, recent=[0.2])
-        step = Gain(gain, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1e-12)
-        stood.append(one.guard.judge(step))
-    one.destroy()
-    assert stood == [True, False]
-
-
 @pytest.mark.parallel(2)
 def test_stiff_damping_creates_no_energy_after_backward_euler_steps(comm: MPI.Comm) -> None:
     """Moments curl a plate on a floor and release it: velocities jump when it touches the floor."""
@@ -228,14 +205,6 @@ def test_stiffly_damped_sheets_start_with_a_step_of_backward_euler(integrator: s
     assert 0 < rejected[0] <= 3
     assert errors[0] < 0.01
     assert errors[2] < errors[1] / 3.3 < errors[0] / 9.0  # of second order
-
-
-def test_repeated_steps_are_counted() -> None:
-    one = simulation(MPI.COMM_SELF, "bdf2", FREE, 0.05)
-    first = one.step()
-    assert first.rejected >= 1
-    assert first.dt == pytest.approx(0.01 / 2**first.rejected)
-    one.destroy()
 
 
 def test_checkpoints_have_the_state_of_the_guard() -> None:

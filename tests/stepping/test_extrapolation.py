@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 from physics import Simulation, grid
 
-from lyra_petsc.stepping.newton.extrapolation import Extrapolation, lagrange_weights
+from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 
 TIMES = [0.0, 0.1, 0.25, 0.3, 0.42, 0.5]  # unequal steps, as before a state is written
 
@@ -30,42 +30,6 @@ def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
 @pytest.mark.parametrize("motion", [lambda t: 3.0, lambda t: 2.0 - t, lambda t: 1.0 + t - 4.0 * t * t])
 def test_polynomials_are_extrapolated_exactly(motion: Callable[[float], float], comm: MPI.Comm) -> None:
     np.testing.assert_allclose(expected(comm, motion), motion(TIMES[-1]) * SHAPE, rtol=1e-12)
-
-
-@pytest.mark.parallel(2)
-def test_tangents_and_parabolas_are_extrapolated_exactly(comm: MPI.Comm) -> None:
-    extrapolation = Extrapolation(comm)
-    extrapolation.record(0.0, SHAPE)
-    (tangent,) = extrapolation.tangent_predictions(0.5, 3.0 * SHAPE)
-    np.testing.assert_allclose(tangent, 1.5 * SHAPE)
-    extrapolation.record(0.2, (1.0 + 0.2 - 4.0 * 0.04) * SHAPE)
-    tangent, parabola = extrapolation.tangent_predictions(0.5, (1.0 - 8.0 * 0.2) * SHAPE)
-    np.testing.assert_allclose(tangent, -0.18 * SHAPE)
-    np.testing.assert_allclose(parabola, (0.5 - 4.0 * 0.25 - 0.2 + 4.0 * 0.04) * SHAPE)
-
-
-@pytest.mark.parallel(2)
-def test_alternating_values_are_extrapolated_as_constant(comm: MPI.Comm) -> None:
-    extrapolation, sign = Extrapolation(comm), 1.0
-    for step in range(6):
-        v = sign * SHAPE
-        guess = extrapolation.extrapolate(step + 1.0, float(step), v)
-        sign = -sign
-    np.testing.assert_allclose(guess, v)
-
-
-def test_a_repeated_step_does_not_count_as_a_new_one() -> None:
-    extrapolation = Extrapolation(MPI.COMM_SELF)
-    extrapolation.extrapolate(1.0, 0.0, 1.0 * SHAPE)
-    extrapolation.extrapolate(2.0, 1.0, 2.0 * SHAPE)
-    extrapolation.extrapolate(3.0, 2.0, 3.0 * SHAPE)
-    for _ in range(2):
-        np.testing.assert_allclose(extrapolation.extrapolate(2.5, 2.0, 3.0 * SHAPE), 3.5 * SHAPE)
-
-
-def test_lagrange_weights_interpolate() -> None:
-    assert lagrange_weights([0.0, 1.0, 3.0], 1.0) == [0.0, 1.0, 0.0]
-    assert sum(lagrange_weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
 
 
 @pytest.mark.parallel(2)

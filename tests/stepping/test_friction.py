@@ -629,24 +629,3 @@ def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, share
     resumed.destroy()
     assert np.abs(unbroken - before).max() > 1e-6
     np.testing.assert_allclose(after, unbroken, rtol=0.0, atol=1e-9)
-
-
-def test_each_pair_remembers_its_own_slip(comm: MPI.Comm) -> None:
-    """Pairs and their elements are in the same order, also if nearest points are on vertices or edges."""
-    sheets = grid(0.4, 0.4, 8, 8, "alternating"), *2 * [grid(0.4, 0.4, 7, 9)]
-    content = {
-        "mesh": [mesh | {"transform": {"translate": [0, 0, 0.02 * i]}} for i, mesh in enumerate(sheets)],
-        "handles": [{"nodes": list(range(81))}],
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"friction": 0.3, "thickness": 0.005},
-    }
-    simulation = SteppedScene(comm, scene_of(content))
-    (friction,) = (term for term in simulation.problem.terms.values() if isinstance(term, CoulombFriction))
-    for _ in range(4):
-        end = simulation.step().time
-        simulation.problem.system.begin_step(end, end + 1e-3)
-        pairs, *_ = friction.contact_state()
-        numbers = simulation.problem.system.discretisation.layout.global_number
-        np.testing.assert_array_equal(numbers[friction.stencil[: friction.n_owned]], pairs.stencil)
-    assert comm.allreduce(len(pairs.stencil)) > 50
-    simulation.destroy()

@@ -38,17 +38,6 @@ def test_bdf2_differentiates_parabolas_exactly(steps: tuple[float, ...]) -> None
     assert sum(scheme.weights(steps[-1])[1]) == pytest.approx(1.0, abs=1e-14)
 
 
-def test_bdf2_restarts_with_given_accelerations() -> None:
-    scheme, resumed = Bdf2(), Bdf2()
-    scheme.set_acceleration(parabola(1.0))
-    resumed.restore(*scheme.saved_state())
-    assert not resumed.needs_acceleration
-    stages = [each.stage(parabola(0.0), parabola(0.0), 0.1) for each in (scheme, resumed)]
-    assert stages[0].v is not None
-    assert stages[1].v is not None
-    np.testing.assert_array_equal(stages[0].v, stages[1].v)
-
-
 def amplification(radius: float, omega_dt: float) -> float:
     """Spectral radius of generalised-α on an oscillator, from its recurrences."""
     columns = []

@@ -2,43 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from mpi4py import MPI
 from physics import CLOTH, grid, shape, stepped
-
-from lyra_petsc.stepping.newton.linear_system import SET_UP, Reuse
-
-MASK = np.zeros((1, 3), dtype=bool)
-
-
-def system(c: float = 0.01, mask: object = MASK) -> Any:
-    return SimpleNamespace(stage=SimpleNamespace(c=c), prescribed=SimpleNamespace(mask=mask))
-
-
-def test_a_preconditioner_is_kept_until_the_average_cost_would_grow() -> None:
-    reuse, kept = Reuse(enabled=True), []
-    for iterations in (10, 11, 12, 13, 14, 15, 16, 17):
-        kept.append(reuse.begin_solve(system()))
-        reuse.end_solve(iterations)
-    # (8 + 10 + 11 + 12 + 13) / 4 = 13.5 > 13, (54 + 14) / 5 = 13.6 < 14
-    assert SET_UP == 8.0
-    assert kept == [False, True, True, True, True, False, True, True]
-
-
-def test_another_step_length_or_other_prescribed_unknowns_need_a_new_one() -> None:
-    reuse = Reuse(enabled=True)
-    for other in (system(), system(c=0.02), system(0.02, MASK.copy()), system(mask=MASK)):
-        assert not reuse.begin_solve(other)
-        reuse.end_solve(10)
-        assert reuse.begin_solve(other)
-        reuse.end_solve(10)
-    never = Reuse(enabled=False)
-    never.end_solve(10)
-    assert not never.begin_solve(system())
 
 
 @pytest.mark.parallel(2)

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, grid, obj_file, shape, stepped
+from physics import CLOTH, grid, shape, stepped
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.linear import presets
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics.stability import add_exact_hessian
 
@@ -166,35 +164,6 @@ def test_ts_adapt_dt_max_limits_the_increment(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(np.diff(factors).max(), 0.2)
 
 
-def slit_ring(folder: Path, n: int) -> dict[str, Any]:
-    """The slit annular plate of Sze, Liu and Lo 2004, n cells wide, lifted at one side of the slit."""
-    around = round(20 * n / 3)
-    flat, faces = rectangle(around, n, 2.0 * np.pi, 1.0)
-    radius = 6.0 + 4.0 * flat[:, 1]
-    vertices = np.column_stack([radius * np.cos(flat[:, 0]), radius * np.sin(flat[:, 0]), 0.0 * radius])
-    lifted = [row * (around + 1) for row in range(n + 1)]
-    return {
-        "mesh": obj_file(folder / "ring.obj", vertices, faces[:, ::-1]),
-        "material": {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0},
-        "gravity": [0, 0, 0],
-        "handles": [{"nodes": [each + around for each in lifted], "clamp": True}],
-        "loads": [
-            {"nodes": lifted[1:-1], "force": [0.0, 0.0, 3.2 * (n - 1) / n]},
-            {"nodes": [lifted[0], lifted[-1]], "force": [0.0, 0.0, 3.2 / n]},
-        ],
-        "solver": {"force_tolerance": 1e-6, "step_tolerance": 1e-6},
-    }
-
-
-@pytest.mark.parallel(1)
-def test_a_shell_takes_few_iterations(comm: MPI.Comm, tmp_path: Path) -> None:
-    """Load steps are extrapolated from the last ones, and the first one is solved without inertia."""
-    time, petsc = {"analysis": "static", "step": 1.0 / 15.0}, {"ts_adapt_dt_max": 1.0 / 15.0}
-    with at_rest(comm, **slit_ring(tmp_path, 6), time=time, petsc=petsc) as simulation:
-        assert simulation.step_number == 15
-        assert simulation.totals["newton_iterations"] <= 80  # 79; without either 92
-
-
 def test_the_tangent_includes_moving_handles(comm: MPI.Comm) -> None:
     """Compared with the difference of two equilibria of a strip under its weight that a clamp lifts."""
     x, rate = [], np.empty(0)
@@ -286,18 +255,6 @@ def test_a_sheet_without_an_equilibrium_fails_soon(name: str, comm: MPI.Comm) ->
         assert re.search(words, tried[-1].words)
         assert sum(each.newton_iterations for each in tried) < 2500  # it took 36,780
         assert np.array_equal(shape(simulation), start)
-
-
-def test_the_limit_of_direct_solvers_counts_vertices_not_directors(
-    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Multigrid finds equilibria of stiff shells slowly or not at all."""
-    monkeypatch.setattr(presets, "DIRECT_UNTIL", 60)
-    material = SHEET["material"] | {"bending_model": "midedge"}
-    with motion(comm, material=material, time={"analysis": "static"}) as simulation:
-        points = simulation.problem.points
-        assert points.n_vertices_global < 60 < points.n_global
-        assert simulation.stepper.presets[0] == "direct"
 
 
 def test_static_analyses_end_at_their_tolerance(comm: MPI.Comm) -> None:
