@@ -2,8 +2,7 @@
 
 Numba does not vectorise these loops. Blocks are (n_blocks, 9), column by column; a row of blocks is
 multiplied one column of a block at a time. With three numbers a fourth is read and computed; for blocks it
-always belongs to the same block. ``tests/kernels/plain_vectors.py`` has the same functions in plain numba;
-docs/notes/performance.md says what the difference is.
+always belongs to the same block; docs/notes/performance.md says what the difference to plain numba is.
 """
 
 from __future__ import annotations
