@@ -422,9 +422,6 @@ class ContactBarrier(LimitsStep):
         active, on_obstacles = self.active_pairs(x, frozen.stage).forces, np.zeros_like(frozen.stage)
         contact_pairs.add_gradient(x, frozen.stage, *self._pair_data, active, out, on_obstacles)
 
-    def acts(self, x: Array, frozen: ObstaclePositions) -> bool:
-        return bool(self.active_elements(x, frozen).any())
-
     def overrun(self, x: Array, frozen: ObstaclePositions) -> tuple[float, str]:
         return 0.0, ""
 

@@ -9,7 +9,14 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.terms.protocols import HasDirectors, LimitsStep, MovingTargets, SharesFrozen, Stateful
+from lyra_petsc.terms.protocols import (
+    Dissipates,
+    HasDirectors,
+    LimitsStep,
+    MovingTargets,
+    SharesFrozen,
+    Stateful,
+)
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
@@ -20,6 +27,8 @@ class ActiveTerms:
     Parameters
     ----------
     terms : sequence of Term
+    obstacles : Elastic or None
+        The contact with obstacles that move.
 
     Attributes
     ----------
@@ -33,8 +42,8 @@ class ActiveTerms:
         Terms of ``sheet`` with moving targets or obstacles; of these the ones with targets.
     limiting : list of LimitsStep
         Terms that limit the length of steps, besides contact.
-    stateful : list of Stateful
-        Terms with a state.
+    stateful, dissipating : list of Stateful
+        Terms with a state; those of which steps make heat.
     sliding : list of CoulombFriction
         Friction of contact, if there is any.
     with_edges : list of HasDirectors
@@ -45,7 +54,7 @@ class ActiveTerms:
         Frozen data of each term in the step.
     """
 
-    def __init__(self, terms: Sequence[Term]) -> None:
+    def __init__(self, terms: Sequence[Term], obstacles: Elastic | None = None) -> None:
         self.elastic = [term for term in terms if isinstance(term, Elastic)]
         self.viscous = [term for term in terms if isinstance(term, Viscous)]
         self.loads = [term for term in terms if isinstance(term, Load)]
@@ -53,8 +62,9 @@ class ActiveTerms:
         roles = {term: term.registration.role for term in self.elastic}
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
-        self.moving = [term for term in self.sheet if term.moving]
-        self.targets = [term for term in self.moving if isinstance(term, MovingTargets)]
+        self.targets = [term for term in self.sheet if isinstance(term, MovingTargets)]
+        self.moving = [term for term in self.sheet if term in self.targets or term is obstacles]
+        self.dissipating = [term for term in self.sheet if isinstance(term, Dissipates)]
         limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
         self.limiting = [term for term in limiting if not term.registration.of_contact]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
-from lyra_petsc.terms.protocols import MovingTargets, PullsHandles
+from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
@@ -148,7 +148,8 @@ class EnergyBalance:
         for term in system.active.elastic:
             if name := term.registration.energy:
                 frozen = system.active.frozen[term]
-                energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
+                energy = float(term.energies(system.x, frozen).sum())
+                energy -= term.heat(system.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
                 moving += energy if isinstance(term, MovingTargets) else 0.0
         for load in system.active.loads:
@@ -195,7 +196,7 @@ class EnergyBalance:
         by_targets += system.move_targets_to_end()
         work = _work_of(external, x_before, system.x) + by_targets
         del external  # to save memory
-        fabric = sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
+        fabric = sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.dissipating)
         impacts = system.contact_impulses.heat if system.contact_impulses else 0.0
         inertia = kinetic_energy(system.mass, system.stage_velocity - system.history)
         before, moving_before = self.budget, self._moving_energy

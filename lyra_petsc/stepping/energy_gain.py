@@ -42,7 +42,6 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
@@ -95,7 +94,7 @@ class EndForces:
     def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
         self._system = system
         elastic = system.active.elastic
-        self._targets = [t for t in elastic if t.moving or t.registration.role is Role.CONSTRAINT]
+        self._targets = [*system.active.moving, *system.active.constraints]
         self._plain = [term for term in elastic if term not in self._targets]
         self._weights = [load for load in system.active.loads if load.registration.energy]
         self._forces = [load for load in system.active.loads if not load.registration.energy]
@@ -198,7 +197,11 @@ class EndForces:
             frozen = first[term], last[term]
             before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
             rise += after - before
-            work += term.work_of_targets((x0, x1), frozen)
+            if contact is not None and term is contact.friction:
+                work += contact.friction.work_of_targets((x0, x1), frozen)
+            else:  # the change of energy at fixed positions, averaged over both ends
+                changes = (term.energies(x, frozen[1]) - term.energies(x, frozen[0]) for x in (x0, x1))
+                work += 0.5 * sum(float(change.sum()) for change in changes)
             if not term.registration.energy:
                 springs = [springs[0] + before, springs[1] + after]
         if self._drift.any():

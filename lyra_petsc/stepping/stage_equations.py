@@ -40,7 +40,7 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.start_acceleration import StartAcceleration
 from lyra_petsc.stepping.state import State, kinetic_energy
 from lyra_petsc.terms.handles.prescribed_handles import ExactHandles
-from lyra_petsc.terms.protocols import FollowsHandles
+from lyra_petsc.terms.protocols import FollowsHandles, LimitsStep
 from lyra_petsc.terms.term import Elastic, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
@@ -124,7 +124,8 @@ class StageEquations:
         events: list[float],
     ) -> None:
         self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
-        self.active = active = ActiveTerms(terms)
+        moves = contact is not None and contact.obstacles_move
+        self.active = active = ActiveTerms(terms, contact.barrier if contact and moves else None)
         self.contact = contact
         self.usual = self.in_contact = integrator
         if contact is not None or active.limiting:
@@ -748,11 +749,15 @@ class StageEquations:
                 continue
             each = term.energies(at.x, self.active.frozen[term])
             parts.append(rate * float(each.sum()))
-            stiffness = self.stiffnesses.get(term)
-            if stiffness is None:
+            of_size: float | Array = rate * self._size
+            if isinstance(term, LimitsStep):
                 stiffness = term.stiffness(at.x, self.active.frozen[term])[: term.n_owned]
-            sizes = term.coordinate_scale(self._size)
-            of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
+                sizes = term.coordinate_scale(self._size)
+                of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
+            elif term in self.stiffnesses:
+                stiffness = self.stiffnesses[term]
+            else:
+                stiffness = term.force_scale(1.0)[: term.n_owned]
             # `**` would raise an error where the square is infinite
             square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
         parts.append(-rate * float(np.vdot(self.applied.force, at.x[:n] - self.x[:n])))
@@ -769,8 +774,8 @@ class StageEquations:
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
         """Force over displacement [N/m] of the owned elements of each term for which it is constant."""
-        active = self.active
-        constant = [t for t in active.elastic if not (t.registration.of_contact or t in active.limiting)]
+        elastic = self.active.elastic
+        constant = [t for t in elastic if not (t.registration.of_contact or isinstance(t, LimitsStep))]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in constant}
 
     def largest_force(self) -> float:
@@ -796,7 +801,8 @@ class StageEquations:
         for one linear solve; collective.
         """
         terms, frozen = self.active.limiting, self.active.frozen
-        return bool(terms) and any(self.points.global_max(any(term.acts(x, frozen[term]) for term in terms)))
+        acts = any(term.energies(x, frozen[term]).any() for term in terms)
+        return bool(terms) and any(self.points.global_max(acts))
 
     def is_within_limits(self, x: Array) -> bool:
         """Whether positions x (n_local, 3) are within the limits of all terms; collective."""

@@ -90,14 +90,20 @@ class LimitsStep(Elastic):
         """
 
     @abstractmethod
-    def acts(self, x: Array, frozen: Any) -> bool:
-        """Whether any element of this rank has an energy at positions x (n_local, 3)."""
-
-    @abstractmethod
     def overrun(self, x: Array, frozen: Any) -> tuple[float, str]:
         """How far this rank's worst element is beyond the limit at positions x (n_local, 3), and a text that
         says so; 0 and no text within the limit.
         """
+
+    @abstractmethod
+    def stiffness(self, x: Array, frozen: Any) -> Array:
+        """Force over displacement [N/m] of each element at positions x (n_local, 3), (E,), without bound."""
+
+    def coordinate_scale(self, size: float) -> float | Array:
+        """Magnitude [m] of the coordinates whose differences each element's energy depends on, where the
+        largest coordinate of the sheet is ``size`` [m].
+        """
+        return size
 
 
 class FollowsHandles(Elastic):
@@ -111,10 +117,6 @@ class FollowsHandles(Elastic):
 
 class MovingTargets(FollowsHandles):
     """An energy stored in the sheet on which targets do work as they move."""
-
-    @property
-    def moving(self) -> bool:
-        return True
 
     @abstractmethod
     def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:

@@ -90,9 +90,6 @@ class StretchLimit(LimitsStep):
         part = np.minimum((self._limit[rows, None] - stretch) / self._width[rows, None], 1.0)
         return Stretched(rows, gradients @ axes, direction, stretch, part)
 
-    def acts(self, x: Array, frozen: Any = None) -> bool:
-        return bool((self._largest(x) > self._limit - self._width).any())
-
     def energies(self, x: Array, frozen: Any = None) -> Array:
         out, at = np.zeros(self.n_owned), self._stretched(x, self.n_owned)
         scale = self._area[at.rows] * self._stiffness[at.rows] * self._width[at.rows] ** 2

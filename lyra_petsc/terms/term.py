@@ -159,11 +159,6 @@ class Term(ABC):
 class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
-    @property
-    def moving(self) -> bool:
-        """Whether the energy depends on moving targets or obstacles, which thereby do work on the sheet."""
-        return False
-
     def connect(self, terms: Iterable[Term]) -> None:
         """Look up the other terms of the scene that this one needs; called before all other methods."""
 
@@ -209,27 +204,6 @@ class Elastic(Term):
 
         It is proportional to ``size`` [m], the largest coordinate.
         """
-
-    def stiffness(self, x: Array, frozen: Any) -> Array:
-        """Force over displacement [N/m] of each element at positions x (n_local, 3), (E,)."""
-        return self.force_scale(1.0)
-
-    def coordinate_scale(self, size: float) -> float | Array:
-        """Magnitude [m] of the coordinates whose differences each element's energy depends on, where the
-        largest coordinate of the sheet is ``size`` [m].
-        """
-        return size
-
-    def work_of_targets(self, ends: tuple[Array, Array], frozen: tuple[Any, Any]) -> float:
-        """Work [J] of the targets' motion in a step: the change of energy at fixed positions, averaged over
-        the positions ``ends`` (n_local, 3) at its start and end. ``frozen`` has the targets at both times.
-        """
-        first, last = frozen
-        return 0.5 * sum(float((self.energies(x, last) - self.energies(x, first)).sum()) for x in ends)
-
-    def heat(self, x: Array, frozen: Any) -> float:
-        """Energy [J] of the owned elements that becomes heat when the step to x is accepted."""
-        return 0.0
 
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
         """This rank's part of each additional column of history.csv that the registration names."""

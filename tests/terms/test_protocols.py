@@ -43,6 +43,9 @@ from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
+MAX_MEMBERS = 15
+"""Largest number of public members of the interface of an ordinary term."""
+
 IDENTITY = {"name", "needed", "role", "module_name", "of_contact"}
 
 FLAGS: dict[str, Any] = {
@@ -70,6 +73,11 @@ def having(interface: type[Elastic]) -> Any:
 def bent(x: Array, size: float = 0.02, seed: int = 5) -> Array:
     """Positions or unknowns x with a random disturbance [m]."""
     return x + np.random.default_rng(seed).uniform(-size, size, x.shape)
+
+
+def test_the_interface_of_an_ordinary_term_is_small() -> None:
+    public = {name for kind in Elastic.__mro__[:-1] for name in vars(kind) if not name.startswith("_")}
+    assert len(public) <= MAX_MEMBERS, sorted(public)
 
 
 @having(Stateful)
@@ -159,7 +167,7 @@ def test_no_step_passes_a_limit(name: str, tmp_path: Path) -> None:
         term, x = simulation.problem.terms[name], simulation.system.x
         assert isinstance(term, LimitsStep)
         frozen, dx = frozen_by(term, simulation.system), 3.0 * x
-        assert not term.acts(x, frozen)
+        assert not term.energies(x, frozen).any()
         assert term.overrun(x, frozen) == (0.0, "")
         excess, text = term.overrun(x + dx, frozen)
         assert excess > 0.0
@@ -168,8 +176,8 @@ def test_no_step_passes_a_limit(name: str, tmp_path: Path) -> None:
         fraction = term.largest_step(x, dx, frozen)
         assert 0.0 < fraction < 1.0
         near = x + fraction * dx
-        assert term.acts(near, frozen)
-        assert np.isfinite(term.energies(near, frozen)).all()
+        assert 0.0 < term.energies(near, frozen).sum() < np.inf
+        assert term.stiffness(near, frozen).max() > term.stiffness(x, frozen).max() > 0.0
         assert term.largest_step(x, 1e-6 * dx, frozen) == 1.0
 
 
@@ -219,12 +227,12 @@ class IdleLimit(Idle, LimitsStep):
         self.calls.add("largest_step")
         return 1.0
 
-    def acts(self, x: Array, frozen: Any) -> bool:
-        self.calls.add("acts")
-        return False
-
     def overrun(self, x: Array, frozen: Any) -> tuple[float, str]:
+        self.calls.add("overrun")
         return 0.0, ""
+
+    def stiffness(self, x: Array, frozen: Any) -> Array:
+        return np.zeros(self.n_elements)
 
 
 class IdleState(Idle, Stateful):
@@ -261,7 +269,7 @@ class IdleState(Idle, Stateful):
 
 INTERFACES: dict[str, tuple[type[Idle], set[str]]] = {
     "MovingTargets": (IdleTargets, {"freeze"}),
-    "LimitsStep": (IdleLimit, {"acts"}),
+    "LimitsStep": (IdleLimit, {"overrun"}),
     "Stateful": (IdleState, {"accept"}),
 }
 """A term with each interface, and the methods that the program must call with every integrator."""

@@ -216,7 +216,7 @@ class BalanceRecorder:
         constraints = system.active.constraints
         self._sheet_terms = [term for term in system.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
-        moving = [term for term in self._sheet_terms if term.moving]
+        moving = system.active.moving
         self._turning = [term for term in moving if term.registration.of_contact or not self._identity]
         self.record_state()
 
