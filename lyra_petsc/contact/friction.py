@@ -23,7 +23,17 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import friction_pairs
 from lyra_petsc.contact.barrier import HALFWAY_CURVATURE, ContactBarrier, Contacts
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE
-from lyra_petsc.contact.friction_pairs import COLUMNS, FACTOR, FORCE, SLID, STIFFNESS
+from lyra_petsc.contact.friction_pairs import (
+    BETA,
+    COLUMNS,
+    CONTACT,
+    FACTOR,
+    FORCE,
+    SLID,
+    SLIP,
+    START,
+    STIFFNESS,
+)
 from lyra_petsc.kernels.sorting import sort_rows
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
@@ -74,8 +84,8 @@ class ObstacleMotion(NamedTuple):
 
     Attributes
     ----------
-    time : float
-        The end of the step [s].
+    start, time : float
+        Start and end of the step [s].
     motions : list of (3, 3) and (3,)
         Rotation and translation [m] of each obstacle from the time at which the pairs were found to the time
         of the forces. Pairs are found at the start of the step, or in statics after a part of a load step.
@@ -83,6 +93,7 @@ class ObstacleMotion(NamedTuple):
         Points [m] and normals of the obstacles at the end of the step.
     """
 
+    start: float
     time: float
     motions: list[tuple[Array, Array]]
     end_points: Array
@@ -177,6 +188,11 @@ class _EndedStep(NamedTuple):
     pairs: Pairs
     loads: Array
     work: Array
+
+
+ContactState = tuple[Pairs, Array, Array, float | None]
+"""Pairs, heat (n_vertices,) [J] of sliding, loads of obstacles, and the time [s] at which pairs were found
+after a part of a load step."""
 
 
 def _no_pairs() -> Pairs:
@@ -357,7 +373,7 @@ class CoulombFriction(Stateful):
         obstacles = self._contact.obstacles
         start = step.start if self._contact_time is None else self._contact_time
         motions = obstacles.rigid_motions(start, step.target_time)
-        return ObstacleMotion(step.end, motions, obstacles.positions(step.end))
+        return ObstacleMotion(step.start, step.end, motions, obstacles.positions(step.end))
 
     def _tangential(self, vectors: Array, rows: Any = slice(None)) -> Array:
         """Tangential components (n, 2) of vectors (n, 3) at some pairs."""
@@ -472,7 +488,7 @@ class CoulombFriction(Stateful):
             old, data, heat = self._moved_pairs(x, frozen)
             self.obstacle_loads, number = self._forces(x, data), self._obstacle[: self.n_owned]
             on = np.flatnonzero(number >= 0)
-            slip = np.linalg.norm(old.data[:, friction_pairs.SLIP : SLID], axis=1)
+            slip = np.linalg.norm(old.data[:, SLIP:SLID], axis=1)
             np.add.at(self.obstacle_loads[:, 7], number[on], (self._stiffness[: self.n_owned] * slip)[on])
             np.add.at(self._work, self.stencil[: self.n_owned, 0], heat)
             self._update_pairs(x, frozen.end_points, old)
@@ -485,7 +501,7 @@ class CoulombFriction(Stateful):
         (data, slip), owned = self._kernel_data(frozen.motions), slice(self.n_owned)
         slip, heat, slides = self._return_map(x, data, slip)
         old = self._element_pairs.data.copy()
-        old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[owned], slides[owned]
+        old[:, SLIP:SLID], old[:, SLID] = slip[owned], slides[owned]
         return self._element_pairs._replace(data=old), data, heat[owned]
 
     def end_friction(
@@ -509,7 +525,7 @@ class CoulombFriction(Stateful):
             normal_force, total[previous], out=np.zeros_like(normal_force), where=normal_force > 0.0
         )
         of_slip = np.zeros((len(old.key) + 1, 3))
-        of_slip[:-1] = -self._stiffness[owned, None] * old.data[:, friction_pairs.SLIP : SLID]
+        of_slip[:-1] = -self._stiffness[owned, None] * old.data[:, SLIP:SLID]
         arrays = self._unpacked(pairs.data)
         beta, tangents, gradients = (
             np.concatenate([new, given[owned]])
@@ -551,7 +567,7 @@ class CoulombFriction(Stateful):
         limit = np.where(sticks, friction.static, friction.kinetic)
         less = np.divide(limit, before, out=np.ones_like(size), where=before > limit)
         n = len(pairs.key)
-        pairs.data[:, friction_pairs.SLIP : SLID] *= less[:n, None]
+        pairs.data[:, SLIP:SLID] *= less[:n, None]
         pairs.data[:, SLID] = ~sticks[:n]
         on = np.flatnonzero(friction.obstacle >= 0)
         np.add.at(loads[:, 7], friction.obstacle[on], size[on])
@@ -571,12 +587,47 @@ class CoulombFriction(Stateful):
     def set_starting_friction(self, friction: Array) -> None:
         owned, data = slice(self.n_owned), self._pairs.data.copy()
         slip = np.einsum("eck,ec->ek", self._tangents[owned], -friction / self._stiffness[owned, None])
-        data[:, friction_pairs.SLIP : SLID] = slip
+        data[:, SLIP:SLID] = slip
         self._pairs, self.pairs_have_changed = self._pairs._replace(data=data), True
 
-    def accept_substep(self, x: Array, frozen: ObstacleMotion) -> None:
+    def accept_substep(
+        self, x: Array, frozen: ObstacleMotion, start: tuple[Array, ContactState] | None
+    ) -> Array:
+        """Accept a part of a static load step that ended at positions x (n_local, 3).
+
+        ``start``: positions (n_local, 3) [m] and `contact_state` at the start of the load step, if the slip
+        of what touched then counts from there; else it goes on from that of the part before. Returns, with
+        ``start``, of what has touched since: heat [J] and normal force [N] on this rank, and the normal force
+        of all.
+        """
         self.accept(x, frozen)
         self._contact_time = frozen.time  # otherwise the obstacles' motion would count twice
+        if start is None or not len(self._pairs.key):
+            return np.zeros(3)
+        start_x, (old, work, _, time) = start
+        contact = self._contact
+        beta, normal, force, _, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)
+        # the same pairs as now, with slip from the start
+        pairs, pair, _, previous = self._pairs_of(x, start_x, (beta, normal, force, pair), old)
+        motions = contact.obstacles.rigid_motions(frozen.start if time is None else time, frozen.time)
+        self._move_with_obstacles(pairs.data, motions)
+        continued = np.flatnonzero(previous >= 0)
+        self._pairs.data[continued] = pairs.data[continued]
+        vertices = contact.stencil[pair[continued], 0]
+        self._work[vertices] = work[vertices]
+        force = self._pairs.data[:, FORCE]
+        return np.array([(self._work - work).sum(), force[previous < 0].sum(), force.sum()])
+
+    @staticmethod
+    def _move_with_obstacles(data: Array, motions: list[tuple[Array, Array]]) -> None:
+        """Move the contact points of pairs ``data`` (E, 35), and rotate their slip, with the obstacles."""
+        for obstacle, (rotation, translation) in enumerate(motions):
+            rows = np.flatnonzero(data[:, 1] == obstacle)
+            side = data[rows, BETA : BETA + 4].sum(axis=1)[:, None]
+            point, slip = (data[rows, first : first + 3] for first in (CONTACT, SLIP))
+            moved = point @ rotation.T + translation
+            data[rows, START : START + 3] += side * (moved - point)
+            data[rows, CONTACT : CONTACT + 3], data[rows, SLIP : SLIP + 3] = moved, slip @ rotation.T
 
     def friction_lag(self, x: Array, frozen: ObstacleMotion) -> dict[str, Array]:
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
@@ -621,10 +672,10 @@ class CoulombFriction(Stateful):
         slip = np.maximum(slip_after, slip_before)
         return float(np.vdot(np.abs(after - given), slip)), float(np.maximum(after, given).sum())
 
-    def contact_state(self) -> tuple[Pairs, Array, Array, float | None]:
+    def contact_state(self) -> ContactState:
         return self._pairs, self._work.copy(), self.obstacle_loads, self._contact_time
 
-    def restore_contacts(self, state: tuple[Pairs, Array, Array, float | None]) -> None:
+    def restore_contacts(self, state: ContactState) -> None:
         self._pairs, self._work, self.obstacle_loads, self._contact_time = state
         self.pairs_have_changed = True
 

@@ -102,10 +102,14 @@ class ActiveTerms:
         """Energy [J] of this rank's terms with moving targets, without obstacles, at the present targets."""
         return sum(float(term.energies(x, self.frozen[term]).sum()) for term in self.targets)
 
-    def accept_substep(self, x: Array) -> None:
-        """Notify terms that a part of a static load step ended at positions x."""
+    def accept_substep(self, x: Array, start: tuple[Array, Mapping[Any, Any]] | None) -> Array:
+        """Accept a part of a static load step as `CoulombFriction.accept_substep`, with ``start`` a
+        `contact_state`; returns the sum of the results on this rank.
+        """
+        landed = np.zeros(3)
         for term in self.sliding:
-            term.accept_substep(x, self.frozen[term])
+            landed += term.accept_substep(x, self.frozen[term], start and (start[0], start[1][term]))
+        return landed
 
     def friction_lag(self, x: Array) -> dict[str, Array]:
         """The results of `Elastic.friction_lag` of all terms."""

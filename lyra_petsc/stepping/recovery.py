@@ -17,6 +17,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.stepping.failure.failure_report import FailedAttempt, explain_failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
+from lyra_petsc.stepping.statics.friction_balance import LANDING_PARTS
 from lyra_petsc.stepping.step_control import HALVINGS
 from lyra_petsc.stepping.stepper import Attempt
 
@@ -210,6 +211,14 @@ def _take_next_solver(run: SteppedScene, step: RejectedStep) -> None:
 # -- smaller steps -------------------------------------------------------------------------------------
 
 
+def _lands(run: SteppedScene, step: RejectedStep) -> bool:
+    return run.equilibrium is not None and run.equilibrium.lands
+
+
+def _limit_increment(run: SteppedScene, step: RejectedStep) -> None:
+    run.control.limit(run.control.end / LANDING_PARTS)
+
+
 def _may_halve(run: SteppedScene, step: RejectedStep) -> bool:
     return not (run.in_vain or run.stepper.stopped_by) and run.control.can_halve()
 
@@ -286,6 +295,13 @@ STRATEGIES = (
         UNSOLVED,
         _other_solver_is_left,
         _take_next_solver,
+    ),
+    Strategy(
+        f"the increment at 1/{LANDING_PARTS} of the run",
+        "with friction, much landed in a larger one",
+        (Trouble.UNSOLVED,),
+        _lands,
+        _limit_increment,
     ),
     Strategy(
         "half the Δt, or increment",

@@ -161,7 +161,7 @@ class SteppedScene:
         self.notes.extend(nothing_acts(scene, system, event_times(scene), self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:
-            sizes = whole.spacing, whole.size, floor
+            sizes = whole.spacing, whole.size, floor, self.control.end
             self.equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
         self.energy_balance = EnergyBalance(system)
         drift = scene.initial.velocity if scene.initial else (0.0, 0.0, 0.0)

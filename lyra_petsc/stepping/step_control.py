@@ -127,6 +127,10 @@ class StepControl:
         self.successes = 0
         self.factor *= 0.5
 
+    def limit(self, dt: float) -> None:
+        """Let the next steps be no longer than dt [s]."""
+        self.factor = min(self.factor, dt / self.step)
+
     def can_shorten(self, dt: float) -> bool:
         """Whether a step of dt [s], which may have been cut to end at an event, may be half as long."""
         return 0.5 * dt >= self.smallest and self._halvings(dt) < HALVINGS

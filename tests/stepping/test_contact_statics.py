@@ -73,8 +73,8 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
 
 
 LAID = {
-    # the cloth buckles as rounding leads it: 92 to 223 in ten runs on two and three ranks
-    "on a ball": ((1.0, [-0.5, -0.48, 0.32], BALL, 0.5), 400),
+    # with much friction in eighths of the load; the cloth buckles as rounding leads it
+    "on a ball": ((1.0, [-0.5, -0.48, 0.32], BALL, 0.5), 1500),
     "on a table": ((1.2, [-0.6, -0.6, 0.02], TABLE, 0.3), 120),
 }
 """Scenes, and upper bounds of Newton iterations."""
@@ -87,6 +87,7 @@ def test_a_cloth_is_laid_on_obstacles(comm: MPI.Comm, where: str) -> None:
     assert newton <= most
     assert simulation.totals["rejected"] <= 3  # by rounding, which is another in each run
     assert simulation.stability["stable"] is True
+    assert where == "on a table" or any("in which they landed" in note for note in simulation.notes)
     # it hangs over the edge, and has not slid off
     assert x[:, 2].min() < -0.08
     assert np.abs(x[:, :2].mean(axis=0)).max() < 0.03
@@ -180,7 +181,7 @@ def test_a_strip_is_pulled_over_a_rod(comm: MPI.Comm, shared_tmp: Path) -> None:
         newton += simulation.step().newton_iterations
     force = simulation.energy_balance.obstacle_forces(1)[0]
     simulation.destroy()
-    assert newton < 1200
+    assert newton < 1600
     both, difference = -force[2], -force[4] / RADIUS
     # without the weight of the strip on the rod
     both -= WEIGHT * WIDTH * np.pi * RADIUS
@@ -250,7 +251,7 @@ def test_a_cloth_is_pulled_off_a_table(comm: MPI.Comm, friction: float) -> None:
 @pytest.mark.parallel(1)
 def test_newton_increments_in_contact_are_limited(comm: MPI.Comm) -> None:
     """A cloth of small triangles is laid on a table in few iterations: full increments lead it far off."""
-    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.3, {})
+    scene = laid(1.2, [-0.6, -0.6, 0.02], TABLE, 0.3, {"step": 0.125})
     scene["mesh"]["grid"] |= {"nx": 24, "ny": 24}
     simulation = SteppedScene(comm, scene_of(scene))
     newton = simulation.step().newton_iterations

@@ -5,9 +5,8 @@ Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²),
 that of the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton's method
 converges in few iterations, until the out-of-balance force is small without the last term. Loads that follow
 the shape (pressure, moments, wind) are updated before every solve, under-relaxed; all but wind also change
-during a solve with their own stiffness. Friction takes the normal forces of the solve before. If points slip
-far while these change, the solve is repeated with a shorter Δτ; and solves are repeated until they are close
-to the normal forces in the equilibrium.
+during a solve with their own stiffness. Friction takes the normal forces of the solve before, as
+`friction_balance` tells.
 
 A snap takes many solves in which the out-of-balance force grows, while the potential energy falls. If a solve
 in contact runs out of iterations, the next one starts from its iterate of least energy. With friction neither
@@ -33,7 +32,7 @@ from lyra_petsc.stepping.newton.newton_trace import FailedSolve
 from lyra_petsc.stepping.newton.roundoff import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.buckled_shape import BuckledShape
-from lyra_petsc.stepping.statics.friction_balance import LAG, FrictionBalance
+from lyra_petsc.stepping.statics.friction_balance import FrictionBalance
 from lyra_petsc.stepping.statics.load_step_progress import PROGRESS, LoadStepProgress
 from lyra_petsc.stepping.statics.pseudo_time import LEAP_ITERATIONS, PseudoTimeStep
 from lyra_petsc.stepping.statics.relaxation import Relaxation
@@ -73,9 +72,6 @@ NO_POTENTIAL = (
 HANDLE_STEP = 1e-6
 """Displacement of handles, over the mean edge length, in a finite difference of forces."""
 
-MAX_SLIDING = 5
-"""Number of proximal steps without progress after which a load step is given up if all contacts slide."""
-
 WORSE = 2.0
 """Δτ is reduced after a solve in which the out-of-balance force grows by more than this factor."""
 
@@ -106,6 +102,8 @@ class Equilibrium:
         Mean edge length [m] and diagonal of the bounding box [m].
     floor : float
         Norm [N] of the residual's round-off.
+    end : float
+        Load factor at the end of the run.
     """
 
     def __init__(
@@ -116,13 +114,14 @@ class Equilibrium:
         spacing: float,
         size: float,
         floor: float,
+        end: float,
     ) -> None:
         assert isinstance(system.integrator, Static)
         self._system, self._stepper, self._integrator = system, stepper, system.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._whole_first = False  # whether the next load step begins with it
         self._in_vain = 0
-        self._friction = FrictionBalance(system, spacing)
+        self._friction = FrictionBalance(system, spacing, end)
         self._whole_stiffness: WholeStiffness | None = None
         if system.active.following:
             from lyra_petsc.stepping.statics.whole_stiffness import (
@@ -163,12 +162,15 @@ class Equilibrium:
     def _examine(self) -> Examination:
         return Examination(self._system, self._size)
 
-    def attempt(self, before: float, factor: float) -> Attempt:
-        """Find the equilibrium at load factor ``factor``; on failure the state is restored; collective."""
+    def attempt(self, before: float, factor: float, *, limited: bool = True) -> Attempt:
+        """Find the equilibrium at load factor ``factor``; on failure the state is restored; collective.
+
+        ``limited``: it counts as a failure if much lands in a large increment.
+        """
         found = self._by_whole_stiffness(before, factor) if self._whole_first else None
         if found is not None:
             return found
-        attempt = self._by_proximal_steps(before, factor)
+        attempt = self._by_proximal_steps(before, factor, limited=limited)
         hard = not attempt.converged or attempt.newton_iterations > HARD_STEP
         if not (attempt.converged or self._whole_first or self._stepper.stopped_by):
             found = self._by_whole_stiffness(before, factor)
@@ -193,7 +195,7 @@ class Equilibrium:
             self._tangent = None
         return found
 
-    def _by_proximal_steps(self, before: float, factor: float) -> Attempt:
+    def _by_proximal_steps(self, before: float, factor: float, *, limited: bool) -> Attempt:
         """Find the equilibrium as described at the top of the module; collective."""
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
@@ -202,7 +204,6 @@ class Equilibrium:
         moving_energy, last, solved_once = 0.0, np.inf, False
         contact = system.contact is not None
         judges_energy = contact and self._is_held()
-        contacts = system.active.contact_state()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
         progress, relaxation = LoadStepProgress(), Relaxation(system.points.comm)
         self._pseudo_time.begin_load_step()
@@ -218,7 +219,13 @@ class Equilibrium:
             if solves and judges_energy and not system.has_friction_pairs:
                 progress.record_potential(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
-            if balanced and self._friction.is_settled():
+            settled = self._friction.is_rough or (balanced and self._friction.is_settled())
+            if settled:
+                self._friction.judge_landing(factor - before, limited=limited)
+            if self._friction.lands:
+                message = "much landed in the increment"
+                break
+            if settled:
                 self._friction.record_success(factor - before)
                 system.moving_energy_before = moving_energy
                 self._record(factor)
@@ -226,16 +233,14 @@ class Equilibrium:
                 linear += self._compute_tangent(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             message = self._failure_message(solves, progress, x, solved_once=solved_once)
-            # after a failed solve only friction has changed, to what the normal forces allow
-            diverges = attempt.converged and force > WORSE * progress.least_force
-            if diverges and solved_once and not message:
-                message = self._message_if_sliding_on(solves - progress.last)
+            if self._friction.keeps_first_state(failed=bool(message) or not attempt.converged):
+                continue
             if message:
                 break
             if attempt.converged:
                 if force > WORSE * last:
                     self._pseudo_time.shrink()
-                system.active.accept_substep(system.x)
+                self._friction.accept_substep()
             last = force
             if balanced:  # except for friction
                 progress.restart()
@@ -276,12 +281,12 @@ class Equilibrium:
         if slides:
             message = f"{message}; {slides}"
         self._pseudo_time.sufficed = 0.0
-        self._in_vain += solves - progress.last_by_force if solved_once else 0
+        self._in_vain += solves - progress.last_by_force if solved_once and not self.lands else 0
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
         system.directors.transport_frames(frozen)
-        system.active.restore_contacts(contacts)
+        system.active.restore_contacts(self._friction.contacts)
         return dataclasses.replace(
             attempt,
             converged=False,
@@ -405,7 +410,7 @@ class Equilibrium:
         newton = linear = followed = 0
         message = ""
         while True:
-            lag = self._friction.lag
+            friction_note = self._friction.note()
             with self._examine() as examination:
                 found = examination.stability
                 if found.stable is not False:
@@ -431,7 +436,7 @@ class Equilibrium:
             self._pseudo_time.sufficed = 0.0
             assert mode is not None
             buckled = BuckledShape(system, self._examine, before, factor, self._size)
-            attempt = self.attempt(before, factor) if buckled.find(mode) else None
+            attempt = self.attempt(before, factor, limited=False) if buckled.find(mode) else None
             if attempt is not None:
                 newton += attempt.newton_iterations
                 linear += attempt.linear_iterations
@@ -444,9 +449,7 @@ class Equilibrium:
             followed += 1
         system.moving_energy_before = moving_energy
         note = _note(found, followed, message)
-        if lag > LAG:
-            note += "; " if note else ""
-            note += f"friction is known to {100.0 * lag:.1g} % of what normal forces allow"
+        note = "; ".join(part for part in (note, friction_note) if part)
         return EquilibriumReport(found, newton, linear, note)
 
     def saved_state(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -470,6 +473,11 @@ class Equilibrium:
         self._extrapolation.restore(arrays, saved["extrapolation"], factor, x)
 
     @property
+    def lands(self) -> bool:
+        """Whether the last load step is to be repeated with a smaller increment, as much landed in it."""
+        return self._friction.lands
+
+    @property
     def in_vain(self) -> bool:
         """Whether attempts since the last equilibrium show that a smaller increment would not help."""
         return self._in_vain >= MAX_IN_VAIN or self._friction.in_vain
@@ -491,15 +499,6 @@ class Equilibrium:
         if idle >= PATIENCE:
             return f"no equilibrium: the last {idle} of {solves} proximal steps came no nearer"
         return f"no equilibrium within {solves} proximal steps" if solves >= MAX_SOLVES else ""
-
-    def _message_if_sliding_on(self, idle: int) -> str:
-        """Why a load step that diverges is given up after ``idle`` proximal steps without progress, or ''.
-
-        It is if all contacts slide; collective.
-        """
-        if idle < MAX_SLIDING or not self._friction.sliding_message():
-            return ""
-        return "no equilibrium: proximal steps lead farther off"
 
     def _failed_solve(
         self, before: float, factor: float, progress: LoadStepProgress, x: Array

@@ -1,8 +1,14 @@
-"""Consistency of friction with the normal forces of an equilibrium.
+"""Consistency of friction with the normal forces of an equilibrium, and with the path to it.
 
 Friction in a solve takes the normal forces of the solve before. Solves in which points slip far while normal
 forces change are therefore repeated with a shorter Δτ, and a load step repeats its solves until these are
 close to the normal forces in the equilibrium. If all contacts slide there may be none.
+
+So a state in balance is found, but points have slipped along the way of the solves. From there on the slip of
+all that touched at the start of the load step counts from that start, with the normal forces of the state:
+the solves are corrected until these are those in the equilibrium, which does not depend on their way. Where
+this fails the first state in balance is kept. Points that land in the load step stick, and slide, along the
+way of the solves: if much lands in a large increment, it is repeated with a smaller one.
 """
 
 from __future__ import annotations
@@ -15,14 +21,21 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 
-LAG, MAX_ROUNDS = 1e-3, 10
-"""Fraction by which friction may differ from what the normal forces of the equilibrium allow, and largest
-number of updates to reach it."""
+LAG, ROUGH_LAG, MAX_ROUNDS = 1e-6, 1e-3, 20
+"""Fraction by which friction may differ from what the normal forces of the equilibrium allow; that before
+slip counts from the start of the load step; and largest number of updates to reach each."""
 
 MAX_SLIP = 0.1
 """Largest slip in a solve times the change of normal forces, over these and the mean edge length."""
 
-SLIDES, MAX_SLIDING = 0.95, 3
+MAX_LANDED, LANDING_PARTS = 0.1, 8
+"""Part of the normal forces that points may have which land in an increment that is longer than a run's
+length over the second number."""
+
+NOTABLE = 0.01
+"""Heat of points that landed, over the elastic energy, from which on a note tells it."""
+
+SLIDES, MAX_SLIDING = 0.95, 5
 """Fraction of the allowed friction from which on all contacts slide, and number of failed load steps with
 sliding after which smaller ones are not tried."""
 
@@ -34,20 +47,33 @@ class FrictionBalance:
     ----------
     lag : float
         Error of the friction in the last equilibrium, as a fraction of what its normal forces allow.
+    contacts : dict of CoulombFriction
+        The contacts at the start of the load step.
+    is_rough : bool
+        Whether the first state in balance is kept.
+    lands : bool
+        Whether the load step is to be repeated with a smaller increment, as much landed in it.
     in_vain : bool
         Whether so many load steps failed with sliding that a smaller one would not help.
     """
 
-    def __init__(self, system: StageEquations, spacing: float) -> None:
+    def __init__(self, system: StageEquations, spacing: float, end: float) -> None:
         self._system, self._spacing = system, spacing
+        self._longest = end / LANDING_PARTS
         self._acts = system.contact is not None and system.contact.friction is not None
-        self.lag = 0.0
+        self.lag, self.is_rough, self.lands = 0.0, False, False
         self._rounds = self._sliding_steps = 0
         self._sliding_increment = 0.0  # the last increment of the load factor in which all slid
+        self._landed_heat, self._heat, self._rough_steps = 0.0, 0.0, 0  # in a load step, and in all before
+        self._start: tuple[Array, Mapping[Any, Any]] | None = None  # from which slip counts
+        self._landed = np.zeros(3)  # as from `ActiveTerms.accept_substep`
+        self.contacts: Mapping[Any, Any] = {}
 
     def begin_step(self) -> None:
-        """Begin a load step."""
-        self.lag, self._rounds = 0.0, 0
+        """Begin a load step at the present positions."""
+        self.lag, self.is_rough, self.lands = 0.0, False, False
+        self._rounds, self._landed_heat, self._start = 0, 0.0, None
+        self._begin, self.contacts = self._system.x.copy(), self._system.active.contact_state()
 
     def lags(self, begin: Array) -> bool:
         """Whether points slipped too far in the solve from positions ``begin`` (n_owned, 3) [m]; collective.
@@ -64,20 +90,82 @@ class FrictionBalance:
         return bool(slip > MAX_SLIP * self._spacing * normal)
 
     def is_settled(self) -> bool:
-        """Whether friction needs no further update in a state that is balanced otherwise; collective."""
+        """Whether friction needs no further update in a state that is balanced otherwise; collective.
+
+        In the first such state slip begins to count from the start of the load step.
+        """
+        system = self._system
         self.lag = self._sums()[0]
         self._rounds += 1
-        return self.lag <= LAG or self._rounds > MAX_ROUNDS
+        if self._start is not None:
+            return self.lag <= LAG or (self.lag <= ROUGH_LAG and self._rounds > MAX_ROUNDS)
+        settled = self.lag <= ROUGH_LAG or self._rounds > MAX_ROUNDS
+        if not (settled and self._acts and system.near):
+            return settled
+        system.points.update_ghosts(self._begin)
+        self._start, self._rounds = (self._begin, self.contacts), 0
+        self._first = system.x[: system.points.n_owned].copy(), system.active.contact_state(), self.lag
+        return False
+
+    def accept_substep(self) -> None:
+        """Accept the part of the load step that ends at the present positions."""
+        self._landed = self._system.active.accept_substep(self._system.x, self._start)
+
+    def keeps_first_state(self, *, failed: bool) -> bool:
+        """Go back to the first state in balance, and return True, if corrections from there fail; collective.
+
+        ``failed``: the last solve did, or proximal steps lead no further.
+        """
+        if self._start is None or not (failed or self._rounds > MAX_ROUNDS):
+            return False
+        x, contacts, self.lag = self._first
+        self._system.state.set(x, np.zeros_like(x))
+        self._system.directors.transport_frames()
+        self._system.active.restore_contacts(contacts)
+        self.is_rough = True
+        return True
+
+    def judge_landing(self, increment: float, *, limited: bool) -> None:
+        """Set `lands` for the equilibrium of a load step of this increment; collective.
+
+        ``limited``: it may be repeated.
+        """
+        if self._start is not None:
+            heat, landed, force = self._system.points.global_sum(*self._landed).tolist()
+            self._landed_heat = heat
+            self.lands = limited and increment > self._longest and landed > MAX_LANDED * force
+
+    def _elastic_energy(self) -> float:
+        system, frozen = self._system, self._system.active.frozen
+        terms = [term for term in system.active.elastic if term not in system.active.sliding]
+        energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
+        return float(system.points.global_sum(energy)[0])
+
+    def note(self) -> str:
+        """What is not known of friction at the end, or an empty text; collective."""
+        notes = []
+        if self.lag > LAG:
+            notes.append(f"friction is known to {100.0 * self.lag:.1g} % of what normal forces allow")
+        if self._rough_steps:
+            notes.append(f"increments in which points slid along the way of the solves: {self._rough_steps}")
+        if self._heat > NOTABLE * self._elastic_energy():
+            part = 100.0 * self._heat / max(self._elastic_energy(), float(np.finfo(float).tiny))
+            notes.append(
+                f"points slid with {self._heat:.2g} J of friction in the increments in which they landed, "
+                f"{part:.2g} % of the elastic energy: the shape may depend on the increments"
+            )
+        return "; ".join(notes)
 
     def record_success(self, increment: float) -> None:
         """Note that a load step of this increment of the load factor found an equilibrium."""
+        self._heat, self._rough_steps = self._heat + self._landed_heat, self._rough_steps + self.is_rough
         if increment >= self._sliding_increment:
             self._sliding_steps, self._sliding_increment = 0, 0.0
 
     def record_failure(self, increment: float) -> str:
         """Note that a load step of this increment failed; a message if all contacts slide, else ''."""
         self.lag = 0.0
-        message = self.sliding_message()
+        message = "" if self.lands else self.sliding_message()
         if message:
             self._sliding_steps, self._sliding_increment = self._sliding_steps + 1, increment
         return message
@@ -92,11 +180,13 @@ class FrictionBalance:
 
     def saved_state(self) -> dict[str, Any]:
         """Entries of a checkpoint, for `restore`."""
-        return {"slid": self._sliding_steps, "slid_in": self._sliding_increment}
+        numbers = {"slid": self._sliding_steps, "slid_in": self._sliding_increment}
+        return numbers | {"landed": self._heat, "rough": self._rough_steps}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Restore a `saved_state`."""
         self._sliding_steps, self._sliding_increment = saved["slid"], saved["slid_in"]
+        self._heat, self._rough_steps = saved["landed"], saved["rough"]
 
     def _sums(self) -> tuple[float, str]:
         """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""
