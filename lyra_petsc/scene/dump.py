@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ruamel.yaml.representer import RoundTripRepresenter
 
 ABSENT = "absent"
-MAX_LENGTH = 60
 
 
 @dataclass(frozen=True)
@@ -146,4 +145,5 @@ def _text(value: Any) -> str:
 
 
 def _shortened(text: str) -> str:
-    return text if len(text) <= MAX_LENGTH else text[: MAX_LENGTH - 1] + "…"
+    max_length = 60
+    return text if len(text) <= max_length else text[: max_length - 1] + "…"

@@ -43,14 +43,6 @@ from lyra_petsc.scene.values import (
     shown,
 )
 
-HANDLE_STIFFNESS = 1000.0  # N/m
-STRETCHING_SHAPE = (6, 4)
-BENDING_SHAPE = (3, 5)
-DEFAULT_FRAME_TIME = 0.04  # s
-DEFAULT_FRAME_STEPS = 8
-FRICTION, OBSTACLE_FRICTION = 0.6, 0.3
-"""ARCSim's coefficients of friction of cloths, and of cloths on obstacles, by default."""
-
 ARCSIM_KEYS = {
     "scene": {"obstacles", "disable", "magic", "friction", "obs_friction", "timestep", "duration", "morphs"},
     "cloth": {"remeshing", "reference", "velocity"},
@@ -227,7 +219,7 @@ class OriginalObstacle(Block):
 
 
 class OriginalMagic(Block):
-    handle_stiffness: Positive = HANDLE_STIFFNESS
+    handle_stiffness: Positive = 1000.0
     repulsion_thickness: Positive | None = None
 
 
@@ -240,7 +232,7 @@ class OriginalWind(Block):
 class OriginalScene(Block):
     """The keys of a conf.json, with the defaults of the original."""
 
-    frame_time: Positive = DEFAULT_FRAME_TIME
+    frame_time: Positive = 0.04
     frame_steps: Count
     timestep: Positive | None = None
     save_frames: Count = 1
@@ -256,15 +248,16 @@ class OriginalScene(Block):
     obstacles: list[OriginalObstacle] = Field(default_factory=list)
     disable: list[Text] = Field(default_factory=list)
     magic: OriginalMagic = Field(default_factory=OriginalMagic)
-    friction: NonNegative = FRICTION
-    obs_friction: NonNegative = OBSTACLE_FRICTION
+    # ARCSim's coefficients of friction of cloths, and of cloths on obstacles, by default
+    friction: NonNegative = 0.6
+    obs_friction: NonNegative = 0.3
     gravity: Vector | None = None
     wind: OriginalWind = Field(default_factory=OriginalWind)
 
     @classmethod
     def with_defaults(cls, data: dict[str, Any]) -> dict[str, Any]:
         """``frame_steps`` is 1 by default, but without ``frame_time`` that of the original's own scene."""
-        return {"frame_steps": 1 if "frame_time" in data else DEFAULT_FRAME_STEPS, **data}
+        return {"frame_steps": 1 if "frame_time" in data else 8, **data}
 
     @model_validator(mode="after")
     def _check_references(self) -> Self:
@@ -311,8 +304,8 @@ class MaterialFile(Block):
     """The tables of one cloth in a material file of the original."""
 
     density: Positive
-    stretching: Annotated[list[list[float]], _table(STRETCHING_SHAPE)]
-    bending: Annotated[list[list[float]], _table(BENDING_SHAPE)]
+    stretching: Annotated[list[list[float]], _table((6, 4))]
+    bending: Annotated[list[list[float]], _table((3, 5))]
 
 
 def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:

@@ -966,9 +966,6 @@ class Initial(Block):
 Analysis = Literal["dynamic", "static"]
 Integrator = Literal["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"]
 INTEGRATORS: tuple[str, ...] = get_args(Integrator)
-TOLERANCE = 1e-3
-SPECTRAL_RADIUS = 0.5
-LOAD_STEP = 0.25
 FIELD_UNITS = {
     "velocity": "m/s",
     "displacement": "m",
@@ -1063,12 +1060,12 @@ class Time(Block):
         if data.get("integrator") == "static":
             raise problem("static is no integrator; write analysis: static instead", "integrator")
         if data.get("analysis") == "static":
-            return {"end": 1.0, "step": LOAD_STEP, **data}
+            return {"end": 1.0, "step": 0.25, **data}
         data = {"integrator": "beuler", **data}
         if data.get("step") == "auto":
-            data.setdefault("tolerance", TOLERANCE)
+            data.setdefault("tolerance", 1e-3)
         if data["integrator"] == "alpha2":
-            data.setdefault("spectral_radius", SPECTRAL_RADIUS)
+            data.setdefault("spectral_radius", 0.5)
         return data
 
 
@@ -1151,10 +1148,6 @@ class Solver(Block):
     hessian: Literal["adaptive", "regularised", "exact"] = "adaptive"
 
 
-PARALLEL = 1e-6
-"""Sine of the angle between two directions below which they count as one."""
-
-
 class Camera(Block):
     """Camera of the pictures; keys left out are computed from the whole motion.
 
@@ -1212,7 +1205,8 @@ def parallel(a: Vec3, b: Vec3) -> bool:
     """Whether two directions are the same or opposite."""
     first, second = (np.asarray(v) / np.abs(v).max() for v in (a, b))
     sine = np.linalg.norm(np.cross(first, second)) / (np.linalg.norm(first) * np.linalg.norm(second))
-    return bool(sine < PARALLEL)
+    # sine of the angle between two directions below which they count as one
+    return bool(sine < 1e-6)
 
 
 class Render(Block):

@@ -17,14 +17,9 @@ from lyra_petsc.scene.values import one_line
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import Node
 
-LARGEST_SCENE = 32 * 2**20
-"""Limit on the bytes of a scene file: enough for lists of some million vertices."""
 
-MAX_ENTRIES = 2_000_000
-"""Limit on the entries of a scene whose YAML anchors are expanded."""
-
-
-def read_text(path: Path, *, largest: float = LARGEST_SCENE, remedy: str = "") -> str:
+# limit on the bytes of a scene file: enough for lists of some million vertices
+def read_text(path: Path, *, largest: float = 32 * 2**20, remedy: str = "") -> str:
     """The text of a file; ``remedy`` is added to the message if it is too large.
 
     Raises
@@ -65,6 +60,8 @@ def read_bytes(path: Path, *, largest: float = math.inf, remedy: str = "") -> by
 
 def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any:
     """YAML 1.2 text as plain values; duplicate keys and anchors that expand without bound are refused."""
+    # limit on the entries of a scene whose YAML anchors are expanded
+    max_entries = 2_000_000
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
@@ -74,8 +71,8 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor may be redefined
             node = yaml.compose(io.StringIO(text))
-        if (entries := _count_entries(node, {})) > MAX_ENTRIES:
-            grown = f"holds more than {MAX_ENTRIES} entries once its anchors are expanded"
+        if (entries := _count_entries(node, {})) > max_entries:
+            grown = f"holds more than {max_entries} entries once its anchors are expanded"
             raise InputError("refers to itself" if entries == math.inf else grown, file=file, key=key)
         for mistake in _mistaken_keys(node, set()):
             raise InputError(mistake, file=file, key=key)

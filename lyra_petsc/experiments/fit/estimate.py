@@ -111,11 +111,6 @@ class Conclusion:
     misfit: float
     notes: list[str] = field(default_factory=list)
 
-    @property
-    def words(self) -> list[str]:
-        """The former name of ``notes``."""
-        return self.notes
-
 
 Evaluate = Callable[[Array], Misfit]
 

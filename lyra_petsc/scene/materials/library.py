@@ -39,12 +39,6 @@ PROJECTION_FLOOR = 0.01
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
 
-MIN_FRICTION = 1e-3
-"""Smallest friction moment of warp or weft over that of the other, if only one is given."""
-
-MIN_TWIST = 0.2
-"""Smallest 2 d33 of a measured cloth over √(d11 d22)."""
-
 
 @dataclass(frozen=True)
 class ShellMaterial:
@@ -291,7 +285,8 @@ def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[st
     if shell.plate[0] > 0.0 or max(shell.bending) <= 0.0:
         return shell, []
     twist = at_45 - 0.25 * (at_0 + at_90)
-    minimum = 0.5 * MIN_TWIST * math.sqrt(at_0 * at_90)
+    # smallest d33 of a measured cloth, a tenth of √(d11 d22)
+    minimum = 0.1 * math.sqrt(at_0 * at_90)
     notes = []
     if twist < minimum:
         notes.append(
@@ -308,6 +303,8 @@ GF_PER_CM = 0.980665
 
 def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
     """``shell`` with friction, and with the numbers of a KES report."""
+    # smallest friction moment of warp or weft over that of the other, if only one is given
+    min_friction = 1e-3
     moment, force = material.friction_moment or (0.0, 0.0), material.friction_force or 0.0
     if (kes := material.kes) is not None:
         if kes.B is not None:
@@ -325,7 +322,7 @@ def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
         if kes.width_of_shear is not None:
             force = 0.25 * sum(kes.width_of_shear) * GF_PER_CM
     if (moment[0] > 0.0) != (moment[1] > 0.0):
-        moment = max(moment[0], MIN_FRICTION * moment[1]), max(moment[1], MIN_FRICTION * moment[0])
+        moment = max(moment[0], min_friction * moment[1]), max(moment[1], min_friction * moment[0])
     return replace(shell, friction_moment=moment, friction_force=force)
 
 

@@ -21,11 +21,6 @@ LocatedPoint = tuple[str, float, float]
 MAX_POINTS = 1000
 """Limit on the points of a curve: every triangle searches its strain among them."""
 
-LARGEST_FILE = 2**20
-"""Limit on the bytes of a file."""
-
-LARGEST_STRAIN = 10.0
-"""Limit on strains; larger numbers are percent or degrees."""
 
 OTHER_UNITS = ("%", "°", "gf", "/cm", "/mm")
 """Units that a heading must not contain."""
@@ -43,7 +38,8 @@ def read_curve(path: Path) -> list[LocatedPoint]:
     """
     found: list[LocatedPoint] = []
     remedy = f"thin the curve out to at most {MAX_POINTS} points"
-    text = read_text(path, largest=LARGEST_FILE, remedy=remedy)
+    # limit on the bytes of a file
+    text = read_text(path, largest=2**20, remedy=remedy)
     for number, line in enumerate(text.splitlines(), start=1):
         columns = re.sub("[;,\"']", " ", line.split("#")[0]).split()
         try:
@@ -101,7 +97,8 @@ def checked_points(points: list[LocatedPoint], whole: str = "the curve") -> Poin
                     "leave out or smooth what does not grow"
                 )
     location, strain, _ = points[-1]
-    if strain > LARGEST_STRAIN:
+    # limit on strains; larger numbers are percent or degrees
+    if strain > 10.0:
         raise InputError(
             f"{location}: strain {strain:g} is {100.0 * strain:g} %; give fractions, as 0.05 for 5 %"
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.fit.estimate import Misfit, Unknown, conclude, search
 from lyra_petsc.experiments.fit.fit_runner import FIT, FitObserver, fit_scene
 from lyra_petsc.experiments.fit.model import Model
-from lyra_petsc.experiments.fit.readings import Positions, readings_of
+from lyra_petsc.experiments.fit.readings import readings_of
 
 TRUE = 4.2e-5
 
@@ -279,20 +278,6 @@ def test_values_are_in_the_order_of_their_axes() -> None:
     )
     assert one.labels == other.labels[::-1]
     np.testing.assert_array_equal(one.value, other.value[::-1])
-
-
-def test_each_simulation_has_its_own_rows() -> None:
-    """A new partition may have the memory address of an earlier one."""
-    rng = np.random.default_rng(1)
-    tip = Positions("", "tip", 1.0, ("z", "x"), "m", wanted=[("tip", (2,)), (7, (0,))])
-    for _ in range(20):
-        original, rows = rng.permutation(12), rng.permutation(12)[:3]
-        x = rng.normal(size=(12, 3))
-        problem = SimpleNamespace(
-            points=SimpleNamespace(mesh_vertices=original), probes={"tip": rows}, system=SimpleNamespace(x=x)
-        )
-        values = tip.values(tip.sums(problem, None))
-        np.testing.assert_allclose(values, [x[rows, 2].mean(), x[original == 7, 0][0]])
 
 
 @pytest.mark.parallel(2)
