@@ -12,14 +12,9 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending.hinge import Bending, dihedral_angles
-from lyra_petsc.terms.bending.hinge_energy import add_square_hessian, fade, hinge_hessian
+from lyra_petsc.terms.bending.hinge_energy import hinge_hessian
 from lyra_petsc.terms.bending.midedge import NO_REST_ROTATION, MidEdge, mean_directors
-from lyra_petsc.terms.bending.midedge_friction import MidEdgeFriction
 from lyra_petsc.terms.bending.midedge_shape import (
-    Frames,
-    coupling_tangent,
-    derivatives,
-    tangent_of,
     transported,
     unit,
 )
@@ -165,75 +160,6 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
     return out
 
 
-def midedge_blocks(
-    term: MidEdge | MidEdgeFriction, x: Array, frames: Frames, blend: float, out: Array
-) -> None:
-    """Element Hessians (E, 12, 12) of triangles with directors, each computed separately."""
-    data, friction = term.elements.data, np.zeros((term.n_elements, 2))
-    if isinstance(term, MidEdge):
-        (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
-        sheet, rotation = term, term._rest_rotation
-    else:
-        _, stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
-        edges, sheet = term._edges, term._sheet
-        rotation = sheet._rest_rotation
-        rotation = rotation[term._rows] if len(rotation) else rotation
-    directors, length = sheet._directors(x, frames), sheet.of_edges.length
-    rest = rest if len(rest) else np.zeros((term.n_elements, 3))
-    for e, points in enumerate(term.stencil):
-        corners, k = x[points], np.empty((3, 3))
-        k[np.triu_indices(3)] = k.T[np.triu_indices(3)] = stiffness[e]
-        sides = corners[[2, 0, 1]] - corners[[1, 2, 0]]
-        area = np.cross(sides[1], sides[2])  # 2A n
-        double = np.linalg.norm(area)
-        n, along = area / double, np.linalg.norm(sides, axis=1)
-        director = directors[edges[e]]
-        if len(rotation):
-            cosine, sine = rotation[e].T[:, :, None]
-            director = cosine * director - sine * np.cross(sides / along[:, None], director)
-        tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.direction[edges[e]]
-        beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
-        spin = -np.cross(before, tangent) / (along[:, None] * beside)
-        about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)
-        t = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
-        t1, t2, s, s1, s2 = np.array([derivatives(each) for each in t]).T
-        omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double
-        ends = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
-        own, between = np.diag(np.diag(k)), k - np.diag(np.diag(k))
-        further = s - [coupling_tangent(tangent) for tangent in rest[e]]
-        pull = own @ (t - rest[e]) * t1 + between @ further * s1
-        gradients, curved = np.zeros((3, 12)), np.zeros((12, 12))
-        for i in range(3):
-            for c in range(3):
-                at = slice(3 * c, 3 * c + 3)
-                gradients[i, at] = omega[i, c] * n + ends[i, c] * spin[i]
-                for d in range(3):
-                    tau = -np.cross(sides[i], n) / (2.0 * along[i] ** 3)
-                    block = -omega[i, d] * np.outer(n, inward[c]) - omega[i, c] * np.outer(inward[d], n)
-                    both = np.outer(n, tau) - 0.5 * data["sign"][e, i] * np.outer(spin[i], about[i])
-                    block += ends[i, c] * ends[i, d] * (both + both.T)
-                    curved[at, 3 * d : 3 * d + 3] += pull[i] * block
-            gradients[i, 9 + i] = data["sign"][e, i] / length[edges[e, i]]
-        bend = own @ (t - rest[e]) * t2 + between @ further * s2
-        curved += gradients.T * bend @ gradients
-        curved += friction[e, 0] * np.outer(pull @ gradients, pull @ gradients)
-        stiff = t1[:, None] * own * t1 + s1[:, None] * between * s1
-        found = gradients.T @ stiff @ gradients + (1.0 - blend) * curved
-        if double**2 < limit[e]:
-            weight, first, second = fade(double**2, limit[e])
-            energy = 0.5 * ((t - rest[e]) @ own @ (t - rest[e]) + further @ between @ further)
-            energy += friction[e, 1]
-            force = pull @ gradients
-            bent, slopes = np.zeros((4, 4, 3, 3)), np.zeros(12)
-            slopes[:9] = 2.0 * np.cross(area, sides).ravel()
-            add_square_hessian(tuple(map(tuple, corners)), tuple(area), (0, 1, 2), first * energy, bent)
-            more = first * (np.outer(force, slopes) + np.outer(slopes, force))
-            more += energy * second * np.outer(slopes, slopes)
-            more[:9, :9] += bent[:3, :3].transpose(0, 2, 1, 3).reshape(9, 9)
-            found = weight * found + (1.0 - blend) * more
-        out[e] = found
-
-
 def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
     """Element Hessians (E, 3, 3, 3, 3): a ninth of ∂²P/∂v_rel² to each pair of corners."""
     out = np.empty((term.n_elements, 3, 3, 3, 3))
@@ -296,19 +222,3 @@ def blocks_of(
     out = np.full((term.n_elements, k, k, 3, 3), np.nan)
     term.hessians(at, frozen, 0, term.n_elements, blend, out)
     return out
-
-
-def plain_hessian(term: Elastic, at: Array, frozen: Any, blend: float) -> Array:
-    """The Hessian of an elastic term (n, 3, n, 3), element by element from ``blocks_of``."""
-    if term.edges is None:
-        return summed(term.stencil, blocks_of(term, at, frozen, blend), len(at))
-    points, unknowns = 3 * term.stencil[:, :, None] + np.arange(3), term.edges
-    index = np.concatenate([points.reshape(len(points), -1), unknowns], axis=1)
-    out, blocks = np.zeros((at.size, at.size)), np.empty((len(index), index.shape[1], index.shape[1]))
-    if isinstance(term, (MidEdge, MidEdgeFriction)):
-        midedge_blocks(term, at, frozen, blend, blocks)
-    else:
-        term.hessians(at, frozen, 0, term.n_elements, blend, blocks)
-    for rows, block in zip(index, blocks, strict=True):
-        out[np.ix_(rows, rows)] += block
-    return out.reshape(*at.shape, *at.shape)

@@ -30,15 +30,6 @@ CLOTH = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0,
 TIGHT = {"force_tolerance": 1e-9, "step_tolerance": 1e-9}
 """Tolerances of tests; Newton's method ends far below, as its convergence is quadratic."""
 
-SOLVERS: dict[str, dict[str, Any]] = {
-    "block Jacobi": {"pc_type": "pbjacobi"},
-    "incomplete factors": {"pc_type": "bjacobi", "sub_pc_type": "ilu", "mat_type": "baij"},
-    "our multigrid": {"pc_type": "mg", "pc_mg_levels": 2},
-    "algebraic multigrid": {"pc_type": "gamg"},
-    "direct": {"pc_type": "cholesky"},
-}
-"""Options of all linear solvers with which a new term is tested."""
-
 REFERENCE = Path(__file__).parent / "reference"
 
 

@@ -151,26 +151,6 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, pairs: Pairs) -> None
     np.testing.assert_allclose(gradient(x, after), force, atol=1e-12)
 
 
-def test_rounding_does_not_decide_which_sliding_pair_is_continued() -> None:
-    """A vertex that moves over an edge continues the contact with the larger normal force."""
-    triangles, edge = [[7, 1, 2, 3], [7, 2, 1, 4]], [[7, 1, 2, 2]]
-    keys = np.zeros((3, 10), dtype=np.int64)
-    keys[:, :4], keys[:, 4], keys[:, 5] = [*triangles, *edge], VERTEX_TRIANGLE, -1
-    among, key = keys[:2], keys[2:]
-    data = np.zeros((2, COLUMNS))
-    data[:, SLIP], data[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
-    for order in ([0, 1], [1, 0]):
-        for longer in (0, 1):
-            old = data.copy()
-            old[longer, SLIP] *= 1.0 + 1e-12
-            place = np.empty(1, dtype=np.int64)
-            friction_pairs.match_pairs(key, among[order], old[order], place)
-            assert order[place[0]] == 1
-    data[0, SLIP] *= 1.01  # one that still sticks
-    friction_pairs.match_pairs(key, among, data, place)
-    assert place[0] == 0
-
-
 def pairs_between_sheets(random: np.random.Generator) -> tuple[Array, Pairs]:
     """Points (4 N, 3) and pairs of a vertex and a triangle, or of two edges, some nearest at a corner."""
     points, kind = random.normal(size=(N, 4, 3)), np.where(np.arange(N) < N // 2, VERTEX_TRIANGLE, EDGE_EDGE)

@@ -162,14 +162,6 @@ def test_a_monotone_motion_stays_between_neighbouring_keyframes(turns: float) ->
     assert overshoot["hermite"] > 0.01
 
 
-def test_a_monotone_motion_without_turning_points_is_smooth() -> None:
-    """Where neighbouring rates differ by less than a factor of three, the tangents are those of hermite."""
-    rows = [{"time": t, "translate": [t + 0.1 * t * t, 0, 0]} for t in range(5)]
-    smooth, original = Motion(keyframes(*rows), "monotone"), Motion(keyframes(*rows), "hermite")
-    for t in np.linspace(0, 4, 33):
-        np.testing.assert_array_equal(smooth.transform(t)[1], original.transform(t)[1])
-
-
 def test_a_handle_and_an_obstacle_do_not_swing_beyond_a_hold_unless_told() -> None:
     frames = [{"time": 0}, {"time": 1, "rotate": turn(90)}, {"time": 2, "rotate": turn(178)}]
     frames.append({"time": 3, "rotate": turn(178)})
@@ -206,11 +198,6 @@ def test_more_than_half_a_turn_between_different_axes_is_refused() -> None:
     with pytest.raises(InputError, match=r"keyframes 1 and 2 .*180°") as refused:
         Motion(rows, "hermite", key="motions.swing")
     assert refused.value.key == "motions.swing"
-
-
-def test_a_scale_through_zero_is_refused() -> None:
-    with pytest.raises(InputError, match="keyframes 1 and 2"):
-        Motion(keyframes({"time": 0}, {"time": 1}, {"time": 2, "scale": [1, -1, 1]}), "linear")
 
 
 def test_from_until_and_fade() -> None:

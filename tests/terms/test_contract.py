@@ -17,7 +17,6 @@ from oracle import (
     frozen_by,
     gradient,
     hessian,
-    plain_hessian,
     summed,
 )
 from physics import Simulation, rotation
@@ -147,14 +146,14 @@ def test_exact_hessian_is_the_derivative_of_the_gradient(
     np.testing.assert_allclose(analytic, numeric, rtol=0.0, atol=1e-8 * np.abs(analytic).max())
 
 
-@every_elastic
-@pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("name", ["membrane", "bending"])
+@pytest.mark.parametrize("blend", [0.3, 1.0])
 def test_hessian_is_that_of_a_plain_formula(
     elastic: Elastic, frozen: Any, simulation: Simulation, blend: float
 ) -> None:
     y = disturbed(simulation, 0.15)
     found = hessian(elastic, y, frozen, blend)
-    plain = plain_hessian(elastic, y, frozen, blend)
+    plain = summed(elastic.stencil, blocks_of(elastic, y, frozen, blend), len(y))
     np.testing.assert_allclose(found, plain, rtol=0.0, atol=1e-12 * np.abs(plain).max())
 
 
