@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
+from physics import CLOTH, gathered, grid, obj_file, scene_of
 
 from lyra_petsc.contact.barrier import ContactBarrier
 from lyra_petsc.contact.crossings import mutual_crossings, self_crossings
@@ -22,10 +22,9 @@ from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Watch = Callable[[SteppedScene], None]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 LOWER = grid(0.6, 0.4, 5, 4, "alternating")
 UPPER = grid(0.55, 0.4, 4, 4) | {"transform": {"translate": [0.03, 0.01, 0.06]}}
@@ -233,36 +232,7 @@ def test_impacts_create_no_energy(comm: MPI.Comm, integrator: str) -> None:
         assert most > 0.1
 
 
-@pytest.mark.parallel(alone=False)
-def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
-    def end(on: MPI.Comm) -> Array:
-        with Watched(on, two_sheets()) as run:
-            run.throw(toward_each_other(2.0))
-            return run.run().x
-
-    alone = comm.Split(comm.rank)
-    single = end(alone)
-    alone.Free()
-    np.testing.assert_allclose(end(comm), single, rtol=0.0, atol=1e-7 * 0.7)
-
-
-def test_a_run_resumes_on_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
-    sheet = grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.03]}}
-    scene = {
-        "mesh": sheet,
-        "material": MATERIAL,
-        "contact": CONTACT,
-        "solver": TIGHT,
-        "obstacles": {"floor": {"plane": {"point": [0, 0, 0], "normal": [0.1, 0, 1]}}},
-        "time": {"end": 0.12, "step": 0.005},
-    } | GRAVITY
-    with Watched(comm, scene) as run:
-        whole = run.run().x
-    x = end_on_one_rank(comm, scene_of(scene), shared_tmp / "run", 14)
-    if x is not None:
-        np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
-
-
+@pytest.mark.parallel
 def test_forces_balance_at_boundaries_between_ranks(comm: MPI.Comm) -> None:
     """Triangles extend beyond the bounding box of a rank's own vertices."""
     upper = grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [0.23, 0.21, 0.015]}}

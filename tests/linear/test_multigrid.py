@@ -19,7 +19,7 @@ from lyra_petsc.scene.schema import Scene
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 def hanging(cells: int, **time: Any) -> dict[str, Any]:
@@ -165,6 +165,7 @@ def test_it_is_refused_as_part_of_another_preconditioner(comm: MPI.Comm) -> None
     assert caught.value.key == "-sub_pc_python_type"
 
 
+@pytest.mark.parallel
 def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     _, counts = iterated(comm, hanging(50), 3, "python")
     alone = comm.Split(comm.rank, 0)
@@ -174,6 +175,7 @@ def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     assert max(counts) <= max(serial) + 2
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("model", ["hinge", "midedge"])
 @pytest.mark.parametrize("pattern", ["diagonal", "criss-cross"])
 def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm) -> None:

@@ -17,7 +17,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SIDE, CELLS, STEPS = 0.2, 6, 6
 PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
@@ -71,7 +71,6 @@ def expected() -> Array:
     return thrown(MPI.COMM_SELF, direct_solver(MPI.COMM_SELF))
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_preconditioner_works_with_contact(comm: MPI.Comm, kind: str, expected: Array) -> None:
     if kind == "mumps" and not PETSc.Sys.hasExternalPackage("mumps"):

@@ -179,23 +179,6 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
     np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-8 * size)
 
 
-@pytest.mark.parallel(2, alone=False)
-def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
-    """Errors of linear solves add up until something is near."""
-    turned = {"rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 20.0}, "translate": [-0.05, -0.12, 0.05]}
-    content = {
-        "mesh": [grid(0.22, 0.3, 9, 12, "alternating"), grid(0.2, 0.2, 8, 8) | {"transform": turned}],
-        "gravity": [0.0, 0.0, -9.81],
-        "material": {"cloth": "gray-interlock", "damping": 0.005},
-        "contact": {"friction": 0.3},
-        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}}},
-        "time": {"end": 1.0, "step": 0.004},
-        "solver": {},
-    }
-    (alone, *_), (together, *_) = (positions_after(ranks, content, 10) for ranks in (MPI.COMM_SELF, comm))
-    np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-9)
-
-
 @pytest.mark.parallel(alone=False)
 def test_ranks_agree_on_a_table(comm: MPI.Comm) -> None:
     """Errors of a step's last linear solve are magnified after the cloth has met the table's edges."""

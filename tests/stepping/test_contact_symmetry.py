@@ -16,7 +16,7 @@ from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.symmetry import symmetry_walls
 from lyra_petsc.stepping.simulation import SteppedScene
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 GAP = 0.015
 

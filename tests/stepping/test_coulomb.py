@@ -18,7 +18,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 G, GAP, SIDE = 9.81, 0.005, 0.4
 INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "bdf2", "alpha2")
@@ -83,7 +83,6 @@ def steps_by_coulombs_law(simulation: SteppedScene, friction: float, weight: flo
 
 CASES = [  # height above the plane, friction, speeds along and down, step
     (0.7 * GAP, 2.0, 2.0, 0.0, 0.002),
-    (0.7 * GAP, 0.3, 1.0, 0.0, 0.02),
     (0.6 * GAP, 0.3, 1.0, 0.0, 0.005),
     (1.1 * GAP, 0.3, 3.0, 3.0, 0.005),
     (1.1 * GAP, 0.3, 2.0, 1.0, 0.02),

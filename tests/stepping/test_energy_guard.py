@@ -61,7 +61,8 @@ def surrounded(drift: list[float], *, contact: bool) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("integrator", "contact", "end", "step"),
     [
-        *((name, False, 0.1, 0.02) for name in ("beuler", "midpoint", "alpha2", "bdf2")),
+        ("midpoint", False, 0.1, 0.02),
+        ("bdf2", False, 0.1, 0.02),
         ("alpha2", True, 0.1, 0.02),
         ("alpha2", False, 0.002, 0.0005),  # far below the time between keyframes of the handles
     ],

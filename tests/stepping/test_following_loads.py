@@ -89,7 +89,7 @@ def ring(comm: MPI.Comm, part: float, start: float = OVAL) -> tuple[float, int]:
     return 0.5 * float(x[:, 0].max() - x[:, 2].max()), newton
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
     """Deviations grow by 1 / (1 − p / p_c) below the critical pressure; solutions exist beyond it."""
     oval, newton = ring(comm, 0.5)
@@ -169,7 +169,7 @@ def curled(
         return tip[[0, 2]], newton, "; ".join(trial.simulation.notes)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
     """Beyond half a circle; at free edges the stiffness of the pressure is not symmetric."""
     tip, newton, notes = curled(comm, 30.0, 0.125)
@@ -178,14 +178,14 @@ def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
     assert "stable" not in notes
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_long_increments_take_few_iterations(comm: MPI.Comm) -> None:
     tip, newton, _ = curled(comm, 50.0, 0.25)
     np.testing.assert_allclose(tip, pressed_tip(50.0), atol=6e-3)
     assert newton <= 75  # 62; 101 where all of the stiffness is tried first after 40 iterations alone
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_it_curls_further_when_the_symmetric_part_is_indefinite(comm: MPI.Comm) -> None:
     """From 57 B/L³ on. The whole stiffness is regular: the rod has one shape at each load."""
     tip, newton, notes = curled(comm, 80.0, 0.25)

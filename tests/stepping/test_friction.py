@@ -19,7 +19,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SLOPE, GAP, G = math.radians(30.0), 0.01, 9.81
 NORMAL = [math.sin(SLOPE), 0.0, math.cos(SLOPE)]
@@ -153,7 +153,6 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
     assert ratios[1] > 0.05
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
     comm: MPI.Comm, integrator: str
@@ -329,7 +328,6 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     assert np.abs(crept).max() < 1e-6
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
 def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, integrator: str) -> None:
     """A sheet falls on it and slides until it has its speed, whatever the normal force is meanwhile."""
@@ -527,6 +525,7 @@ def test_sheets_with_friction_conserve_momentum(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
     """Two crossed sheets stick on a slope, so heavy that their edges touch.
@@ -580,6 +579,7 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
         np.testing.assert_allclose(x, unbroken, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parallel
 def test_obstacles_in_another_order_keep_sticking_contacts(comm: MPI.Comm, shared_tmp: Path) -> None:
     """A sheet sticks on two rails down a slope; the scene that goes on has an obstacle more."""
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}

@@ -12,7 +12,7 @@ from physics import CLOTH, end_on_one_rank, finished, grid, scene_of, shape
 
 from lyra_petsc.stepping.simulation import SteppedScene
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 SPEED, END = 0.5, 0.12
 FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, -0.021], "normal": [0.0, 0.0, 1.0]}}

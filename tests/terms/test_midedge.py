@@ -150,7 +150,7 @@ def test_energy_is_continuous_at_all_angles() -> None:
         assert (np.diff(values) > 0.0).all()
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_one_linear_solve_a_step_unfolds_a_crumpled_sheet(comm: MPI.Comm) -> None:
     """The solve rotates directors beyond a right angle, where the energy was once unbounded."""
     scene: dict[str, Any] = {
@@ -683,7 +683,7 @@ def vault(mesh: dict[str, Any], handles: list[dict[str, Any]], **more: Any) -> d
     return {"mesh": mesh, "material": material, "handles": [rim, *handles], "solver": TIGHT} | static | more
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("motion", [False, True])
 def test_a_part_with_symmetry_planes_moves_as_the_whole(
     comm: MPI.Comm, shared_tmp: Path, motion: bool
@@ -913,14 +913,14 @@ def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path, row: int = -1
     return dict(zip(lines[0].split(","), map(float, lines[row].split(",")), strict=True))
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_before_the_first_step_a_clamp_has_no_moment(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = CANTILEVER | {"handles": [{"group": "left", "clamp": True}]}
     found = reactions(comm, scene, shared_tmp / "run", row=1)
     np.testing.assert_allclose([found[f"handle0_m{axis}"] for axis in "xyz"], 0.0, atol=1e-9)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_load_of_a_corner_in_two_handles_counts_for_one(comm: MPI.Comm, shared_tmp: Path) -> None:
     """A clamp and a symmetry plane that hold the same corner: the clamp bears the weight, the plane nothing
     within itself.
@@ -932,7 +932,7 @@ def test_the_load_of_a_corner_in_two_handles_counts_for_one(comm: MPI.Comm, shar
     assert found["handle1_z"] == pytest.approx(0.1 * 0.6 * 0.2, rel=1e-6)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("kind", ["clamp", "symmetry"])
 def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tmp: Path) -> None:
     """Reaction of a clamp or a symmetry plane to a force at the corner and a moment at the end."""
@@ -954,7 +954,7 @@ def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tm
         np.testing.assert_allclose(moments, [0.0, 0.04 * 0.2, 0.0], atol=1e-6)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_moments_are_balanced_where_edges_turn(comm: MPI.Comm) -> None:
     """The side with the moment turns in a load step, and with it the axis of the moment."""
     scene = CANTILEVER | {
@@ -973,7 +973,7 @@ def test_moments_are_balanced_where_edges_turn(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(reaction, -load, rtol=0.0, atol=1e-8 * np.linalg.norm(load))  # was 0.24
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_moment_of_a_clamp_that_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
     """Rate of the angular momentum of a stiff sheet that is rotated about its edge."""
     turn = [{"time": 0.0}, {"time": 2.0, "rotate": {"axis": [0, 1, 0], "degrees": 720}}]
@@ -1104,7 +1104,7 @@ def pushed(comm: MPI.Comm, path: Path, n: int) -> float:
     return float(x[x[:, 2] > 0.999][:, 0].mean() - 1.0)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_plate_stands_on_another(tmp_path: Path, comm: MPI.Comm) -> None:
     """F L³ / 3D from the standing plate, and F L³ / 6D from the rotation of the joint on a span of 2 L."""
     exact = PUSH * (1.0 / 3.0 + 1.0 / 6.0)
