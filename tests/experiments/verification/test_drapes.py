@@ -13,7 +13,7 @@ from lyra_petsc.experiments import drape
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.drape import CLOTH, STARTS
 from lyra_petsc.experiments.meshes import ring_disc
-from lyra_petsc.experiments.verification.cases import contacts
+from lyra_petsc.experiments.verification.cases import drapes
 from lyra_petsc.stepping.simulation import StepReport
 
 
@@ -61,11 +61,11 @@ def starts(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array,
         seen.append((start, faces, rest))
         return start
 
-    monkeypatch.setattr(contacts, "drape_scene", scene)
-    monkeypatch.setattr(contacts, "drape_cloth", lambda bench, start, speed: start)
-    monkeypatch.setattr(contacts, "PIXELS", 8)
+    monkeypatch.setattr(drapes, "drape_scene", scene)
+    monkeypatch.setattr(drapes, "drape_cloth", lambda bench, start, speed: start)
+    monkeypatch.setattr(drapes, "PIXELS", 8)
     with Bench(comm) as bench:
-        list(contacts.cusick.measure(bench, contacts.cusick.resolutions[-1]))
+        list(drapes.cusick.measure(bench, drapes.cusick.resolutions[-1]))
     return seen
 
 
@@ -111,7 +111,7 @@ def test_friction_at_the_disc_does_not_throw_vertices_off(
     monkeypatch.setattr(Trial, "step", watched)
     monkeypatch.setattr(drape, "STEPS", 2)
     with Bench(comm) as bench:
-        contacts._drape(bench, "rings", 8, 1)
+        drapes._drape(bench, "rings", 8, 1)
     assert max(rises) < 0.0
 
 
@@ -123,14 +123,14 @@ def drawn(mean: float, scatter: float = 0.01) -> list[float]:
 
 
 def test_a_biased_kind_of_mesh_fails() -> None:
-    found = [contacts.scatter_of_means([*(drawn(0.80) for _ in range(3)), drawn(0.84)]) for _ in range(200)]
+    found = [drapes.scatter_of_means([*(drawn(0.80) for _ in range(3)), drawn(0.84)]) for _ in range(200)]
     assert (np.array(found) > 1.0).mean() > 0.9
 
 
 def test_kinds_of_mesh_that_differ_by_chance_pass() -> None:
-    found = [contacts.scatter_of_means([drawn(0.80) for _ in range(4)]) for _ in range(1000)]
+    found = [drapes.scatter_of_means([drawn(0.80) for _ in range(4)]) for _ in range(1000)]
     assert 0.01 < (np.array(found) > 1.0).mean() < 0.05
 
 
 def test_the_scatter_follows_the_formula() -> None:
-    assert contacts.scatter_of_means([[0.0, 2.0], [2.0, 4.0]]) == pytest.approx(math.sqrt(2.0) / 2.0)
+    assert drapes.scatter_of_means([[0.0, 2.0], [2.0, 4.0]]) == pytest.approx(math.sqrt(2.0) / 2.0)

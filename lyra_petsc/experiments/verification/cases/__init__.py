@@ -24,6 +24,7 @@ CASES: Registry[VerificationCase] = Registry(
         ("cantilevers", "elastica-roll-up elastica-overhang tip-load roll-up heavy-cantilever"),
         ("cantilevers", "coiling-strip cloth-overhang"),
         ("hinges", "strip-vibration"),
-        ("contacts", "incline sheets rest capstan collision layers ruck pole table-edge cusick"),
+        ("contacts", "incline sheets rest capstan collision layers"),
+        ("drapes", "ruck pole table-edge cusick"),
     ),
 )
