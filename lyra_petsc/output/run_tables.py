@@ -19,6 +19,7 @@ from lyra_petsc.output.history import (
     vector_columns,
 )
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+from lyra_petsc.terms.registry import ENERGIES
 
 Row: TypeAlias = Mapping[str, float | str]
 
@@ -80,9 +81,7 @@ class RunTables:
         history: Row = {
             **asdict(report),
             "kinetic_energy": budget.kinetic,
-            "membrane_energy": budget.membrane,
-            "bending_energy": budget.bending,
-            "potential_energy": budget.potential,
+            **dict(zip(ENERGIES, (budget.membrane, budget.bending, budget.potential), strict=True)),
             "external_work": budget.external_work,
             "dissipation": budget.dissipation,
             **energy_balance.columns(),

@@ -17,14 +17,12 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
+from lyra_petsc.terms.registry import ENERGIES
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
 ROWS = 1 << 13
 """Rows whose works are computed together."""
-
-ENERGIES = ("membrane_energy", "bending_energy", "potential_energy")
-"""Columns of history.csv to which several terms add their energies; columns of single terms follow these."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from lyra_petsc.mesh.elements import Elements
     from lyra_petsc.terms.term import Term
 
+MEMBRANE, BENDING, POTENTIAL = ENERGIES = "membrane_energy", "bending_energy", "potential_energy"
+"""Columns of history.csv that every run has, to which several terms add their energies."""
+
 Need = Callable[[Scene, Sequence[ShellMaterial]], bool]
 
 
@@ -108,12 +111,12 @@ def _has_bending_friction(scene: Scene, shells: Sequence[ShellMaterial]) -> bool
 
 
 REGISTRY: list[Registration] = [
-    Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
+    Registration("membrane", lambda scene, shells: True, Role.ELASTIC, MEMBRANE, damped=True),
     Registration(
         "bending",
         _bends_by("hinge"),
         Role.ELASTIC,
-        "bending_energy",
+        BENDING,
         damped=True,
         bends=True,
         module_name=".bending.hinge",
@@ -122,7 +125,7 @@ REGISTRY: list[Registration] = [
         "midedge",
         _bends_by("midedge"),
         Role.ELASTIC,
-        "bending_energy",
+        BENDING,
         damped=True,
         bends=True,
         coarse="bending",
@@ -132,7 +135,7 @@ REGISTRY: list[Registration] = [
         "midedge_friction",
         _has_bending_friction,
         Role.ELASTIC,
-        "bending_energy",
+        BENDING,
         coarse="bending",
         module_name=".bending.midedge_friction",
     ),
@@ -140,13 +143,13 @@ REGISTRY: list[Registration] = [
         "shear_friction",
         lambda scene, shells: any(shell.friction_force > 0.0 for shell in shells),
         Role.ELASTIC,
-        "membrane_energy",
+        MEMBRANE,
     ),
     Registration(
         "stretch_limit",
         lambda scene, shells: any(shell.stretch_limit < math.inf for shell in shells),
         Role.ELASTIC,
-        "membrane_energy",
+        MEMBRANE,
     ),
     Registration(
         "contact",
@@ -169,7 +172,7 @@ REGISTRY: list[Registration] = [
         "clamp",
         _has_clamped_hinges,
         Role.ELASTIC,
-        "bending_energy",
+        BENDING,
         damped=True,
         bends=True,
         module_name=".bending.hinge_clamp",
@@ -184,7 +187,7 @@ REGISTRY: list[Registration] = [
         "gravity",
         lambda scene, shells: scene.gravity is not None and any(scene.gravity),
         Role.LOAD,
-        "potential_energy",
+        POTENTIAL,
         module_name=".loads.gravity",
     ),
     Registration(
