@@ -6,7 +6,8 @@ update of ghosts. Its counted elements come first: each element is counted (in e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Hashable
+from dataclasses import dataclass, field
 
 import numpy as np
 from mpi4py import MPI
@@ -30,6 +31,8 @@ class GlobalMesh:
     elements : dict of name → Elements
         Elements in the numbering of the mesh.
     vertex_data : dict of name → (V, …) array
+    vertex_sets : dict of key → (n,) int64
+        Vertices that are chosen for something, as those of a handle.
     edges : (N, 2) int64 or None
         Vertices of the edges of the mesh; needed where elements couple unknowns of edges.
     owner : (V,) int64 or None
@@ -45,6 +48,7 @@ class GlobalMesh:
     edges: Ints | None = None
     owner: Ints | None = None
     positions: Array | None = None
+    vertex_sets: dict[Hashable, Ints] = field(default_factory=dict)
 
 
 @dataclass
@@ -57,6 +61,8 @@ class LocalMesh:
     elements : dict of name → Elements
         Elements in local numbering, those that this rank counts first.
     vertex_data : dict of name → (n_vertices, …) array
+    vertex_sets : dict of key → (n,) int64
+        The owned vertices of each set, ascending.
     partitioner : str
         Name of the partitioner.
     """
@@ -64,6 +70,7 @@ class LocalMesh:
     layout: Layout
     elements: dict[str, Elements]
     vertex_data: dict[str, Array]
+    vertex_sets: dict[Hashable, Ints]
     partitioner: str
 
 
@@ -183,8 +190,8 @@ def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
         piece = next(pieces)
     else:
         piece = messages.recv(source=0)
-    bounds, ghosts, unknowns, elements, vertex_data = piece
-    return LocalMesh(Layout(comm, bounds, ghosts, unknowns), elements, vertex_data, name)
+    bounds, ghosts, unknowns, elements, vertex_data, sets = piece
+    return LocalMesh(Layout(comm, bounds, ghosts, unknowns), elements, vertex_data, sets, name)
 
 
 def _pieces(whole: GlobalMesh, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
@@ -217,7 +224,9 @@ def _pieces(whole: GlobalMesh, rows: Rows, n_ranks: int):  # type: ignore[no-unt
             elements[name] = Elements(stencil, data, n_owned, index.astype(counts), edges)
         own = rows.unknowns[rank]
         vertex_data = {key: np.ascontiguousarray(v[own.vertices]) for key, v in whole.vertex_data.items()}
-        yield rows.bounds, ghosts, own, elements, vertex_data
+        sets = {key: np.sort(rows.vertex[vertices]) for key, vertices in whole.vertex_sets.items()}
+        sets = {key: row[(row >= lo) & (row < hi)] - lo for key, row in sets.items()}
+        yield rows.bounds, ghosts, own, elements, vertex_data, sets
 
 
 def local_numbers(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
@@ -218,8 +218,9 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     spacing = mean_edge_length(mesh)
     largest = float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
     check_resolved(spacing, largest, scene)
+    sets: dict[Hashable, Ints] = {}
     for number, vertices in held.items():
-        elements[f"held {number}"] = Elements(vertices[:, None])
+        sets["handle", number] = vertices
     for entry in map(registration_of, names):
         if entry.coarse:
             elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
@@ -230,7 +231,7 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
             elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
     for name, selector in scene.probes.items():
         vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
-        elements[f"probe {name}"] = Elements(vertices[:, None])
+        sets["probe", name] = vertices
     data = {"position": mesh.positions, "mass": rest.mass}
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
@@ -266,7 +267,9 @@ def _prepare(scene: Scene, mesh: Mesh) -> tuple[WholeProblem, GlobalMesh]:
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
-    return whole, GlobalMesh(mesh.n_vertices, mesh.triangles, elements, data, edges, positions=positions)
+    return whole, GlobalMesh(
+        mesh.n_vertices, mesh.triangles, elements, data, edges, positions=positions, vertex_sets=sets
+    )
 
 
 def _refuse_unconnected(scene: Scene, mesh: Mesh, positions: Array) -> None:
@@ -419,7 +422,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     _check_indices(layout, discretisation.rows.pattern.n_couplings)
     held = ExactHandles(
         scene,
-        {n: _owned_vertices(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
+        {n: part.vertex_sets["handle", n] for n, handle in enumerate(scene.handles) if is_exact(handle)},
         _clamped_edges(scene, part, terms),
     )
     mass = np.zeros(layout.n_owned)
@@ -461,7 +464,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     system.hold_targets(0.0)
     refuse_overrun(system, scene, "at the start")
     refuse_contact(system, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)
-    probes = {name: _owned_vertices(part, f"probe {name}") for name in scene.probes}
+    probes = {name: part.vertex_sets["probe", name] for name in scene.probes}
     return Problem(
         scene,
         whole,
@@ -562,9 +565,3 @@ def _spectral_radius(scene: Scene) -> float | None:
     if not 0.0 <= radius <= 1.0:
         raise InputError(f"must be from 0 to 1, not {radius:g}", key="-ts_alpha_radius")
     return radius
-
-
-def _owned_vertices(part: LocalMesh, name: str) -> Ints:
-    """Owned vertices of the single-vertex elements ``name``, in local numbering."""
-    elements = part.elements[name]
-    return elements.stencil[: elements.n_owned, 0].astype(np.int64)
