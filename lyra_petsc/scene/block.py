@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
@@ -109,6 +109,10 @@ class Block(BaseModel):
     def require_with(self, key: str, condition: object, message: str) -> None:
         """Raise a `problem` at ``key`` if it has a value and the condition does not hold."""
         require(self.get(key) is None or condition, message, key)
+
+
+BY_KIND = Discriminator(lambda value: "[block]" if isinstance(value, (dict, Block)) else "[plain]")
+"""Discriminator of values that may be a block or plain values; messages omit the tags."""
 
 
 @dataclass(frozen=True)

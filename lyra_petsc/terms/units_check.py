@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import ShellMaterial
-from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.rest import RestShape
 
 LIGHTEST, LIGHTEST_CLOTH, DENSEST = 10.0, 22.0, 25e3

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import (
     PROJECTION_FLOOR,
     ClothTable,
@@ -17,7 +18,6 @@ from lyra_petsc.scene.materials.library import (
     resolve_material,
     shell_of_table,
 )
-from lyra_petsc.scene.schema import Material
 
 WANG_2011 = {
     "11oz-black-denim", "aluminium", "camel-ponte-roma", "gray-interlock", "ivory-rib-knit",

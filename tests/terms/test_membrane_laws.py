@@ -19,9 +19,9 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
+from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import ShellMaterial, measured_names, resolve_material
 from lyra_petsc.scene.messages import validated
-from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import LAWS, law_of
 from lyra_petsc.terms.membrane_laws.measured import fit_errors
 

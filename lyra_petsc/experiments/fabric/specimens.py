@@ -10,9 +10,9 @@ from typing import Any
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
+from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import ShellMaterial, material_names, measured_names, resolve_material
 from lyra_petsc.scene.messages import validated
-from lyra_petsc.scene.schema import Material
 from lyra_petsc.scene.text import parse_yaml
 
 G = 9.80665

@@ -45,9 +45,9 @@ from lyra_petsc.experiments.fabric.fabric_report import (
 )
 from lyra_petsc.experiments.fabric.specimens import Fabric, G
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, square_to_disc
+from lyra_petsc.scene.material_block import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.scene.materials.library import GF_PER_CM, ShellMaterial
 from lyra_petsc.scene.materials.measured_curves import force_at
-from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.stepping.simulation import SteppedScene
 
 TOLERANCES = {"force_tolerance": 1e-8, "step_tolerance": 1e-8}

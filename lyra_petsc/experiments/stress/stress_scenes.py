@@ -21,10 +21,11 @@ from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Case, Verdict
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import resolve_material
 from lyra_petsc.scene.messages import validated
 from lyra_petsc.scene.overrides import apply_overrides
-from lyra_petsc.scene.schema import Material, Scene
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_yaml
 
 if TYPE_CHECKING:

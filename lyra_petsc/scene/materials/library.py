@@ -27,7 +27,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.materials.measured_curves import Points, interpolation
 
 if TYPE_CHECKING:
-    from lyra_petsc.scene.schema import Material, PlateStiffness
+    from lyra_petsc.scene.material_block import Material, PlateStiffness
 
 TABLE_LIBRARIES = ("wang2011.json", "original.json")
 ISOTROPIC_LIBRARIES = ("engineering.json",)
@@ -186,7 +186,7 @@ def resolve_material(
 
     Parameters
     ----------
-    material : scene.schema.Material
+    material : scene.material_block.Material
     file, key : optional
         File and key of the block, for messages.
 

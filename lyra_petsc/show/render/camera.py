@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.scene.schema import Camera, Scene, parallel
+from lyra_petsc.scene.camera_block import Camera, parallel
+from lyra_petsc.scene.schema import Scene
 
 MARGIN = 0.86
 """Fraction of the picture's height and width that the motion fills."""
