@@ -20,20 +20,14 @@ from numpy.typing import NDArray
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import contact_pairs, surface_shares
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.contact.contact_search import EDGE_GAP, ContactSearch
+from lyra_petsc.contact.contact_setup import AREA_UNITS, HALFWAY_CURVATURE, Barrier, surface_elements
 from lyra_petsc.contact.obstacle_points import ObstaclePositions, Obstacles, StepInterval
-from lyra_petsc.contact.obstacle_search import ObstacleSearch
 from lyra_petsc.contact.one_sided import Springs
 from lyra_petsc.contact.pairs import NearPairs, no_near_pairs
-from lyra_petsc.contact.sheet_search import SheetSearch
-from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.mesh.symmetry import symmetry_walls
-from lyra_petsc.mesh.topology import connected_pieces, edge_table
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms.protocols import KEPT_FRACTION, LimitsStep
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
@@ -45,74 +39,11 @@ TARGET_FRACTION = 0.7
 TARGET_TOLERANCE = 0.05
 """Part of the gap by which pairs may be nearer than their target distance after a Newton iteration."""
 
-PARALLEL = 1e-3
-"""Squared sine of the angle of two edges below which their energy is multiplied by the mollifier."""
-
 MAX_DEVIATION = 0.1
 """Largest deviation over the gap of an obstacle's paths from straight lines, where these are used instead."""
 
-HALFWAY_CURVATURE = 14.0
-"""b″ / k in the middle of the gap."""
-
-EDGE_GAP = 0.3
-"""Part of the gap below which two edges repel each other, except for sharp edges of obstacles. Sheets that
-lie on each other are kept apart by pairs of vertices and triangles, two for each vertex; pairs of edges, of
-which there are ten times as many, are needed only for what these miss. The same holds for edges and points of
-obstacles' smooth surfaces, so that forces on the vertices of a sheet do not depend on the obstacle's mesh."""
-
-SKIN = 0.5
-"""Distance over the gap by which points may approach each other between two searches."""
-
-SAG = 0.01
-"""Part of the gap by which a sheet's edges may sag between its vertices on a sphere or rod for the obstacle
-to count as nearly flat: there, as on planes, vertices carry the contact, and edges and triangles have the gap
-of two edges only, because their nearest points are not well defined."""
-
-MAX_PAIRS, MAX_PAIRS_PER_VERTEX = 500_000, 100
-"""If a search finds more pairs than both (the second per vertex), it is repeated with shorter displacements:
-a Newton increment may lead through all of a crumpled sheet, but only a small part of it will be possible. Not
-in a static analysis, whose first load step may lead far while nothing holds the sheet."""
-
-MIN_STRAIN = 0.01
-"""Least strain of an edge under the force k · gap. With a softer barrier a small force would nearly close a
-small gap, which takes Newton's method many iterations."""
-
 
 TO_STAGE = StepInterval(0.0, 1.0)
-
-AREA_UNITS = 1_000_000_000
-"""Area factors of vertices are stored as multiples of 1 / `AREA_UNITS`: integers are sent to other ranks with
-the triangles."""
-
-MIN_AREA_FACTOR, MAX_AREA_FACTOR = 1e-3, 1e3
-"""Bounds of the area factors."""
-
-MAX_NARROWING = 1e6
-"""Bound of the factor by which the gap is smaller at small triangles."""
-
-
-class Barrier(NamedTuple):
-    """Constants of the barrier, the same on all ranks.
-
-    Attributes
-    ----------
-    gap, thickness : float [m]
-    stiffness : float [N/m]
-        k in the interior of a regular mesh.
-    parallel : float
-        Squared sine of the angle of edges below which their energy is mollified.
-    flat : float
-        Radius [m] of spheres and rods from which on they count as nearly flat (`SAG`).
-    walls : tuple of Container
-        Symmetry planes, one for each side with sheets.
-    """
-
-    gap: float
-    thickness: float
-    stiffness: float
-    parallel: float
-    flat: float = np.inf
-    walls: tuple[Container, ...] = ()
 
 
 class ActivePairs(NamedTuple):
@@ -211,30 +142,14 @@ class ContactBarrier(LimitsStep):
 
     Parameters
     ----------
-    surface : (F, 3)
-        Triangles of this rank, in local rows.
-    uv : (F, 3, 2)
-        Material coordinates [m] of their corners.
-    marks : (F, 8 + walls)
-        Code of the triangles' surroundings (`surface_shares.rings`), and of their corners the `area_factors`,
-        the `narrowing`, a code of their symmetry planes (`_plane_codes`), and for each of `Barrier.walls`
-        bits i: whether it acts on corner i.
+    search : ContactSearch
     """
 
-    def __init__(self, surface: NDArray[np.int32], uv: Array, marks: Ints) -> None:
-        self.obstacles, self.self_contact, self.static = Obstacles([]), True, False
+    def __init__(self, search: ContactSearch) -> None:
+        self.search, self.static = search, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
-        self._sheet_search = SheetSearch(surface.astype(np.int64), uv)
-        self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, 0.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32)))
-        self.surface: NDArray[np.int32] = np.ascontiguousarray(surface, dtype=np.int32)
-        self.surface_marks = marks
         self._capacity = 0
-        self._searched: Ints | None = None  # triangles that the search has
-        self._vertex_units = np.empty(0, dtype=np.int64)  # of the stiffness, by vertex
-        self._narrowing = np.empty(0, dtype=np.int64)  # in the same units, by vertex
-        self._on_planes = np.empty((0, 3), dtype=np.bool_)  # symmetry planes normal to each axis, by vertex
-        self._walled = np.empty((0, 0), dtype=np.bool_)  # walls that act on each vertex
         self.set_pairs(no_near_pairs(), self.stencil, 0)
 
     def set_up(
@@ -244,16 +159,13 @@ class ContactBarrier(LimitsStep):
 
         ``self_contact``: sheets repel each other and themselves; ``static``: an equilibrium is computed.
         """
-        walls = barrier.walls, -0.5 * barrier.thickness  # at half of the distance of a vertex from its image
-        self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat, *walls)
-        self.self_contact, self.static = self_contact, static
-        self.skin = SKIN * barrier.gap
-        self.search_distance = barrier.thickness + barrier.gap + self.skin
-        self.approach_limit = (EDGE_GAP if self_contact else 1.0) * barrier.gap + self.skin
-        self._obstacle_search = ObstacleSearch(self.obstacles, self._sheet_search, self.search_distance)
-        start, stage, end = self._next_obstacle_x = self._obstacle_search.x
-        self._at_rest = ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(0.0, 0.0))
-        self.obstacles_have_moved = False
+        self.barrier, self.static = barrier, static
+        self.search.set_up(barrier, obstacles, self_contact=self_contact, static=static)
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """The obstacles of the scene, and its symmetry planes."""
+        return self.search.obstacles
 
     def set_pairs(self, pairs: NearPairs, stencil: NDArray[np.int32], n_counted: int) -> None:
         """Take the near pairs with a vertex of this rank, in local rows ``stencil`` (E, 4); this rank counts
@@ -274,7 +186,7 @@ class ContactBarrier(LimitsStep):
         self.pair_stiffness *= image_scale**2 * narrowing
         self._remembered = Remembered(self._find_active)
         self._expected = np.full(self.n_elements, np.nan)
-        largest = np.append(np.abs(self._obstacle_search.x).max(axis=(0, 2)), 0.0)
+        largest = np.append(np.abs(self.search.obstacle_x).max(axis=(0, 2)), 0.0)
         of_points = largest[np.where(self.points < 0, ~self.points, -1)]
         self._largest_coordinate = np.maximum(np.abs(self.offset), of_points.max(axis=1))
         self._springs: Springs | None = None
@@ -297,85 +209,11 @@ class ContactBarrier(LimitsStep):
     # -- obstacles ---------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> ObstaclePositions:
-        if not self.moving:
-            return self._at_rest
-        times = step.start, step.target_time, step.end
-        search = self._obstacle_search
-        start, stage, end = self._next_obstacle_x = np.stack([self.obstacles.positions(t) for t in times])
-        largest = np.linalg.norm(self._next_obstacle_x - search.x, axis=-1).max(initial=0.0)
-        planes = (self.obstacles.planes[:, 3] < self.obstacles.first_wall).any()
-        self.obstacles_have_moved = bool(largest > 0.5 * self.skin or (largest > 0.0 and planes))
-        search.deviations = self.obstacles.path_deviations(step.start, step.end)
-        return ObstaclePositions(start, stage, end, self.obstacles.rigid_motions(*times[:2]))
+        return self.search.expect(step)
 
     @property
     def moving(self) -> bool:
         return self.obstacles.moving
-
-    # -- search ------------------------------------------------------------------------------------
-
-    def near_pairs(self, x: Array, dx: Array, numbers: Ints, triangles: Ints) -> NearPairs | None:
-        """The pairs that may come nearer than ``search_distance`` along straight displacements dx (N, 3) [m]
-        of points x (N, 3) [m]; None if there are too many, so that shorter ones must be searched.
-
-        ``numbers`` (N,) are the points' global numbers, ``triangles`` (F, 3 + m) near triangles with their
-        marks. Ranks that see the same points find the same pairs.
-        """
-        if self.moving:
-            self._obstacle_search.move(self._next_obstacle_x)
-        self.obstacles_have_moved = False
-        if triangles is not self._searched:
-            self._sheet_search.set_triangles(x, numbers, triangles[:, :3], triangles[:, 3])
-            self._vertex_units = np.full(len(x) + 1, AREA_UNITS)  # the last one for other pairs
-            self._vertex_units[triangles[:, :3]] = triangles[:, 4:7]
-            self._narrowing = np.full(len(x), AREA_UNITS)
-            self._narrowing[triangles[:, :3]] = triangles[:, 7:10]
-            self._on_planes = np.zeros((len(x), 3), dtype=np.bool_)
-            codes = triangles[:, 10, None] >> np.arange(9)
-            self._on_planes[triangles[:, :3]] = (codes & 1).astype(np.bool_).reshape(-1, 3, 3)
-            codes = triangles[:, None, 11:] >> np.arange(3)[:, None]
-            self._walled = np.zeros((len(x), codes.shape[2]), dtype=np.bool_)
-            self._walled[triangles[:, :3]] = (codes & 1).astype(np.bool_)
-            self._searched = triangles
-        limit = np.inf
-        if dx.any() and not self.static:
-            limit = max(MAX_PAIRS, MAX_PAIRS_PER_VERTEX * len(x))
-        boxes = self._sheet_search.boxes(x, dx)
-        found = [np.empty((0, 7), dtype=np.int64)]
-        if self.obstacles.each:
-            found += self._obstacle_search.pairs(x, dx, boxes, self._walled)
-        if self.self_contact:
-            radius = self.search_distance
-            edge_radius = radius - (1.0 - EDGE_GAP) * self.barrier.gap
-            pairs = self._sheet_search.pairs(x, dx, numbers, radius, edge_radius, boxes, limit)
-            if pairs is None:
-                return None
-            found.append(pairs)
-        every = np.concatenate(found)
-        if len(every) > limit:
-            return None
-        if not len(every):
-            return no_near_pairs()
-        kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
-        sheet = points >= 0
-        first = points[np.arange(len(points)), sheet.argmax(axis=1)]
-        vertex = np.where((kind != EDGE_EDGE) & sheet[:, 0], points[:, 0], -1)
-        units = self._vertex_units[vertex]
-        if self._on_planes.any():
-            edges = np.flatnonzero(kind == EDGE_EDGE)
-            units[edges] >>= self._symmetry_planes(x, points[edges])
-        narrowing = np.where(obstacle < 0, self._narrowing[np.maximum(points, 0)].max(axis=1), AREA_UNITS)
-        vertices = numbers[np.where(sheet, points, first[:, None])]
-        obstacle_points = np.where(sheet, 0, points)
-        return NearPairs(vertices, kind, obstacle, obstacle_points, every[:, 6], units, narrowing)
-
-    def _symmetry_planes(self, x: Array, points: Ints) -> Ints:
-        """Number of symmetry planes in which all vertices of pairs of edges ``points`` (m, 4) lie, (m,)."""
-        at, sheet = np.maximum(points, 0), points >= 0
-        on_planes, place = self._on_planes[at] | ~sheet[:, :, None], x[np.where(sheet, at, at[:, :1])]
-        # no edge between two planes is shorter than the gap
-        in_one = np.ptp(place, axis=1) < 0.5 * self.barrier.gap
-        return (on_planes.all(axis=1) & in_one).sum(axis=1)
 
     # -- energy ------------------------------------------------------------------------------------
 
@@ -479,6 +317,10 @@ class ContactBarrier(LimitsStep):
         return float(contact_pairs.free_fraction(x, frozen.stage, dx, at_rest, *pairs))
 
     def springs(self, x: Array, approach: float, frozen: ObstaclePositions) -> Springs:
+        """One-sided springs for the pairs in contact at x (n_local, 3), or that may be after points have
+        approached each other by ``approach`` [m], the same on all ranks. Their pairs count as active until
+        `release_springs`.
+        """
         active, capacity = self.active_pairs(x, frozen.stage), self._capacity
         given = active.pair, active.weight, active.owned_weight, active.beta, active.derivatives
         while True:
@@ -495,12 +337,16 @@ class ContactBarrier(LimitsStep):
         return self._springs
 
     def release_springs(self, length: Array | None) -> None:
+        """Drop the springs. Their forces at lengths (m,) [m], where given, are those that `target_distances`
+        expects.
+        """
         self._expected[:] = np.nan
         if length is not None and self._springs is not None:
             self._expected[self._springs.pair] = self._springs.law(length)[0] / self._springs.scale
         self._springs = None
 
     def target_distances(self, x: Array, dx: Array, frozen: ObstaclePositions) -> tuple[NDArray[Any], ...]:
+        """Distances of pairs that `add_corrections` restores after Newton's increment dx (n_local, 3) [m]."""
         n, pairs = self.n_elements, (*self._geometry, TARGET_FRACTION, self._expected)
         targets = np.empty(n), np.zeros((n, 3)), np.empty(n, np.bool_)
         contact_pairs.target_distances(x, frozen.stage, dx, *pairs, *targets)
@@ -515,6 +361,11 @@ class ContactBarrier(LimitsStep):
         out: Array,
         weight: Array,
     ) -> bool:
+        """Whether points are nearer after the increment dx (n_local, 3) [m] of x than their target distances.
+
+        Adds corrections of the increment to ``out`` (n_local, 3) [m], each times a weight, and the weights to
+        ``weight`` (n_local, 1).
+        """
         pairs = *self._geometry, *targets, TARGET_TOLERANCE
         return bool(contact_pairs.add_corrections(x, frozen.stage, dx, *pairs, out, weight))
 
@@ -523,9 +374,12 @@ class ContactBarrier(LimitsStep):
     def is_collision_free(
         self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
     ) -> bool:
+        """Whether nothing collides on the displacement dx (n_local, 3) [m] from x, while obstacles move as
+        in an interval of the step.
+        """
         if not self.n_elements:
             return True
-        curved = np.flatnonzero(self._obstacle_search.deviations > MAX_DEVIATION * self.barrier.gap)
+        curved = np.flatnonzero(self.search.path_deviations > MAX_DEVIATION * self.barrier.gap)
         if len(curved) and np.isin(self.obstacle, curved).any():
             return False
         motion = frozen.displacements(interval, dx)
@@ -538,6 +392,7 @@ class ContactBarrier(LimitsStep):
         return out - self.offset
 
     def gaps(self, x: Array, frozen: ObstaclePositions) -> Array:
+        """Distance less thickness [m] between the two simplices of each owned pair, (n_owned,)."""
         return (self._scale * self.distances(x, frozen.stage))[: self.n_owned]
 
     def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
@@ -549,13 +404,20 @@ class ContactBarrier(LimitsStep):
     def collision_free_fractions(
         self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
     ) -> Array:
+        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which each owned pair does not
+        collide, (n_owned,), while obstacles move as in an interval of the step.
+        """
         return self._free_fractions(x, frozen.displacements(interval, dx), self.n_owned)
 
     def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
+        """Whether any pair of this rank may come into contact in a step with displacement dx (n_local, 3) [m]
+        from x; only pairs that approach by more than ``threshold`` [m] count.
+        """
         motion = frozen.displacements(TO_STAGE, dx)
         return bool(contact_pairs.may_collide(x, *motion, *self._geometry, threshold))
 
     def pair(self, element: int) -> Pair:
+        """The pair of simplices of this number."""
         points, n_first = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
         parts = (tuple(points[:n_first]), tuple(points[n_first:]))
         number = int(self.obstacle[element])
@@ -591,6 +453,9 @@ class ContactBarrier(LimitsStep):
         return out
 
     def work(self, x: Array, at: float, start: float, end: float) -> float:
+        """Work [J] of moving obstacles on this rank's pairs between the times ``start`` and ``end`` [s], by
+        the forces at positions x (n_local, 3) with obstacles at time ``at``.
+        """
         to_start, to_end = (self.obstacles.rigid_motions(at, time) for time in (start, end))
         work = 0.0
         for obstacle, force in self._obstacle_gradients(x, self.obstacles.positions(at)):
@@ -599,6 +464,9 @@ class ContactBarrier(LimitsStep):
         return work
 
     def moved_with_obstacles(self, x: Array, dx: Array, frozen: ObstaclePositions) -> Array:
+        """Displacements dx (n_local, 3) [m] from x, for vertices in the path of moving obstacles changed to
+        those of the obstacles.
+        """
         if not self.moving:
             return dx
         motion = frozen.displacements(TO_STAGE, dx)
@@ -635,6 +503,9 @@ class ContactBarrier(LimitsStep):
         return beta[kept], normal[kept], force[kept], delta[kept], pair[kept]
 
     def contacts(self, x: Array, v: Array, frozen: ObstaclePositions, last: tuple[float, float]) -> Contacts:
+        """The pairs in contact at the end of the step, with positions x and velocities v (n_local, 3). The
+        velocities of obstacles are means between the two times ``last`` [s].
+        """
         beta, normal, force, delta, pair = self.find_contacts(x, frozen.end, self.n_owned)
         points, obstacle = self.stencil[pair].astype(np.int64), self.obstacle[pair]
         _, slope, curvature = contact_pairs.barrier(delta, self.gap[pair])
@@ -670,121 +541,10 @@ class ContactBarrier(LimitsStep):
 
 def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets (rank 0)."""
-    triangles = rest.mesh.triangles.astype(np.int64)
-    rings, areas = surface_shares.rings(triangles), area_factors(triangles, rest.area)
-    walled = []
-    for wall in symmetry_walls(rest.scene, rest.mesh):
-        acts = np.zeros(rest.mesh.n_vertices, dtype=np.int64)
-        acts[wall.vertices] = 1
-        walled.append(acts[triangles] @ (1 << np.arange(3)))
-    narrow = np.rint(AREA_UNITS * _gap_and_narrowing(rest)[1]).astype(np.int64)[triangles]
-    marks = np.column_stack([rings, areas, narrow, _plane_codes(rest), *walled])
-    uv = rest.mesh.triangle_uv.reshape(-1, 6)
-    return Elements(rest.mesh.triangles, {"uv": uv, "marks": marks.astype(np.float64)})
-
-
-def area_factors(triangles: Ints, area: Array) -> Ints:
-    """Factors of k, in units of 1 / `AREA_UNITS`, for pairs of the corners of triangles (F, 3): the area of a
-    vertex over its mean in a regular mesh with as many triangles as the sheet.
-
-    An even pressure so leads to the same distance everywhere, whatever the size of the triangles. With the
-    mean over all sheets the few vertices of a coarse sheet would carry most of the load of a fine one on it,
-    and friction would oscillate.
-    """
-    sheet = connected_pieces(triangles)
-    mean = np.bincount(sheet, area) / np.bincount(sheet)
-    of_vertex = np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3))
-    factor = np.clip(of_vertex[triangles] / (2.0 * mean[sheet])[:, None], MIN_AREA_FACTOR, MAX_AREA_FACTOR)
-    return np.rint(AREA_UNITS * factor).astype(np.int64)
-
-
-def _plane_codes(rest: RestShape) -> Ints:
-    """For each triangle (F,) the bits 3 i + k: whether corner i lies in a symmetry plane normal to axis k.
-
-    Edges in a symmetry plane belong to both halves of the sheet, and so their energy counts by half.
-    """
-    on_planes = np.zeros((rest.mesh.n_vertices, 3), dtype=np.int64)
-    for number, handle in enumerate(rest.scene.handles):
-        if handle.symmetry is not None:
-            held = select_vertices(rest.mesh, handle, key=f"handles[{number}]", file=rest.scene.source)
-            on_planes[held, AXES.index(handle.symmetry)] = 1
-    codes: Ints = on_planes[rest.mesh.triangles].reshape(-1, 9) @ (1 << np.arange(9))
-    return codes
-
-
-def barrier(rest: RestShape) -> Barrier:
-    """The constants of a scene's barrier (rank 0).
-
-    Raises
-    ------
-    InputError
-        If the gap is so large that neighbours in most of the mesh would repel each other.
-    """
-    scene = rest.scene
-    assert scene.contact is not None
-    length, thickness = edge_lengths(rest.mesh), scene.contact.thickness
-    (gap, narrowing), shortest = _gap_and_narrowing(rest), _low(length.min(axis=1))
-    if gap + thickness >= shortest:
-        raise InputError(
-            f"gap + thickness = {gap + thickness:.3g} m is not below the shorter edges, {shortest:.3g} m: "
-            "neighbours in the mesh would touch; give smaller ones, or a coarser mesh",
-            file=scene.source,
-            key="contact",
-        )
-    if (narrowing > 1.0).any():
-        rest.notes.append(
-            f"contact: gap {gap:.3g} m, but less at {np.count_nonzero(narrowing > 1.0)} vertices of "
-            f"triangles with short sides or heights, down to {gap / narrowing.max():.3g} m at vertex "
-            f"{narrowing.argmax()}"
-        )
-    stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
-    stiffness *= max(1.0 / HALFWAY_CURVATURE, MIN_STRAIN * float(length.mean()) / gap)
-    flat = float(length.max()) ** 2 / (8.0 * SAG * gap)
-    walls = tuple(wall.container for wall in symmetry_walls(scene, rest.mesh))
-    return Barrier(gap, thickness, stiffness, PARALLEL, flat, walls)
-
-
-def _gap_and_narrowing(rest: RestShape) -> tuple[float, Array]:
-    """The gap [m] of a scene with contact, and for each vertex (V,) the factor >= 1 by which gap and
-    thickness are less.
-
-    Vertices of triangles that are smaller than gap and thickness would else repel their neighbours in the
-    mesh at rest.
-    """
-    contact, factor = rest.scene.contact, np.ones(rest.mesh.n_vertices)
-    assert contact is not None
-    length = edge_lengths(rest.mesh)
-    side = length.min(axis=1)
-    height = _least_heights(rest, length) if contact.self else np.full(len(side), np.inf)
-    gap = contact.gap or min(0.25 * float(length.mean()), 0.5 * _low(side), 0.7 * _low(height))
-    if contact.self:
-        reach = gap + contact.thickness
-        small = np.flatnonzero(np.minimum(side, height) <= reach)
-        needed = np.minimum(reach / np.minimum(0.5 * side, 0.7 * height)[small], MAX_NARROWING)
-        np.maximum.at(factor, rest.mesh.triangles[small], needed[:, None])
-    return gap, factor
-
-
-def _low(values: Array) -> float:
-    """A low percentile of the values (F,) of triangles, which few bad ones do not decide."""
-    order = max(len(values) // 20, min(2, len(values) // 4))
-    return float(np.partition(values, order)[order])
-
-
-def _least_heights(rest: RestShape, length: Array) -> Array:
-    """Least distance (F,) [m] of a corner of each triangle from those behind its opposite side, in the flat
-    rest shape; infinite if there are none. ``length`` (F, 3) [m] are the sides.
-    """
-    table = edge_table(rest.mesh.triangles.astype(np.int64))
-    at_side = np.empty(length.size, dtype=np.int64)
-    at_side[table.sides] = np.repeat(table.sizes, table.sizes)
-    square, height = length**2, 2.0 * rest.area[:, None] / length
-    others = np.abs(np.roll(square, 1, axis=1) - np.roll(square, -1, axis=1))
-    inner = (at_side.reshape(-1, 3) > 1) & (others <= square)  # the foot of the height is on the side
-    return np.where(inner, height, np.inf).min(axis=1)
+    return surface_elements(rest)
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must be called next."""
     uv, marks = elements.data["uv"].reshape(-1, 3, 2), elements.data["marks"]
-    return ContactBarrier(elements.stencil.astype(np.int32), uv, marks.astype(np.int64))
+    return ContactBarrier(ContactSearch(elements.stencil.astype(np.int32), uv, marks.astype(np.int64)))

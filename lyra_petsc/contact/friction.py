@@ -5,9 +5,9 @@ vertex that moved on to a neighbouring triangle, keeps its elastic slip, so that
 The owner of a pair's first vertex stores the pair and sends it to the owners of the others.
 
 The equations of a step use the normal forces at its start, or where these change much, those at the end of
-the solve before (`Stepper.attempt`). When the normal forces of the step are known, an impulse changes the
+the solve before (`SceneContact.follow`). When the normal forces of the step are known, an impulse changes the
 friction of each pair to that of Coulomb's law with these: the point of the disc |f| ≤ μ N that is nearest to
-the friction which stops the pair (`stepping.impacts`). So friction never exceeds μ times the normal force of
+the friction which stops the pair (`impacts`). So friction never exceeds μ times the normal force of
 the same step, and it opposes the motion.
 """
 
@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.contact import friction_pairs
-from lyra_petsc.contact.barrier import HALFWAY_CURVATURE, ContactBarrier, Contacts
+from lyra_petsc.contact.barrier import ContactBarrier, Contacts
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE
+from lyra_petsc.contact.contact_setup import HALFWAY_CURVATURE
 from lyra_petsc.contact.friction_pairs import (
     BETA,
     COLUMNS,
@@ -150,8 +151,8 @@ class StartingFriction(NamedTuple):
         Local rows of the vertices.
     gradients : (m, 2, 4, 3)
         Gradients of the relative displacement's components with respect to the points' positions.
-    size : (m, 4)
-        Largest norms of the gradients over all tangential directions.
+    beta : (m, 4)
+        As in `Contacts`, 0 for points of obstacles.
     weight, limit : (m,)
         Normal forces, in proportion to which masses are divided, and largest friction [N].
     force : (m, 2)
@@ -162,7 +163,7 @@ class StartingFriction(NamedTuple):
 
     points: Ints
     gradients: Array
-    size: Array
+    beta: Array
     weight: Array
     limit: Array
     force: Array
@@ -268,6 +269,7 @@ class CoulombFriction(Stateful):
 
     @property
     def n_friction_pairs(self) -> int:
+        """Number of pairs in contact that may stick or slide in the next step."""
         return len(self._pairs.key)
 
     # -- pairs -------------------------------------------------------------------------------------
@@ -280,10 +282,14 @@ class CoulombFriction(Stateful):
         return self._element_pairs.stencil, self._element_pairs.data
 
     def begin_step(self) -> None:
+        """Prepare for an attempt at a step from the accepted state."""
         self._next_pairs = None
         self.pairs_have_changed |= self._element_pairs is not self._pairs
 
     def changed_contacts(self, x: Array, start: Array, frozen: ObstacleMotion) -> tuple[float, float]:
+        """Change of the normal forces of this rank's pairs since they were last taken, and their sum [N], at
+        a Newton iterate x of a step from ``start``, (n_local, 3) each.
+        """
         contact, given = self._contact, self._element_pairs
         if not contact.n_elements and not len(given.key):
             return 0.0, 0.0
@@ -296,6 +302,7 @@ class CoulombFriction(Stateful):
         return float(change), float(continued.sum())
 
     def take_contacts(self) -> None:
+        """Take the pairs that `changed_contacts` found for the step's equations."""
         self.pairs_have_changed = True
 
     def _update_pairs(self, x: Array, obstacle_x: Array, old: Pairs) -> None:
@@ -513,6 +520,9 @@ class CoulombFriction(Stateful):
         normal_force: Array,
         last: tuple[float, float],
     ) -> EndFriction:
+        """Friction at the end of a step to positions x, with velocities v (n_local, 3), in ``contacts`` whose
+        normal forces in the step are ``normal_force`` (m,) [N]; ``last`` as in `ContactBarrier.contacts`.
+        """
         old, data, _ = self._moved_pairs(x, frozen)
         found = contacts.beta, contacts.normal, contacts.force, contacts.pair
         pairs, pair, order, previous = self._pairs_of(x, x, found, old)
@@ -538,9 +548,11 @@ class CoulombFriction(Stateful):
         slides = pairs.data[:, SLID] > 0.5
         static, kinetic = self._coefficients[pairs.data[:, 1].astype(np.int64)].T
         limit, none = pairs.data[:, FACTOR] * normal_force, np.zeros(self.n_owned)
-        points = np.concatenate([self._contact.stencil[pair], self.stencil[owned]]).astype(np.int64)
-        obstacle = np.concatenate([contacts.obstacle[order], self._obstacle[owned]])
-        velocity = self._contact.obstacles.contact_velocities(x, v, points, beta, obstacle, last)
+        before = self.stencil[owned].astype(np.int64), self._beta[owned], self._obstacle[owned]
+        points = np.concatenate([self._contact.stencil[pair].astype(np.int64), before[0]])
+        obstacle = np.concatenate([contacts.obstacle[order], before[2]])
+        velocity = self._contact.obstacles.contact_velocities(x, v, *before, last)
+        velocity = np.concatenate([contacts.velocity[order], velocity])
         return EndFriction(
             points,
             beta,
@@ -561,6 +573,9 @@ class CoulombFriction(Stateful):
     def set_end_friction(
         self, friction: EndFriction, force: Array, sticks: NDArray[np.bool_], work: Array
     ) -> None:
+        """Set friction (m, 2) [N] of the step in the pairs of an `end_friction`, which of them stick, and the
+        heat (m,) [J] of sliding.
+        """
         assert self._ended is not None
         pairs, loads, at_vertices = self._ended[1:]
         size, before = (np.linalg.norm(each, axis=1) for each in (force, friction.force))
@@ -574,17 +589,17 @@ class CoulombFriction(Stateful):
         np.add.at(at_vertices, friction.points[:, 0], work)
 
     def starting_friction(self, frozen: ObstacleMotion) -> StartingFriction:
+        """Friction at the start of the step."""
         owned = slice(self.n_owned)
         gradients, beta = self._gradients[owned], self._beta[owned]
-        # a gradient β t + (d · t) n is longest for t along d, and has the length |β| for t perpendicular to d
-        size = np.sqrt(np.maximum((gradients * gradients).sum(axis=(1, 3)) - beta * beta, 0.0))
         (_, _, constant, stiffness, _), _ = self._kernel_data(frozen.motions)
         elastic = -(stiffness[:, None] * self._tangential(self._slip))[owned]
         moved, force = (constant - self._constant)[owned], self._force[owned]
         points = self.stencil[owned].astype(np.int64)
-        return StartingFriction(points, gradients, size, force, self._limit[owned], elastic, moved)
+        return StartingFriction(points, gradients, beta, force, self._limit[owned], elastic, moved)
 
     def set_starting_friction(self, friction: Array) -> None:
+        """Set the friction (m, 2) [N] of the pairs of `starting_friction`."""
         owned, data = slice(self.n_owned), self._pairs.data.copy()
         slip = np.einsum("eck,ec->ek", self._tangents[owned], -friction / self._stiffness[owned, None])
         data[:, SLIP:SLID] = slip
@@ -630,6 +645,11 @@ class CoulombFriction(Stateful):
             data[rows, CONTACT : CONTACT + 3], data[rows, SLIP : SLIP + 3] = moved, slip @ rotation.T
 
     def friction_lag(self, x: Array, frozen: ObstacleMotion) -> dict[str, Array]:
+        """How far friction is from the limit of the normal forces at positions x (n_local, 3).
+
+        For each obstacle by its name, and between sheets (empty name), three sums [N] over this rank's
+        vertices: error (friction beyond the limit, or below it where pairs slide), friction, limit.
+        """
         names = [*(obstacle.name for obstacle in self._contact.obstacles.each), ""]
         (slip, _, slides), count = self._return_map(x, *self._kernel_data(frozen.motions)), len(names)
         owned, friction = slice(self.n_owned), self._stiffness * np.linalg.norm(slip, axis=1)
@@ -650,6 +670,11 @@ class CoulombFriction(Stateful):
         return dict(zip(names, sums, strict=True))
 
     def slip_under_changed_forces(self, x: Array, dx: Array, frozen: ObstacleMotion) -> tuple[float, float]:
+        """How far points slip while normal forces change, in a solve by dx (n_local, 3) [m] to x.
+
+        Two sums over this rank's vertices: slip times the change of the normal force since friction was
+        computed [J], and the larger of the normal forces before and after [N].
+        """
         contact, n = self._contact, len(self._work)
         obstacles, motions, owned = contact.obstacles, frozen.motions, slice(self.n_owned)
         beta, normal, force, _, pair = contact.find_contacts(x, frozen.end_points, contact.n_owned)

@@ -232,12 +232,12 @@ def hold_by_friction(
     velocities of ``step``, as far as its limit allows. (Projected gradients with momentum: Nesterov, Soviet
     Mathematics Doklady 27 (1983) 372-376.)
     """
-    points, gradients, size, weight, limit, elastic, moved = term.starting_friction(motion)
+    points, gradients, beta, weight, limit, elastic, moved = term.starting_friction(motion)
     layout, dt, n = step.layout, step.dt, len(step.v)
     largest = layout.global_max(float(limit.max(initial=0.0)))[0]
     if not largest > 0.0:
         return acceleration
-    stopped = _pair_masses(step, points, size, weight)
+    stopped = _pair_masses(step, points, _sizes(gradients, beta), weight)
 
     def with_friction(friction: Array) -> Array:
         pull = _sums(points, np.einsum("ec,ecik->eik", friction - elastic, gradients), n)

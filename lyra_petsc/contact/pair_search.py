@@ -97,9 +97,9 @@ class PairSearch:
         self._path: tuple[Array, Array] | None = None
         self._begin = self._square = 0.0
         self._steps = 1  # steps that were expected to lead along the path
-        self._radius = 0.5 * barrier.skin  # distance [m] from the path up to which the search is valid
+        self._radius = 0.5 * barrier.search.skin  # distance [m] from the path up to which the search is valid
         self._fraction = 1.0  # of the expected displacement that was searched
-        self._triangles = self._with_marks(barrier.surface.astype(np.int64))  # all, on a single rank
+        self._triangles = self._with_marks(barrier.search.surface.astype(np.int64))  # all, on a single rank
 
     @property
     def _layout(self) -> Layout:
@@ -118,7 +118,7 @@ class PairSearch:
         positions = (here,) if expected is None else (here, here + expected[: len(here)])
         leaves, moved, changed = layout.global_max(
             not self._are_near_path(self._radius, *positions),
-            barrier.obstacles_have_moved,
+            barrier.search.obstacles_have_moved,
             friction is not None and friction.pairs_have_changed,
         )
         searches, before = bool(leaves or moved), (self._pairs, self._friction_pairs)
@@ -209,7 +209,7 @@ class PairSearch:
         if self._path is None:
             return 1.0
         n = self._layout.n_vertices
-        radius = 0.5 * self._barrier.approach_limit
+        radius = 0.5 * self._barrier.search.approach_limit
         x, displacement = x[:n], displacement[:n]
         for part in (1.0, self._fraction) if 0.0 < self._fraction < 1.0 else (1.0,):
             near = self._are_near_path(radius, x, x + part * displacement)
@@ -265,15 +265,15 @@ class PairSearch:
 
     def _with_marks(self, triangles: Ints) -> Ints:
         """Triangles (F, 3) with further columns, the barrier's marks."""
-        return np.column_stack([triangles, self._barrier.surface_marks])
+        return np.column_stack([triangles, self._barrier.search.marks])
 
     def _near_pairs(self, x: Array, u: Array) -> NearPairs | None:
         """The pairs near owned vertices, on displacements u (n_local, 3) [m]; None if there are too many."""
         layout, n, barrier = self._layout, self._layout.n_vertices, self._barrier
         own = layout.start + np.arange(n)
         if layout.comm.size == 1:
-            return barrier.near_pairs(x[:n], u[:n], own, self._triangles)
-        surface, number_of = barrier.surface.astype(np.int64), np.arange(layout.n_local)
+            return barrier.search.near_pairs(x[:n], u[:n], own, self._triangles)
+        surface, number_of = barrier.search.surface.astype(np.int64), np.arange(layout.n_local)
         corners = self._with_marks(layout.global_number[surface])
         mine = surface[:, 0] < layout.n_owned  # each triangle is sent once
         # a pair of a triangle with ghost corners also acts on the triangle's owned corners
@@ -294,7 +294,7 @@ class PairSearch:
             [self._with_marks(number_of[surface]), np.concatenate([order[at], corners[:, 3:]], axis=1)]
         )
         points = np.concatenate([x[:n], x[ghosts], moves[:, 0]])
-        pairs = barrier.near_pairs(
+        pairs = barrier.search.near_pairs(
             points, np.concatenate([u[:n], u[ghosts], moves[:, 1]]), numbers, triangles
         )
         if pairs is None:
@@ -321,7 +321,7 @@ class PairSearch:
         numbers, moves : (k, …), (k, 3, 2, 3)
             The received ones; ``moves`` holds position and displacement of each corner.
         """
-        comm, distance = self._layout.comm, self._barrier.search_distance
+        comm, distance = self._layout.comm, self._barrier.search.distance
         received = [(numbers[:0], np.empty((0, rows.shape[1], 2, 3)))]
         low, high = swept_boxes(x, u, rows)
         box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])

@@ -92,7 +92,7 @@ class SceneContact:
     @property
     def skin(self) -> float:
         """Distance [m] by which points may approach each other between two searches."""
-        return self.barrier.skin
+        return self.barrier.search.skin
 
     @property
     def obstacles_move(self) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from lyra_petsc.arrays import Ints
 from lyra_petsc.kernels.cache import cached
 
-FEW = 16
+INSERTED = 16
 """Number of rows up to which rows with the same number in the first column are sorted by insertion."""
 
 
@@ -35,9 +35,9 @@ def _sort_runs(order, spare, keys):  # type: ignore[no-untyped-def]
         end = begin + 1
         while end < n and keys[order[end], 0] == keys[order[begin], 0]:
             end += 1
-        for low in range(begin, end, FEW):
-            _insert(order, low, min(low + FEW, end), keys)
-        width = FEW
+        for low in range(begin, end, INSERTED):
+            _insert(order, low, min(low + INSERTED, end), keys)
+        width = INSERTED
         while width < end - begin:
             for low in range(begin, end - width, 2 * width):
                 high = min(low + 2 * width, end)

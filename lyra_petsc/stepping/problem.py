@@ -51,7 +51,8 @@ from lyra_petsc.terms.term import Elastic, Load, Term
 from lyra_petsc.terms.units_check import unit_notes
 
 if TYPE_CHECKING:
-    from lyra_petsc.contact.barrier import Barrier, ContactBarrier
+    from lyra_petsc.contact.barrier import ContactBarrier
+    from lyra_petsc.contact.contact_setup import Barrier
     from lyra_petsc.contact.friction import CoulombFriction
     from lyra_petsc.contact.scene_contact import SceneContact
     from lyra_petsc.terms.bending.midedge_clamp import ClampedEdges
@@ -369,7 +370,7 @@ def _barrier(rest: RestShape) -> Barrier | None:
     """Parameters of contact for all ranks, or None if the scene has no contact."""
     if rest.scene.contact is None:
         return None
-    from lyra_petsc.contact.barrier import barrier  # only contact needs its kernels
+    from lyra_petsc.contact.contact_setup import barrier  # only contact needs its kernels
 
     return barrier(rest)
 

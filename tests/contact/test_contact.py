@@ -51,7 +51,7 @@ class Watched:
         self.term = term
         self.system = self.simulation.problem.system
         layout = self.system.points
-        pieces = comm.allgather(layout.global_number[term.surface])
+        pieces = comm.allgather(layout.global_number[term.search.surface])
         originals = np.concatenate(comm.allgather(layout.mesh_vertices))
         every = np.unique(np.sort(originals[np.concatenate(pieces)], axis=1), axis=0)
         self.triangles = every.astype(np.int64)

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.contact.barrier import ContactBarrier
+from lyra_petsc.contact.contact_search import ContactSearch
 from lyra_petsc.stepping.simulation import SteppedScene
 
 SCENE: dict[str, Any] = {
@@ -48,14 +48,14 @@ def test_one_search_serves_several_steps(
     """If vertices move by more than the gap, gravity bends their paths, and forces are evaluated within the
     step: searches look 1, 2, 3, 4, 4, … steps ahead.
     """
-    searches, search = 0, ContactBarrier.near_pairs
+    searches, search = 0, ContactSearch.near_pairs
 
     def counted(*given: Any) -> Any:
         nonlocal searches
         searches += 1
         return search(*given)
 
-    monkeypatch.setattr(ContactBarrier, "near_pairs", counted)
+    monkeypatch.setattr(ContactSearch, "near_pairs", counted)
     thrown = {"handles": [], "initial": {"velocity": [0.0, 0.0, -6.0]}}
     simulation = SteppedScene(comm, scene_of(SCENE | FAR | thrown | timed(integrator)))
     searches = 0

@@ -125,7 +125,7 @@ def force_work(
     smooth = comm.allreduce(turn, op=MPI.MAX) < LARGEST_TURN
     largest_dx, skin = (
         largest(comm, dx[:n]),
-        min((cast("ContactBarrier", term).skin for term in contact), default=0.0),
+        min((cast("ContactBarrier", term).search.skin for term in contact), default=0.0),
     )
     panels = max(CONTACT_PANELS, math.ceil(largest_dx / skin) if skin > 0.0 else 0)
     for part, refine, first in ((hinges, smooth, 1), (contact, True, panels)):
