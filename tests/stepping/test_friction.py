@@ -563,8 +563,7 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
     renamed, turned = vertices.copy(), pairs.copy()
     renamed[between] = vertices[between][:, [3, 2, 1, 0]]
     turned[between, 6:9] *= -1.0
-    layout = simulation.problem.points
-    term.restore_elements(renamed, turned, range(layout.start, layout.start + layout.n_owned), {})
+    term.restore_pairs(renamed, turned, {})
     again = term.state()["pairs"]
     np.testing.assert_array_equal(again.vertices, vertices)
     np.testing.assert_array_equal(again.values, pairs)
