@@ -125,7 +125,6 @@ MEMBRANE_SCENE = {
     "membrane_laws.stvk",
     "protocols",
     "registry",
-    "remembered",
     "rest",
     "term",
     "units_check",
