@@ -133,8 +133,8 @@ class BlockRows:
         pattern = self.pattern
         _add_diagonal(pattern.indptr[: pattern.n_diagonal + 1], diagonal, values)
         if pattern.edge_couplings is not None:
-            first = pattern.edge_couplings.first_number(pattern.n_blocks)
-            indptr, own = pattern.edge_couplings.numbers.indptr, diagonal[pattern.n_diagonal :]
+            first = pattern.edge_couplings.first_entry(pattern.n_blocks)
+            indptr, own = pattern.edge_couplings.entries.indptr, diagonal[pattern.n_diagonal :]
             _add_edge_diagonal(indptr, first, own, values.reshape(-1))
 
     def scale_diagonal(self, values: Array, factor: float) -> None:

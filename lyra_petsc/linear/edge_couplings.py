@@ -5,10 +5,11 @@ be zero, and 70 % of those that couple edges with edges. So one half of the symm
 
 - 3 × 3 blocks of vertices, in the pattern,
 - *groups*: 3 × 4 blocks of a vertex and four of its edges, padded with zeros in a vertex' last group,
-- *numbers*: scalar entries of pairs of edges.
+- *edge entries*: scalar entries of pairs of edges.
 
-Couplings to ghosts are few, and stay 3 × 3 blocks of the pattern. One array of values holds blocks, groups
-and numbers in this order. The column of an edge's unknown is its index in a flattened array of local rows.
+Couplings to ghosts are few, and stay 3 × 3 blocks of the pattern. One array of values holds blocks,
+groups and edge entries in this order. The column of an edge's unknown is its index in a flattened array of
+local rows.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ class Groups(NamedTuple):
     columns: NDArray[np.int32]
 
 
-class Numbers(NamedTuple):
+class EdgeEntries(NamedTuple):
     """Scalar couplings of owned edges, in compressed rows; the first entry of a row is the diagonal one.
 
     Attributes
     ----------
     indptr : (n_edges + 1,) int32, or int64 if needed
-    columns : (n_numbers,) int32
+    columns : (n_edge_entries,) int32
     """
 
     indptr: NDArray[Any]
@@ -75,12 +76,12 @@ class EdgeValues(NamedTuple):
         Each block column by column.
     groups : (n_groups, 12)
         Each block row by row.
-    numbers : (n_numbers, 1)
+    entries : (n_edge_entries, 1)
     """
 
     blocks: NDArray[Any]
     groups: NDArray[Any]
-    numbers: NDArray[Any]
+    entries: NDArray[Any]
 
 
 class EdgeCouplings:
@@ -97,7 +98,7 @@ class EdgeCouplings:
     n_vertices : int
         Owned rows of vertices; those of edges follow.
     groups : Groups
-    numbers : Numbers
+    entries : EdgeEntries
     """
 
     def __init__(self, elements: Sequence[MixedStencil], n_owned: int) -> None:
@@ -133,25 +134,25 @@ class EdgeCouplings:
         diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
         one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
         indptr = row_pointers(np.bincount(one - 3 * first, minlength=len(diagonal)))
-        self.numbers = Numbers(indptr.astype(index_type(len(other))), other.astype(np.int32))
+        self.entries = EdgeEntries(indptr.astype(index_type(len(other))), other.astype(np.int32))
 
     # -- positions of values, as indices into the flattened array ------------------------------------
 
     @property
     def n_values(self) -> int:
-        """Stored values of groups and numbers."""
-        return int(3 * self.groups.columns.size + len(self.numbers.columns))
+        """Stored values of groups and edge entries."""
+        return int(3 * self.groups.columns.size + len(self.entries.columns))
 
     @property
     def n_entries(self) -> int:
-        """Entries of groups and numbers in both halves of the matrix, including padding."""
-        return 2 * self.n_values - len(self.numbers.indptr) + 1
+        """Entries of groups and pairs of edges in both halves of the matrix, including padding."""
+        return 2 * self.n_values - len(self.entries.indptr) + 1
 
     def first_group(self, n_blocks: int) -> int:
         """Position of the first group, behind n_blocks blocks."""
         return 9 * ALIGNMENT * -(-n_blocks // ALIGNMENT)
 
-    def first_number(self, n_blocks: int) -> int:
+    def first_entry(self, n_blocks: int) -> int:
         """Position of the first number."""
         return self.first_group(n_blocks) + 3 * self.groups.columns.size
 
@@ -161,14 +162,14 @@ class EdgeCouplings:
 
     def diagonal(self, n_blocks: int) -> Ints:
         """Positions of the edges' diagonal entries, including padding."""
-        own: Ints = self.numbers.indptr[:-1].astype(np.int64)
-        return own + self.first_number(n_blocks)
+        own: Ints = self.entries.indptr[:-1].astype(np.int64)
+        return own + self.first_entry(n_blocks)
 
     def parts(self, values: NDArray[Any], n_blocks: int) -> EdgeValues:
         """Views of values (n_stored, 3, 3)."""
-        flat, first, last = values.reshape(-1), self.first_group(n_blocks), self.first_number(n_blocks)
+        flat, first, last = values.reshape(-1), self.first_group(n_blocks), self.first_entry(n_blocks)
         blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
-        return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.columns)].reshape(-1, 1))
+        return EdgeValues(blocks, groups, flat[last : last + len(self.entries.columns)].reshape(-1, 1))
 
     def offsets_of(self, elements: MixedStencil, pattern: BlockPattern) -> Offsets:
         """Positions of the couplings (a, b), b ≥ a, of elements for edges b; edges come after vertices.
@@ -181,8 +182,8 @@ class EdgeCouplings:
         first = self.first_group(pattern.n_blocks)
         kind = index_type(4 * (first + self.n_values))
         out: Offsets = np.empty((len(stencil), n * m + m * (m + 1) // 2), dtype=kind)
-        rows = pattern.indptr, pattern.columns, *self.groups, *self.numbers
-        _look_up(*rows, first, self.first_number(pattern.n_blocks), stencil, elements.edges, out)
+        rows = pattern.indptr, pattern.columns, *self.groups, *self.entries
+        _look_up(*rows, first, self.first_entry(pattern.n_blocks), stencil, elements.edges, out)
         return out
 
     # -- prescribed unknowns -------------------------------------------------------------------------
@@ -193,25 +194,25 @@ class EdgeCouplings:
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
         coupled = mask[vertex][:, :, None] | held[self.groups.columns][:, None, :]
         of_groups = self.first_group(n_blocks) + np.flatnonzero(coupled)
-        indptr, columns = self.numbers
+        indptr, columns = self.entries
         edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(indptr))
         own = self.diagonal(n_blocks)
-        of_numbers = held[edge] | held[columns]
-        of_numbers[indptr[:-1]] = False
-        zeros = np.concatenate([of_groups, self.first_number(n_blocks) + np.flatnonzero(of_numbers)])
+        of_entries = held[edge] | held[columns]
+        of_entries[indptr[:-1]] = False
+        zeros = np.concatenate([of_groups, self.first_entry(n_blocks) + np.flatnonzero(of_entries)])
         edges: Ints = np.flatnonzero(held[3 * self.n_vertices : 3 * self._n])
         return zeros, own[edges], own.reshape(-1, 3)[edges // 3]
 
     # -- in blocks -----------------------------------------------------------------------------------
 
     def _coupled(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Rows and columns of all groups' entries, then of all numbers, as indices of unknowns."""
+        """Rows and columns of all groups' entries, then of all edge entries, as indices of unknowns."""
         vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
         shape = (len(vertex), 3, GROUP)
         row = np.broadcast_to((3 * vertex[:, None] + np.arange(3))[:, :, None], shape).ravel()
         column = np.broadcast_to(self.groups.columns[:, None, :], shape).ravel()
-        edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(self.numbers.indptr))
-        return row, column.astype(np.int64), edge, self.numbers.columns.astype(np.int64)
+        edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(self.entries.indptr))
+        return row, column.astype(np.int64), edge, self.entries.columns.astype(np.int64)
 
     def whole(self, pattern: BlockPattern) -> BlockPattern:
         """The equivalent pattern of 3 × 3 blocks only, in which rows of owned edges hold three edges."""
@@ -223,7 +224,7 @@ class EdgeCouplings:
 
     def in_blocks(self, pattern: BlockPattern, values: Array) -> Array:
         """Values (n_blocks, 3, 3) of the pattern ``whole`` from values (n_stored, 3, 3)."""
-        blocks, groups, numbers = self.parts(values, pattern.n_blocks)
+        blocks, groups, entries = self.parts(values, pattern.n_blocks)
         n_local = pattern.n_local
         keys = pattern.whole.keys(n_local)
         out = np.zeros((len(keys), 9))
@@ -239,19 +240,19 @@ class EdgeCouplings:
         row, column, edge, other = self._coupled()
         # added, as the padding of a group repeats an edge with value 0
         np.add.at(flat, position(row, column), groups.ravel())
-        flat[position(edge, other)] = numbers[:, 0]
+        flat[position(edge, other)] = entries[:, 0]
         same_row = edge // 3 == other // 3
-        flat[position(other[same_row], edge[same_row])] = numbers[same_row, 0]
+        flat[position(other[same_row], edge[same_row])] = entries[same_row, 0]
         return out.reshape(-1, 3, 3)
 
 
 @cached()
 def _look_up(  # type: ignore[no-untyped-def]
-    indptr, columns, group_ptr, columns4, number_ptr, columns1, first_group, first_number, stencil, edges, out
+    indptr, columns, group_ptr, columns4, entry_ptr, columns1, first_group, first_entry, stencil, edges, out
 ):
     """Positions (`offsets_of`) of elements whose stencil (E, n + m) ends with the rows of edges (E, m).
 
-    ``columns4`` and ``columns1`` are the columns of groups and of numbers.
+    ``columns4`` and ``columns1`` are the columns of groups and of edge entries.
     """
     n_owned, n_vertices = len(indptr) - 1, len(group_ptr) - 1
     n = stencil.shape[1] - edges.shape[1]
@@ -285,9 +286,9 @@ def _look_up(  # type: ignore[no-untyped-def]
                             lesser, greater = greater, lesser
                         found = MISSING
                         edge = lesser - 3 * n_vertices
-                        for k in range(number_ptr[edge], number_ptr[edge + 1]):
+                        for k in range(entry_ptr[edge], entry_ptr[edge + 1]):
                             if columns1[k] == greater:
-                                found = first_number + k
+                                found = first_entry + k
                                 break
                 out[e, pair] = found
                 pair += 1
@@ -295,7 +296,7 @@ def _look_up(  # type: ignore[no-untyped-def]
 
 @cached(fastmath={"contract", "nsz"})
 def multiply(  # type: ignore[no-untyped-def]
-    indptr, ends, columns, group_ptr, columns4, number_ptr, columns1, blocks, groups, numbers, x, sums, out
+    indptr, ends, columns, group_ptr, columns4, entry_ptr, columns1, blocks, groups, entries, x, sums, out
 ):
     """out (n_owned, 3) = A x for x (n_local, 3); sums (n_vertices, 4) is scratch."""
     n, n_owned = Index(len(sums)), Index(len(ends))
@@ -312,14 +313,14 @@ def multiply(  # type: ignore[no-untyped-def]
         out[row, 0], out[row, 1] = s0 + t0 + sums[row, 0], s1 + t1 + sums[row, 1]
         out[row, 2] = s2 + t2 + sums[row, 2]
     first, flat, to = Index(3) * n, x.reshape(-1), out.reshape(-1)
-    for edge in range(Index(len(number_ptr) - 1)):
-        lo, hi = Index(number_ptr[edge]), Index(number_ptr[edge + Index(1)])
+    for edge in range(Index(len(entry_ptr) - 1)):
+        lo, hi = Index(entry_ptr[edge]), Index(entry_ptr[edge + Index(1)])
         mine = flat[first + edge]
-        s0 = numbers[lo, 0] * mine
+        s0 = entries[lo, 0] * mine
         for k in range(lo + Index(1), hi):
             other = Index(columns1[k])
-            s0 += numbers[k, 0] * flat[other]
-            to[other] += numbers[k, 0] * mine
+            s0 += entries[k, 0] * flat[other]
+            to[other] += entries[k, 0] * mine
         to[first + edge] += s0
     for row in range(n, n_owned):
         lo, hi = Index(indptr[row]), Index(indptr[row + Index(1)])
@@ -343,7 +344,7 @@ class ProductWithEdges:
     def __init__(self, pattern: BlockPattern, values: Array) -> None:
         couplings = pattern.edge_couplings
         assert couplings is not None
-        rows = pattern.indptr, pattern.ends, pattern.columns, *couplings.groups, *couplings.numbers
+        rows = pattern.indptr, pattern.ends, pattern.columns, *couplings.groups, *couplings.entries
         self._rows = *rows, *couplings.parts(values, pattern.n_blocks)
         self._n_vertices = couplings.n_vertices
 

@@ -56,11 +56,11 @@ def memory_sizes(pattern: BlockPattern) -> tuple[int, int]:
 
 
 @cached()
-def invert_numbers(indptr, numbers, inverse):  # type: ignore[no-untyped-def]
+def invert_edge_diagonal(indptr, entries, inverse):  # type: ignore[no-untyped-def]
     """inverse (n_rows, 3), flattened = inverses of the edges' diagonal entries; 0 for entries of 0."""
     flat = inverse.reshape(-1)
     for edge in range(Index(len(flat))):
-        value = numbers[Index(indptr[edge]), 0]
+        value = entries[Index(indptr[edge]), 0]
         flat[edge] = 1.0 / value if value != 0.0 else 0.0
 
 
@@ -74,7 +74,7 @@ def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
 
 
 @cached(fastmath=True)
-def backward_edges(first, indptr, columns, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+def backward_edges(first, indptr, columns, entries, inverse, x, r):  # type: ignore[no-untyped-def]
     """``gauss_seidel.backward`` over the owned edges, from index ``first`` on, in x and r (n_local, 3).
 
     An edge depends on the edge processed before it, which is mostly its first coupling: that one is added
@@ -87,28 +87,28 @@ def backward_edges(first, indptr, columns, numbers, inverse, x, r):  # type: ign
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
         s = rest[at]
         for k in range(hi - lo):
-            s -= numbers[hi - Index(1) - k, 0] * flat[Index(columns[hi - Index(1) - k])]
+            s -= entries[hi - Index(1) - k, 0] * flat[Index(columns[hi - Index(1) - k])]
         y = flushed(inverses[edge] * s)
         decrement = flat[at] - y
         flat[at], rest[at] = y, 0.0
         for k in range(lo, hi):
-            rest[Index(columns[k])] += numbers[k, 0] * decrement
+            rest[Index(columns[k])] += entries[k, 0] * decrement
 
 
 @cached(fastmath=True)
-def forward_edges(first, indptr, columns, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+def forward_edges(first, indptr, columns, entries, inverse, x, r):  # type: ignore[no-untyped-def]
     """``gauss_seidel.forward`` over the owned edges; couplings to ghosts are already subtracted from r."""
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     first = Index(first)
     for edge in range(Index(len(inverses))):
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
-        s = numbers.dtype.type(0.0)
+        s = entries.dtype.type(0.0)
         for k in range(lo, hi):
-            s += numbers[k, 0] * flat[Index(columns[k])]
+            s += entries[k, 0] * flat[Index(columns[k])]
         y = flushed(inverses[edge] * (rest[at] - s))
         flat[at] = y
         for k in range(lo, hi):
-            rest[Index(columns[k])] -= numbers[k, 0] * y
+            rest[Index(columns[k])] -= entries[k, 0] * y
 
 
 @cached(fastmath=True)
@@ -224,7 +224,7 @@ class SweepsWithEdges:
         self._couplings, self._n_blocks = couplings, pattern.n_blocks
         self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._groups = couplings.groups
-        self._numbers, self._first = couplings.numbers, 3 * couplings.n_vertices
+        self._entries, self._first = couplings.entries, 3 * couplings.n_vertices
         n, n_local = couplings.n_vertices, pattern.n_local
         rows = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._with_ghosts, self._edges_with_ghosts = rows[rows < n], rows[rows >= n]
@@ -275,8 +275,8 @@ class SweepsWithEdges:
         """Invert the diagonal of block rows (n_stored, 9)."""
         begin = self._rows[0][: len(self._inverse) + 1]
         invert_diagonal(begin, values, self._inverse)
-        numbers = self._couplings.parts(values, self._n_blocks).numbers
-        invert_numbers(self._numbers.indptr, numbers, self._inverse_of_edges)
+        entries = self._couplings.parts(values, self._n_blocks).entries
+        invert_edge_diagonal(self._entries.indptr, entries, self._inverse_of_edges)
 
     def store(self, values: Array) -> None:
         """Copy block rows (n_stored, 9), which may overlap the memory of the copy."""
@@ -310,8 +310,8 @@ class SweepsWithEdges:
 
     def backward(self, x: Floats) -> None:
         """Sweep over the edges, then over the vertices."""
-        blocks, groups, numbers = self._values
-        backward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
+        blocks, groups, entries = self._values
+        backward_edges(self._first, *self._entries, entries, self._inverse_of_edges, x, self.of_edges)
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
@@ -338,7 +338,7 @@ class SweepsWithEdges:
 
     def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
         """Sweep over the vertices, and if ``number`` is even over the edges after that."""
-        blocks, groups, numbers = self._values
+        blocks, groups, entries = self._values
         rows = *self._rows, *self._groups, blocks, groups
         if number % EDGES_EVERY:
             forward_vertices(*rows, self._inverse, b, x, self.r, None)
@@ -348,5 +348,5 @@ class SweepsWithEdges:
         before = self.of_edges[with_ghosts]
         subtract_ghosts(with_ghosts, *self._rows, blocks, x, self.of_edges)
         of_ghosts = before - self.of_edges[with_ghosts]
-        forward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
+        forward_edges(self._first, *self._entries, entries, self._inverse_of_edges, x, self.of_edges)
         self.of_edges[with_ghosts] += of_ghosts  # the residual of vertices does not contain ghosts either

@@ -64,7 +64,7 @@ class InterpolationRows:
     weights: Array
 
 
-class WithoutEdges(Protocol):
+class VertexMatrix(Protocol):
     """Replaces the finest level's matrix in the Galerkin product, as coarse levels have no edges' unknowns.
 
     Attributes
@@ -115,7 +115,7 @@ class Hierarchy:
     pattern : BlockPattern
     interpolations : sequence of InterpolationRows
         Between the levels, finest first.
-    below : WithoutEdges, optional
+    vertex_matrix : VertexMatrix, optional
         Given if edges carry unknowns.
     spare : bool
         Whether the finest level's block rows may be overwritten once its sweeps have copied them.
@@ -124,7 +124,7 @@ class Hierarchy:
     ----------
     levels : list of Level
     rows : (n_stored, 3, 3) or None
-        If ``below`` and ``spare`` are given: array for the finest level's block rows, within its memory.
+        If ``vertex_matrix`` and ``spare`` are given: array for the finest level's block rows, in its memory.
     """
 
     def __init__(
@@ -132,30 +132,34 @@ class Hierarchy:
         points: Points,
         pattern: BlockPattern,
         interpolations: Sequence[InterpolationRows],
-        below: WithoutEdges | None = None,
+        vertex_matrix: VertexMatrix | None = None,
         *,
         spare: bool = False,
     ) -> None:
-        self._below = below
-        level = Level(points, pattern, below.turns if below else None)
+        self._vertex_matrix = vertex_matrix
+        level = Level(points, pattern, vertex_matrix.turns if vertex_matrix else None)
         self.rows: Array | None = None
         self._spare, self._overwritten = spare, False
-        if below is not None:
+        if vertex_matrix is not None:
             from lyra_petsc.linear.edge_sweeps import memory_sizes  # only needed here
 
-            # if rows are spare, their copy overwrites them and the rows of ``below`` use the vectors' part;
-            # else the rows of ``below`` begin at 0, as they are projected before the sweeps copy anything
+            # if rows are spare, their copy overwrites them and the vertices' rows use the vectors' part;
+            # else the vertices' rows begin at 0, as they are projected before the sweeps copy anything
             of_rows, of_vectors = memory_sizes(pattern)
             begin = of_rows if spare else 0
-            size = max(of_rows + of_vectors, begin + 9 * below.pattern.n_blocks)
+            size = max(of_rows + of_vectors, begin + 9 * vertex_matrix.pattern.n_blocks)
             level.memory = np.zeros(max(size, 9 * pattern.n_stored) if spare else size)
-            self._memory_below = level.memory[begin:]
+            self._vertex_memory = level.memory[begin:]
             if spare:
                 self.rows = level.memory[: 9 * pattern.n_stored].reshape(-1, 3, 3)
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
-            fine = below.pattern if below is not None and level is self.levels[0] else level.pattern
+            fine = (
+                vertex_matrix.pattern
+                if vertex_matrix is not None and level is self.levels[0]
+                else level.pattern
+            )
             level.galerkin = Galerkin(level.points, fine, *rows)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
@@ -195,16 +199,16 @@ class Hierarchy:
         """
         finest = self.levels[0]
         free = np.where(held[: finest.pattern.n_diagonal], 0.0, 1.0)
-        below: tuple[Array, Array] | None = None
-        if self._below is not None and not self._spare and finest.galerkin is not None:
-            below = finest.galerkin.project(self._below.values(held, self._memory_below), free)
+        projected: tuple[Array, Array] | None = None
+        if self._vertex_matrix is not None and not self._spare and finest.galerkin is not None:
+            projected = finest.galerkin.project(self._vertex_matrix.values(held, self._vertex_memory), free)
         for level in self.levels:
             yield values, free
-            if self._below is not None and self._spare and level is finest:
+            if self._vertex_matrix is not None and self._spare and level is finest:
                 self._overwritten = True
-                values = self._below.values(held, self._memory_below)
-            if below is not None:
-                (values, free), below = below, None
+                values = self._vertex_matrix.values(held, self._vertex_memory)
+            if projected is not None:
+                (values, free), projected = projected, None
             elif level.galerkin is not None:
                 values, free = level.galerkin.project(values, free)
 

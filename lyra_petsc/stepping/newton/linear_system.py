@@ -227,14 +227,16 @@ class LinearSystem:
             found = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
         if discretisation.stencils_change:
             self._interpolations = found
-        below = None
+        vertex_matrix = None
         if self._system.active.coarse and not discretisation.stencils_change:
             from lyra_petsc.stepping.newton.vertex_equations import (
                 VertexEquations,  # needed with edge unknowns only
             )
 
-            below = VertexEquations(self._system)
-        return Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
+            vertex_matrix = VertexEquations(self._system)
+        return Hierarchy(
+            discretisation.layout, discretisation.rows.pattern, found, vertex_matrix, spare=spare
+        )
 
     def attach(self, ksp: PETSc.KSP) -> None:
         """Attach to a KSP whose options are set."""
