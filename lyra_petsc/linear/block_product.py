@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, read_only
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
 from lyra_petsc.linear.pattern import BlockPattern
@@ -63,4 +63,4 @@ class HalfStoredProduct:
     def __call__(self, x: Array, out: Array) -> None:
         """out (n_owned, 3) = A x for x (n_local, 3) with current ghost values."""
         sums = np.empty(self._shape) if self._kept is None else self._kept
-        multiply_half(*self._rows, x, sums, out)
+        multiply_half(*self._rows, read_only(x), sums, out)

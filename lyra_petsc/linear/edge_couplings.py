@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Array, Ints, read_only
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.pattern import MISSING, BlockPattern, block_of, index_type, row_pointers, union
@@ -350,4 +350,4 @@ class ProductWithEdges:
 
     def __call__(self, x: Array, out: Array) -> None:
         """out (n_owned, 3) = A x for x (n_local, 3) with current ghost values."""
-        multiply(*self._rows, x, np.empty((self._n_vertices, 4)), out)
+        multiply(*self._rows, read_only(x), np.empty((self._n_vertices, 4)), out)
