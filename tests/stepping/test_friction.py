@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import CLOTH, end_on_one_rank, finished, gathered, grid, obj_file, scene_of, shape
+from physics import CLOTH, end_on_one_rank, finished, gathered, grid, obj_file, scene_of, shape, stepped
 
 from lyra_petsc.contact.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.contact.friction import CoulombFriction
@@ -28,6 +28,21 @@ DOWN = np.array([math.cos(SLOPE), 0.0, -math.sin(SLOPE)])
 
 FLAT = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}
 PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}
+LIGHT = CLOTH | {"bending": 1e-4, "damping": 0.0}
+
+
+def on_plane(
+    size: tuple[float, int], gap: float, above: float, friction: Any, motion: dict[str, Any], **more: Any
+) -> dict[str, Any]:
+    """A sheet of side [m] and cells that starts ``above`` gaps over a plane, which may move."""
+    side, cells = size
+    return {
+        "mesh": grid(side, side, cells, cells) | {"transform": {"translate": [0.0, 0.0, above * gap]}},
+        "material": LIGHT,
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": gap, "friction": friction, "self": False},
+        "obstacles": {"floor": {"plane": FLAT} | motion},
+    } | more
 
 
 def on_slope(
@@ -43,7 +58,7 @@ def on_slope(
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
     content = {
         "mesh": grid(0.4, 0.4, 3, 3) | {"transform": {"rotate": turn, "translate": place}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "material": LIGHT,
         "gravity": [0.0, 0.0, -G],
         "contact": {"gap": GAP, "friction": friction, "self": False},
         "obstacles": {"slope": slope},
@@ -162,14 +177,9 @@ def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
     fastest = 1.1 * static * G  # acceleration at the end
     moved, speed = [fastest * end**2 / 6.0, 0.0, 0.0], [0.5 * fastest * end, 0.0, 0.0]
     last = {"time": end, "translate": moved, "velocity": speed}
-    content = {
-        "mesh": grid(0.3, 0.3, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.95 * GAP]}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": GAP, "friction": {"static": static, "kinetic": 0.6 * static}, "self": False},
-        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, last]}},
-        "time": {"end": end, "step": 0.01, "integrator": integrator},
-    }
+    both, motion = {"static": static, "kinetic": 0.6 * static}, {"motion": [{"time": 0.0}, last]}
+    time = {"end": end, "step": 0.01, "integrator": integrator}
+    content = on_plane((0.3, 3), GAP, 0.95, both, motion, time=time)
     simulation = SteppedScene(comm, scene_of(content))
     system, n = simulation.problem.system, simulation.problem.points.n_owned
     start, slip = system.x[:n, 0].copy(), 0.0
@@ -195,7 +205,7 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
         place = [above * GAP * component for component in NORMAL]
         content = {
             "mesh": grid(0.3, 0.3, 3, 3) | {"transform": {"rotate": turn, "translate": place}},
-            "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+            "material": LIGHT,
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": {"static": static, "kinetic": kinetic}, "self": False},
             "obstacles": {"slope": PLANE},
@@ -237,14 +247,8 @@ def first_accelerations(comm: MPI.Comm, content: dict[str, Any]) -> Array:
 
 def test_accelerations_at_the_start_are_those_with_friction(comm: MPI.Comm) -> None:
     """Friction stops a slow sheet within the step, brakes a fast one, and takes it along with an obstacle."""
-    mu, step, place = 0.5, 0.02, {"transform": {"translate": [0.0, 0.0, 0.985 * 0.005]}}
-    content = {
-        "mesh": grid(0.1, 0.1, 3, 3) | place,
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": 0.005, "friction": {"static": mu, "kinetic": 0.3}, "self": False},
-        "obstacles": {"floor": {"plane": FLAT}},
-    }
+    mu, step = 0.5, 0.02
+    content = on_plane((0.1, 3), 0.005, 0.985, {"static": mu, "kinetic": 0.3}, {})
     rest = first_accelerations(comm, content)
     friction = mu * (G + rest[:, 2].mean())
     assert friction > 0.1
@@ -276,7 +280,7 @@ def test_a_stack_is_held_by_friction_from_the_start(comm: MPI.Comm) -> None:
     ]
     content = {
         "mesh": sheets,
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
+        "material": LIGHT,
         "gravity": [push, 0.0, -G],
         "contact": {"gap": gap, "friction": 0.5},
         "obstacles": {"floor": {"plane": FLAT}},
@@ -295,25 +299,16 @@ def test_friction_on_a_tilting_plane_has_a_potential(comm: MPI.Comm) -> None:
         "obstacles": {"floor": {"plane": FLAT, "motion": [{"time": 0.0}, {"time": 0.3, "rotate": tilted}]}},
         "time": {"end": 0.3, "step": 0.01},
     }
-    simulation = SteppedScene(comm, scene_of(content))
-    while not simulation.finished:
-        simulation.step()
-    rejected = simulation.totals["rejected"]
-    simulation.destroy()
-    assert rejected == 0
+    with finished(comm, content) as simulation:
+        assert simulation.totals["rejected"] == 0
 
 
 def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     """The elastic part of the slip, which balances inertia, must rotate, too; else the sheet would creep."""
-    side, far, quarter = 0.06, 0.4, {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}
-    content = {
-        "mesh": grid(side, side, 2, 2) | {"transform": {"translate": [far, 0.0, 0.95 * GAP]}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0, "density": 400.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": GAP, "friction": 0.5, "self": False},
-        "obstacles": {"disc": {"plane": FLAT, "motion": [{"time": 0.3}, {"time": 1.5, "rotate": quarter}]}},
-        "time": {"end": 1.6, "step": 0.02},
-    }
+    quarter, heavy = {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}, LIGHT | {"density": 400.0}
+    turns, time = {"motion": [{"time": 0.3}, {"time": 1.5, "rotate": quarter}]}, {"end": 1.6, "step": 0.02}
+    content = on_plane((0.06, 2), GAP, 0.95, 0.5, turns, time=time, material=heavy)
+    content["mesh"]["transform"]["translate"][0] = 0.4
     simulation = SteppedScene(comm, scene_of(content))
     layout = simulation.problem.points
     settled = None
@@ -328,26 +323,22 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     assert np.abs(crept).max() < 1e-6
 
 
+def running(speed: float) -> dict[str, Any]:
+    """Motion of a belt along x [m/s]."""
+    away = {"time": 1.0, "translate": [speed, 0.0, 0.0]}
+    return {"motion": [{"time": 0.0}, away], "interpolation": "linear"}
+
+
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
 def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, integrator: str) -> None:
     """A sheet falls on it and slides until it has its speed, whatever the normal force is meanwhile."""
     speed = 0.35
-    away = {"time": 1.0, "translate": [speed, 0.0, 0.0]}
-    content = {
-        "mesh": grid(0.2, 0.2, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.003]}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": 0.002, "friction": 0.4, "self": False},
-        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away], "interpolation": "linear"}},
-        "time": {"end": 0.14, "step": 0.001, "integrator": integrator},
-    }
-    simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
-    while not simulation.finished:
-        simulation.step()
-    mass, momentum = system.points.global_sum(float(system.mass.sum()), float(system.mass @ system.v[:n, 0]))
-    work = simulation.energy_balance.columns()["friction_work"]
-    simulation.destroy()
+    time = {"end": 0.14, "step": 0.001, "integrator": integrator}
+    with finished(comm, on_plane((0.2, 4), 0.002, 1.5, 0.4, running(speed), time=time)) as simulation:
+        system, n = simulation.problem.system, simulation.problem.points.n_owned
+        own = float(system.mass.sum()), float(system.mass @ system.v[:n, 0])
+        mass, momentum = system.points.global_sum(*own)
+        work = simulation.energy_balance.columns()["friction_work"]
     assert momentum == pytest.approx(mass * speed, rel=1e-6)
     assert work == pytest.approx(0.5 * mass * speed**2, rel=0.04)
 
@@ -358,23 +349,15 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
 
     The sheet bounces by some per cent of the gap and slips meanwhile, under alpha2 0.05 mm with this Δt.
     """
-    end, far, gap = 0.1, 0.6, 0.003
-    away = {"time": 1.0, "translate": [far, 0.0, 0.0]}
-    content = {
-        "mesh": grid(0.06, 0.06, 3, 3) | {"transform": {"translate": [0.0, 0.0, 0.985 * gap]}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": gap, "friction": 0.5, "self": False},
-        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away]}},
-        "time": {"end": end, "step": 0.005, "integrator": integrator},
-    }
-    simulation = SteppedScene(comm, scene_of(content))
-    start = gathered(simulation.problem.points, simulation.problem.system.x)
-    while not simulation.finished:
-        simulation.step()
-    slip = (gathered(simulation.problem.points, simulation.problem.system.x) - start)[:, 0]
-    rejected = simulation.totals["rejected"]
-    simulation.destroy()
+    end, far = 0.1, 0.6
+    motion = {"motion": running(far)["motion"]}
+    time = {"end": end, "step": 0.005, "integrator": integrator}
+    with stepped(comm, on_plane((0.06, 3), 0.003, 0.985, 0.5, motion, time=time)) as simulation:
+        start = shape(simulation)
+        while not simulation.finished:
+            simulation.step()
+        slip = (shape(simulation) - start)[:, 0]
+        rejected = simulation.totals["rejected"]
     np.testing.assert_allclose(slip, far * (3.0 * end**2 - 2.0 * end**3), rtol=4e-3)
     assert rejected <= 4
 
@@ -383,23 +366,12 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
 def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm, integrator: str) -> None:
     """Friction, zero at the start, reaches its limit early in the first step: all steps balance energy."""
     speed, friction, end = 1.0, 0.5, 0.1
-    away = {"time": 1.0, "translate": [speed, 0.0, 0.0]}
-    content = {
-        "mesh": grid(0.06, 0.06, 2, 2) | {"transform": {"translate": [0.0, 0.0, 0.985 * GAP]}},
-        "material": CLOTH | {"bending": 1e-4, "damping": 0.0, "density": 40.0},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": GAP, "friction": friction, "self": False},
-        "obstacles": {"belt": {"plane": FLAT, "motion": [{"time": 0.0}, away], "interpolation": "linear"}},
-        "time": {"end": end, "step": 0.01, "integrator": integrator},
-    }
-    simulation = SteppedScene(comm, scene_of(content))
-    while not simulation.finished:
-        simulation.step()
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
-    sums = np.append(system.mass @ system.v[:n], system.mass.sum())
-    momentum = comm.allreduce(sums)
-    rejected = simulation.totals["rejected"]
-    simulation.destroy()
+    time, heavy = {"end": end, "step": 0.01, "integrator": integrator}, LIGHT | {"density": 40.0}
+    content = on_plane((0.06, 2), GAP, 0.985, friction, running(speed), time=time, material=heavy)
+    with finished(comm, content) as simulation:
+        system, n = simulation.problem.system, simulation.problem.points.n_owned
+        momentum = comm.allreduce(np.append(system.mass @ system.v[:n], system.mass.sum()))
+        rejected = simulation.totals["rejected"]
     assert momentum[0] / momentum[3] == pytest.approx(friction * G * end, rel=0.05)  # the sheet bounces
     assert rejected <= 2
 
