@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 pytestmark = pytest.mark.parallel(3)
 
 G, GAP, SIDE = 9.81, 0.005, 0.4
-INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "bdf2", "alpha2")
+OTHERS = ("semi-implicit", "midpoint", "alpha2")
 STIFF = {
     "density": 0.187,
     "membrane": {"c11": 2000, "c22": 2000, "c12": 600, "c33": 500},
@@ -87,10 +87,11 @@ CASES = [  # height above the plane, friction, speeds along and down, step
     (1.1 * GAP, 0.3, 3.0, 3.0, 0.005),
     (1.1 * GAP, 0.3, 2.0, 1.0, 0.02),
 ]
+RUNS = [*itertools.product(("beuler", "bdf2"), CASES), *((name, CASES[2]) for name in OTHERS)]
 
 
 @pytest.mark.parallel(1)
-@pytest.mark.parametrize(("integrator", "case"), list(itertools.product(INTEGRATORS, CASES)))
+@pytest.mark.parametrize(("integrator", "case"), RUNS)
 def test_a_thrown_sheet_slides_as_far_as_the_balance_of_momentum_says(
     comm: MPI.Comm, integrator: str, case: tuple[float, ...]
 ) -> None:

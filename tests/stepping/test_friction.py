@@ -168,7 +168,7 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
     assert ratios[1] > 0.05
 
 
-@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
+@pytest.mark.parametrize("integrator", ["beuler", "bdf2", "alpha2"])
 def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
     comm: MPI.Comm, integrator: str
 ) -> None:
@@ -193,7 +193,7 @@ def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
 
 
 @pytest.mark.parallel(1)
-@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
+@pytest.mark.parametrize("integrator", ["beuler", "bdf2"])
 def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, integrator: str) -> None:
     """Springs of sticking contact must not oscillate beyond their limit, or the sheet would slide."""
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
@@ -329,7 +329,7 @@ def running(speed: float) -> dict[str, Any]:
     return {"motion": [{"time": 0.0}, away], "interpolation": "linear"}
 
 
-@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2", "alpha2"])
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "bdf2"])
 def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, integrator: str) -> None:
     """A sheet falls on it and slides until it has its speed, whatever the normal force is meanwhile."""
     speed = 0.35
@@ -362,11 +362,10 @@ def test_an_obstacle_does_work_on_a_sheet_that_it_moves(comm: MPI.Comm, integrat
     assert rejected <= 4
 
 
-@pytest.mark.parametrize("integrator", ["midpoint", pytest.param("alpha2", marks=pytest.mark.parallel(1))])
-def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm, integrator: str) -> None:
+def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm) -> None:
     """Friction, zero at the start, reaches its limit early in the first step: all steps balance energy."""
     speed, friction, end = 1.0, 0.5, 0.1
-    time, heavy = {"end": end, "step": 0.01, "integrator": integrator}, LIGHT | {"density": 40.0}
+    time, heavy = {"end": end, "step": 0.01, "integrator": "midpoint"}, LIGHT | {"density": 40.0}
     content = on_plane((0.06, 2), GAP, 0.985, friction, running(speed), time=time, material=heavy)
     with finished(comm, content) as simulation:
         system, n = simulation.problem.system, simulation.problem.points.n_owned
@@ -377,7 +376,7 @@ def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm, integrator: str)
 
 
 @pytest.mark.parallel(1)
-@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2", "semi-implicit"])
+@pytest.mark.parametrize("integrator", ["beuler", "alpha2", "semi-implicit"])
 def test_friction_uses_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:
     """A sheet dropped on the slope: friction that is one step late would lack g sin α Δt permanently.
 
@@ -390,13 +389,8 @@ def test_friction_uses_normal_forces_of_the_same_time(comm: MPI.Comm, integrator
         assert speed == pytest.approx(expected, abs=accuracy * G * math.sin(SLOPE) * 0.01)
 
 
-INTEGRATORS = [
-    "bdf2",
-    *(
-        pytest.param(name, marks=pytest.mark.parallel(1))
-        for name in ("semi-implicit", "beuler", "midpoint", "alpha2")
-    ),
-]
+# in contact midpoint and alpha2 take the steps of bdf2, and semi-implicit those of beuler
+INTEGRATORS = ["bdf2", pytest.param("beuler", marks=pytest.mark.parallel(1))]
 
 
 def on_a_sheet(friction: float, integrator: str, end: float) -> dict[str, Any]:

@@ -33,9 +33,7 @@ def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]
 
 @pytest.mark.parallel(1)
 @pytest.mark.parametrize("floor_moves", [False, True])
-@pytest.mark.parametrize(
-    ("integrator", "step"), [("beuler", 5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
-)
+@pytest.mark.parametrize(("integrator", "step"), [("beuler", 5e-4), ("alpha2", 1e-3), ("bdf2", 1e-3)])
 def test_colliding_parts_hardly_rebound(
     comm: MPI.Comm, integrator: str, step: float, floor_moves: bool
 ) -> None:
@@ -58,7 +56,7 @@ def test_colliding_parts_hardly_rebound(
 
 
 @pytest.mark.parallel(1)
-@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
+@pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "beuler"])
 def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
     """A sheet falls on a ball by hundreds of gaps per step, and vertices touch it in each step."""
     ball = {"sphere": {"center": [0.0, 0.0, -0.302], "radius": 0.3}}
@@ -191,7 +189,7 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
     assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=1e-4)
 
 
-@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "bdf2", "alpha2"])
 def test_a_sheet_at_rest_on_an_accelerating_floor_is_pressed_but_not_damped(
     comm: MPI.Comm, integrator: str
 ) -> None:

@@ -133,8 +133,6 @@ LAWS: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     ),
 }
 
-INTEGRATORS = ("semi-implicit", "beuler", "midpoint", "bdf2", "alpha2", "static")
-
 
 def scene(integrator: str, material: Mapping[str, Any] | None = None, **more: Any) -> Scene:
     """The pulled sheet; an equilibrium has no wind but its pressure."""
@@ -190,7 +188,7 @@ def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Arr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["static", "bdf2"])
 def test_each_parameter(integrator: str) -> None:
     pulled, numbers = scene(integrator), of_integrator(integrator, NUMBERS)
     found = tangents(pulled, numbers)
@@ -200,7 +198,12 @@ def test_each_parameter(integrator: str) -> None:
         assert np.linalg.norm(found[key] - expected) < 1e-6 * np.linalg.norm(expected), key
 
 
-@pytest.mark.parametrize("integrator", ["static", "beuler", "midpoint", "bdf2"])
+@pytest.mark.parametrize("integrator", ["semi-implicit", "beuler", "midpoint", "alpha2"])
+def test_all_parameters_together(integrator: str) -> None:
+    agree(scene(integrator), of_integrator(integrator, NUMBERS))
+
+
+@pytest.mark.parametrize("integrator", ["static", "midpoint"])
 @pytest.mark.parametrize(("material", "numbers"), [(SHELL, OF_SHELL), (PLATE, OF_PLATE)])
 def test_directors_at_rest(
     integrator: str, material: Mapping[str, Any], numbers: Mapping[str, float]
@@ -214,7 +217,7 @@ def agree(pulled: Scene, numbers: Mapping[str, float]) -> None:
     assert np.linalg.norm(sum(found.values()) - expected) < 1e-6 * scale
 
 
-@pytest.mark.parametrize("integrator", ["static", "beuler", "alpha2", "bdf2"])
+@pytest.mark.parametrize("integrator", ["static", "semi-implicit", "alpha2", "bdf2"])
 def test_curved_sheets_with_directors(integrator: str) -> None:
     agree(scene(integrator, CURVED, **TURNED), of_integrator(integrator, OF_CURVED))
 
@@ -239,9 +242,8 @@ def test_stiff_damping_whose_first_step_is_of_backward_euler(integrator: str) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint"])
-def test_each_parameter_of_curved_sheets_with_directors(integrator: str) -> None:
-    pulled = scene(integrator, CURVED, **TURNED)
+def test_each_parameter_of_curved_sheets_with_directors() -> None:
+    pulled = scene("midpoint", CURVED, **TURNED)
     for key, value in OF_CURVED.items():
         agree(pulled, {key: value})
 
