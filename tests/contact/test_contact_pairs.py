@@ -360,65 +360,6 @@ def test_planes_that_turn() -> None:
     assert limited > 20
 
 
-def two_layers(noise: float) -> Pairs:
-    """All pairs between two parallel squares of 3 × 3 vertices."""
-    rng = np.random.default_rng(5)
-    flat = np.array([(i, j, 0.0) for j in range(3) for i in range(3)])
-    x = np.concatenate([flat, flat + [0.0, 0.0, 0.5]]) + noise * rng.normal(size=(18, 3))
-    corners = [(i, i + 1, i + 4) for i in (0, 1, 3, 4)] + [(i, i + 4, i + 3) for i in (0, 1, 3, 4)]
-    triangles = np.array(corners)
-    edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    upper = [[v, *t] for v in range(9, 18) for t in triangles]
-    lower = [[v, *t] for v in range(9) for t in triangles + 9]
-    across = [[*a, *b] for a in edges for b in edges + 9]
-    points = np.array(upper + lower + across)
-    kind = np.repeat([VERTEX_TRIANGLE, EDGE_EDGE], [len(upper) + len(lower), len(across)])
-    return Pairs(kind, points, x, np.zeros((0, 3)), np.zeros(len(kind)))
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-@pytest.mark.parametrize("parallel", [NOWHERE, 0.3])
-@pytest.mark.parametrize("alike", [True, False])
-def test_pairs_with_the_same_nearest_vertices_are_counted_once_with_a_weight(
-    noise: float, parallel: float, alike: bool
-) -> None:
-    """Also if edges have different gaps and stiffnesses."""
-    pairs, gap = two_layers(noise), 0.8
-    n = len(pairs)
-    edges = np.flatnonzero(pairs.kind == EDGE_EDGE)
-    gaps, stiffness = np.full(n, gap), np.full(n, STIFFNESS)
-    if not alike:
-        gaps[edges[::2]], stiffness[edges[::3]] = 0.7 * gap, 0.5 * STIFFNESS
-
-    def summed(
-        of: Pairs, counted: int, shares: Array, rows: slice = slice(None)
-    ) -> tuple[dict[str, NDArray[Any]], list[Any]]:
-        barriers = gaps[rows], stiffness[rows]
-        constants = of.kind, of.points, of.offset, *barriers, parallel
-        found = found_active(of.x, of.obstacle_x, *constants, shares, counted=counted)
-        active = tuple(found[name] for name in ACTIVE_COLUMNS)
-        out, hessian = np.zeros_like(of.x), np.zeros((len(of.x), len(of.x), 3, 3))
-        contact_pairs.add_gradient(of.x, of.obstacle_x, *constants, active, out, out)
-        each = blocks_of(of.x, of.obstacle_x, constants, active, 0.0)
-        np.add.at(hessian, (of.points[:, :, None], of.points[:, None, :]), each)
-        return found, [float(found["weight"] @ found["energy"]), out, hessian]
-
-    none = np.zeros((n, 6))
-    merged, total = summed(pairs, n // 2, none)
-    each = [slice(e, e + 1) for e in range(n)]
-    singles = [summed(pairs.part(row), int(row.start < n // 2), none[:1], row) for row in each]
-    assert total[0] == pytest.approx(sum(of[0] for _, of in singles), rel=1e-12)
-    for which in (1, 2):
-        expected = np.sum([of[which] for _, of in singles], axis=0)
-        np.testing.assert_allclose(total[which], expected, atol=1e-11 * np.abs(expected).max())
-    for name in ("weight", "counted"):
-        shares = stiffness[merged["at"]] * merged[name]
-        expected = sum(stiffness[e] * found[name].sum() for e, (found, _) in enumerate(singles))
-        assert shares.sum() == pytest.approx(expected)
-    if noise < 0.01 and alike:
-        assert len(merged["at"]) < (0.7 if parallel == NOWHERE else 0.95) * merged["weight"].sum()
-
-
 def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
     """Points of 4 × 4 cells, followed by five vertices in front of them; pairs of these and triangles, and
     shares.

@@ -1,4 +1,4 @@
-"""Edge unknowns stored as single values behind the blocks: products, sweeps and constraints."""
+"""Edge unknowns stored as single values behind the blocks: products and constraints."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from oracle import expanded
 
 from lyra_petsc.kernels.scatter import add_mixed_elements
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
-from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, memory_sizes
+from lyra_petsc.linear.edge_couplings import ProductWithEdges
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import MixedStencil
 
@@ -38,12 +37,6 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     return pattern, values, dense
 
 
-def couplings_of(pattern: BlockPattern) -> EdgeCouplings:
-    found = pattern.edge_couplings
-    assert found is not None
-    return found
-
-
 def test_products_agree_with_dense_ones() -> None:
     pattern, values, dense = mixed_rows()
     x, out = RNG.normal(size=(N_LOCAL, 3)), np.full((N_OWNED, 3), np.nan)
@@ -69,67 +62,3 @@ def test_prescribed_unknowns_are_decoupled() -> None:
     # nothing else has changed
     flat, old = values.ravel(), before.ravel()
     assert set(np.flatnonzero(flat != old)) <= set(constrained.changed)
-
-
-def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the owned part what is on and above the diagonal: blocks of vertices, numbers of edges."""
-    owned = dense[:, : 3 * N_OWNED]
-    step = np.arange(3 * N_OWNED)
-    step[: 3 * N_VERTICES] -= step[: 3 * N_VERTICES] % 3
-    upper = owned * (step[None, :] >= step[:, None])
-    return owned, upper
-
-
-def sweeps_of(pattern: BlockPattern, values: np.ndarray) -> SweepsWithEdges:
-    """Of block rows that are, as in a run, where the copy will be, in memory that something else had."""
-    memory = np.full(max(sum(memory_sizes(pattern)), values.size), np.nan)
-    rows = memory[: values.size].reshape(-1, 9)
-    rows[:] = values.reshape(-1, 9)
-    sweeps = SweepsWithEdges(pattern, couplings_of(pattern), memory)
-    sweeps.invert(rows)
-    sweeps.store(rows)
-    return sweeps
-
-
-def test_a_sweep_before_and_after_the_coarse_level() -> None:
-    pattern, values, dense = mixed_rows(definite=True)
-    owned, upper = parts(dense)
-    sweeps = sweeps_of(pattern, values)
-
-    def residual() -> np.ndarray:
-        return np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]]).ravel()
-
-    b = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)
-    right = b[:N_OWNED].astype(float).ravel()
-    x = np.zeros((N_LOCAL, 3), dtype=np.float32)
-    sweeps.begin(b)
-    sweeps.backward(x)
-    first = np.linalg.solve(upper, right)
-    np.testing.assert_allclose(x[:N_OWNED].ravel(), first, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(residual(), right - owned @ first, rtol=1e-4, atol=1e-4)
-
-    x[N_OWNED:] = RNG.normal(size=(N_LOCAL - N_OWNED, 3))
-    sweeps.subtract_ghosts(x)
-    np.testing.assert_allclose(residual(), right - dense @ x.astype(float).ravel(), rtol=1e-4, atol=1e-4)
-
-    x[:] = RNG.normal(size=x.shape)
-    before, left = x.astype(float), sweeps.of_edges[N_VERTICES:N_OWNED]
-    diagonal = np.diag(dense)[3 * N_VERTICES : 3 * N_OWNED].reshape(-1, 3)
-    sweeps.correct(x)
-    before[N_VERTICES:N_OWNED] += np.divide(
-        left, diagonal, out=np.zeros_like(diagonal), where=diagonal != 0.0
-    )
-    np.testing.assert_allclose(x, before, rtol=1e-4, atol=1e-5)
-
-    before = x.astype(float).ravel()
-    sweeps.forward(b, x)
-    step = np.linalg.solve(upper.T, right - dense @ before)
-    np.testing.assert_allclose(x[:N_OWNED].ravel(), before[: 3 * N_OWNED] + step, rtol=1e-4, atol=1e-4)
-
-    # and again from there
-    before = x.astype(float).ravel()
-    sweeps.subtract_ghosts(x)
-    sweeps.backward(x)
-    step = np.linalg.solve(upper, right - dense @ before)
-    np.testing.assert_allclose(x[:N_OWNED].ravel(), before[: 3 * N_OWNED] + step, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(residual(), right - dense @ before - owned @ step, rtol=1e-4, atol=1e-3)

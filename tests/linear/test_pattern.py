@@ -10,11 +10,11 @@ from petsc4py import PETSc
 from physics import Simulation, grid
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
+from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear import pattern as block_pattern
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.terms.term import MixedStencil, OffDiagonal
+from lyra_petsc.terms.term import OffDiagonal
 
 N_OWNED, N_LOCAL = 9, 14
 
@@ -77,23 +77,6 @@ def test_sums_of_element_blocks(monkeypatch: pytest.MonkeyPatch, largest: int) -
     np.testing.assert_array_equal(rows.product(sums, x), of_diagonal)
 
 
-def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
-    rng = np.random.default_rng(2)
-    rows = BlockRows(BlockPattern({"three": random_stencil(rng, 12, 3)}, N_OWNED, N_LOCAL))
-    values, mask = rng.standard_normal((rows.pattern.n_blocks, 3, 3)), np.zeros((N_LOCAL, 3), dtype=bool)
-    mask[[2, 5, N_OWNED + 1], [0, 1, 2]] = mask[7] = True
-    before, free = values.copy(), ~mask
-    rows.constrain(values, mask, constrained := rows.constrained_entries(mask))
-    x = rng.standard_normal((N_LOCAL, 3))
-    found = rows.product(values, x)
-    # the free part as it was without the others, each of which is its own
-    alone = rows.product(before, np.where(free, x, 0.0))
-    np.testing.assert_allclose(np.where(free[:N_OWNED], found - alone, 0.0), 0.0, atol=1e-14)
-    assert (found * x[:N_OWNED])[mask[:N_OWNED]].min() > 0.0
-    rows.constrain(everywhere := before, mask, constrained._replace(rows=np.arange(N_OWNED)))
-    np.testing.assert_array_equal(values, everywhere)
-
-
 def test_products_of_rows_and_columns_beyond_32_bits() -> None:
     n = 70_000  # n² > 2³²
     stencil = np.array([[n - 1, n - 2], [0, n - 1]], dtype=np.int32)
@@ -131,25 +114,6 @@ def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, lar
     wide = expanded(made, values, N_LOCAL + 2)
     np.testing.assert_array_equal(wide[:, :, :N_LOCAL], expanded(small, before, N_LOCAL))
     assert not wide[:, :, N_LOCAL:].any()
-
-
-@pytest.mark.parametrize("n_owned", [8, 6, 3])
-def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
-    """Vertices are rows 0 to 5, unknowns of edges three each in rows 6 and 7."""
-    rng = np.random.default_rng(8)
-    vertices = np.array([[0, 1, 2], [5, 3, 1], [4, 2, 0]], dtype=np.int32)
-    edges = np.array([[18, 19], [23, 20], [21, 19]], dtype=np.int64)  # two of one row, and of different ones
-    pattern = BlockPattern({"corners": vertices, "mixed": MixedStencil(vertices, edges)}, n_owned, 8)
-    blocks = rng.random((3, 11, 11))
-    blocks += blocks.transpose(0, 2, 1)
-    weight, values = rng.random(3), np.zeros((pattern.n_stored, 3, 3))
-    add_mixed_elements(weight, blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
-    expected = np.zeros((24, 24))
-    for e in range(3):
-        places = np.concatenate([(3 * vertices[e][:, None] + np.arange(3)).ravel(), edges[e]])
-        expected[np.ix_(places, places)] += weight[e] * blocks[e]
-    found = expanded(pattern, values, 8).reshape(3 * n_owned, 24)
-    np.testing.assert_allclose(found, expected[: 3 * n_owned])
 
 
 @pytest.mark.parallel

@@ -1,4 +1,4 @@
-"""Values written directly into PETSc's arrays are those that MatSetValues would set."""
+"""Matrices of PETSc: enlarged diagonals, and the end of a program that has not freed them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from patience import run_program
-from petsc4py import PETSc
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
@@ -22,33 +21,6 @@ def symmetric(points: Points, pattern: BlockPattern, shift: float) -> np.ndarray
     columns = points.global_number[pattern.columns]
     i, j = (3 * number[:, None] + np.arange(1, 4) for number in (rows, columns))
     return np.sin(shift + i[:, :, None] * j[:, None, :])
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("kind", ["aij", "baij", "sbaij"])
-def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.problem.points, simulation.problem.pattern
-        first, second = symmetric(points, pattern, 0.0), symmetric(points, pattern, 1.0)
-        once, twice = (AssembledMatrix(points, pattern, kind) for _ in range(2))
-        assert once.kind == kind
-        once.set(second)  # the first time through MatSetValues
-        twice.set(first)
-        state = twice.mat.stateGet()
-        twice.set(second)
-        assert twice.mat.stateGet() > state  # or preconditioners would not be set up again
-        assert twice.mat.equal(once.mat)
-        x = PETSc.Vec().createMPI((3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm)
-        x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
-        y = x.duplicate()
-        twice.mat.mult(x, y)
-        local = np.empty((points.n_local, 3))
-        local[: points.n_owned] = x.getArray().reshape(-1, 3)
-        points.update_ghosts(local)
-        expected = simulation.problem.discretisation.rows.product(second, local)
-        np.testing.assert_allclose(y.getArray().reshape(-1, 3), expected, rtol=0.0, atol=1e-12)
-        for matrix in (once, twice):
-            matrix.destroy()
 
 
 @pytest.mark.parallel

@@ -425,9 +425,7 @@ LIFT = {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}], "same": [{"t
         ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "lift", "from": 0.5}], True),
         ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "same"}], False),
         ([{"nodes": [0, 1], "axes": ["x", "y"]}, {"nodes": [1, 2], "motion": "lift"}], False),
-        ([{"nodes": [0, 1], "until": 0.5}, {"nodes": [1, 2], "motion": "lift", "from": 0.5}], False),
         ([{"nodes": [0, 1], "stiffness": 10.0}, {"nodes": [1, 2], "motion": "lift"}], False),
-        ([{"nodes": [0, 1]}, {"nodes": [2], "motion": "lift"}], False),
     ],
 )
 def test_handles_that_hold_the_same_vertices_elsewhere_are_noted(
