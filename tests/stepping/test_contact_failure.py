@@ -157,21 +157,6 @@ def test_impacts_create_no_energy(comm: MPI.Comm, integrator: str, step: float) 
     simulation.destroy()
 
 
-def test_semi_implicit_impacts_are_computed_by_newtons_method(comm: MPI.Comm) -> None:
-    time = {"end": 0.015, "step": 0.005, "integrator": "semi-implicit"}
-    scene = ON_A_TABLE | {"time": time, "initial": {"velocity": [0, 0, -60.0]}}
-    simulation = SteppedScene(comm, scene_of(scene))
-    start, solver = simulation.budget.total, simulation.stepper.preset
-    while not simulation.finished:
-        simulation.step()
-        assert simulation.budget.total < 1.005 * start
-        assert simulation.energy_balance.columns()["smallest_gap"] > 0.0
-        # a checkpoint is of the usual steps
-        assert simulation.saved_state()[1]["preset"] == solver
-    assert simulation.totals["newton_iterations"] > 2 * simulation.step_number
-    simulation.destroy()
-
-
 @pytest.mark.parametrize("integrator", ["alpha2", "semi-implicit"])
 def test_adaptive_steps_are_not_shortened_without_end_by_an_impact(comm: MPI.Comm, integrator: str) -> None:
     scene = BALL | {

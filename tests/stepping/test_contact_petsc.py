@@ -38,12 +38,10 @@ ABOVE = grid(0.1, 0.1, 2, 2) | {"transform": {"translate": [0.04, 0.05, 0.023]}}
 KINDS: dict[str, dict[str, str]] = {
     "jacobi": {"pc_type": "jacobi"},
     "pbjacobi": {"pc_type": "pbjacobi"},
-    "bjacobi": {"pc_type": "bjacobi"},
     "asm": {"pc_type": "asm"},
     "gasm": {"pc_type": "gasm"},
     "gamg": {"pc_type": "gamg"},
     "mg": {"pc_type": "mg"},
-    "telescope": {"pc_type": "telescope"},
     "mumps": {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
     "the program's choice": {},
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -11,25 +10,6 @@ from mpi4py import MPI
 from physics import Simulation, grid
 
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
-
-TIMES = [0.0, 0.1, 0.25, 0.3, 0.42, 0.5]  # unequal steps, as before a state is written
-
-SHAPE = np.arange(1.0, 13.0).reshape(4, 3)
-
-
-def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
-    """The extrapolation to the last time from the steps before it."""
-    guess = np.empty(0)
-    extrapolation = Extrapolation(comm)
-    for t0, t1 in pairwise(TIMES):
-        guess = extrapolation.extrapolate(t1, t0, motion(t0) * SHAPE)
-    return guess
-
-
-@pytest.mark.parallel(2)
-@pytest.mark.parametrize("motion", [lambda t: 3.0, lambda t: 2.0 - t, lambda t: 1.0 + t - 4.0 * t * t])
-def test_polynomials_are_extrapolated_exactly(motion: Callable[[float], float], comm: MPI.Comm) -> None:
-    np.testing.assert_allclose(expected(comm, motion), motion(TIMES[-1]) * SHAPE, rtol=1e-12)
 
 
 @pytest.mark.parallel(2)

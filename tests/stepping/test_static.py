@@ -15,7 +15,6 @@ from physics import CLOTH, grid, shape, stepped
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.stepping.statics.stability import add_exact_hessian
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -206,20 +205,6 @@ def test_a_solve_ends_when_its_error_estimate_is_below_the_tolerance(comm: MPI.C
             spacing = simulation.problem.whole.spacing
     assert np.abs(found[0] - found[1]).max() <= 1e-6 * spacing
     assert iterations[0] <= 32  # 30; 35 without
-
-
-@pytest.mark.parallel(1)
-def test_the_jacobian_of_directors_is_the_hessian_of_their_energy(comm: MPI.Comm) -> None:
-    """The stiffness that fixes edges without triangles is not added to other edges."""
-    with motion(comm, material=SHEET["material"] | {"bending_model": "midedge"}) as simulation:
-        system = simulation.problem.system
-        system.begin_step(0.0, 0.01)
-        rows = system.discretisation.rows
-        system.jacobian(system.evaluate(system.v[: system.points.n_owned]), 0.0, values := rows.zeros())
-        add_exact_hessian(system, exact := rows.zeros())
-        edges = rows.pattern.indptr[system.points.n_vertices : -1]  # each row's first block is its own
-        found, plain = (np.diagonal(each[edges], axis1=1, axis2=2) for each in (values, exact))
-        np.testing.assert_allclose(found, system.stage.c * plain, rtol=1e-8)
 
 
 NOWHERE: dict[str, tuple[dict[str, Any], str]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,8 +32,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle, walls
 from lyra_petsc.experiments.verification.cases.shells import (
-    open_cylinder_scene,
-    slit_annulus_scene,
     symmetric,
 )
 from lyra_petsc.output.recorder import Recorder
@@ -376,16 +374,6 @@ def test_walls_that_meet_bend_as_beams(
 
 
 # -- rest shapes and refusals --------------------------------------------------------------------------
-
-
-def test_a_curved_sheet_at_rest_stays(tmp_path: Path) -> None:
-    content = {
-        "mesh": curved_sheet(tmp_path / "sheet.obj"),
-        "material": BENDING | {"bending_model": "midedge"},
-    }
-    with Simulation(content, MPI.COMM_SELF) as simulation:
-        before = simulation.x
-        np.testing.assert_allclose(simulation.run(0.05, 3), before, atol=1e-13)
 
 
 @pytest.mark.parametrize("pattern", ["diagonal", "criss-cross"])
@@ -787,32 +775,6 @@ def rolled(comm: MPI.Comm, n: int, pattern: str, **more: Any) -> tuple[Array, Ar
         "solver": {"force_tolerance": 1e-8},
     }
     return outcome(comm, scene | more)
-
-
-@pytest.mark.parametrize(
-    ("shell", "most"),
-    [
-        (
-            lambda bench: slit_annulus_scene(bench, 12)[0],
-            76,
-        ),  # 195 without the pseudo time step of the last load step
-        (lambda bench: open_cylinder_scene(bench, 24, "alternating")[0], 66),  # 70 without corrections
-    ],
-    ids=["slit plate", "open cylinder"],
-)
-def test_fifteen_load_steps_in_eighty_iterations(shell: Callable[[Bench], dict[str, Any]], most: int) -> None:
-    """Published benchmarks of shells that rotate by 90° and far more."""
-    with Bench(MPI.COMM_SELF, direct=False) as bench:
-        scene = shell(bench) | {
-            "gravity": [0, 0, 0],
-            "time": {"analysis": "static", "step": 1.0 / 15.0},
-            "petsc": {"ts_adapt_dt_max": 1.0 / 15.0},
-        }
-        with bench.simulation(scene) as trial:
-            trial.run()
-            simulation = trial.simulation
-            assert simulation.step_number == 15
-            assert simulation.totals["newton_iterations"] <= most
 
 
 ROLLED_UP = 0.5 * 100.0 * (2.0 * np.pi / 12.0) ** 2 * 12.0
