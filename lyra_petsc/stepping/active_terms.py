@@ -60,7 +60,7 @@ class ActiveTerms:
         self.loads = [term for term in terms if isinstance(term, Load)]
         self.following = [load for load in self.loads if load.is_follower]
         roles = {term: term.registration.role for term in self.elastic}
-        self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
+        self.constraints = [term for term in self.elastic if roles[term] is Role.EXTERNAL]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.targets = [term for term in self.sheet if isinstance(term, MovingTargets)]
         self.moving = [term for term in self.sheet if term in self.targets or term is obstacles]

@@ -417,7 +417,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         if isinstance(term, (Elastic, Load)):
             term.connect(terms.values())
     integrator = integrator_of(scene.time.scheme, _spectral_radius(scene))
-    roles = {Role.ELASTIC, Role.CONSTRAINT} | (set() if integrator.lagged_loads else {Role.VISCOUS})
+    roles = {Role.ELASTIC, Role.EXTERNAL} | (set() if integrator.lagged_loads else {Role.VISCOUS})
     coupling = [term for term in terms.values() if term.registration.role in roles]
     discretisation = Discretisation(layout, coupling)
     _check_indices(layout, discretisation.rows.pattern.n_couplings)

@@ -35,7 +35,7 @@ class Role(Enum):
     """Role of a term in the equations of motion."""
 
     ELASTIC = "elastic energy of the sheet"
-    CONSTRAINT = "elastic energy by which handles pull: its work comes from outside"
+    EXTERNAL = "energy whose work on the sheet comes from outside: springs of handles, friction on obstacles"
     VISCOUS = "potential of the velocities"
     LOAD = "force that is constant in a step"
 
@@ -163,7 +163,7 @@ REGISTRY: list[Registration] = [
     Registration(
         "friction",
         _has_contact_friction,
-        Role.CONSTRAINT,
+        Role.EXTERNAL,
         columns={"friction_work": "sum"},
         of_contact=True,
         module_name="lyra_petsc.contact.friction",
@@ -180,7 +180,7 @@ REGISTRY: list[Registration] = [
     Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
-        Role.CONSTRAINT,
+        Role.EXTERNAL,
         module_name=".handles.spring",
     ),
     Registration(

@@ -40,7 +40,7 @@ FIXED = [entry for entry in REGISTRY if not entry.of_contact]
 #: step of finite differences [m], small where the force of friction has a kink: in shear after 0.1°
 STEPS = {"shear_friction": 3e-6}
 
-KINDS = {Role.ELASTIC: Elastic, Role.CONSTRAINT: PullsHandles, Role.VISCOUS: Viscous, Role.LOAD: Load}
+KINDS = {Role.ELASTIC: Elastic, Role.EXTERNAL: PullsHandles, Role.VISCOUS: Viscous, Role.LOAD: Load}
 
 
 def names_of(kind: type[Term]) -> list[str]:
