@@ -105,14 +105,13 @@ def arc(s: Array, span: float) -> Array:
     """Points (n, 2) [m] at arc lengths s of a sagging circular arc of length 1 over a chord ``span``."""
     if span >= LENGTH:
         return np.column_stack([s, 0.0 * s])
-    # chord = 2 R sin(L/2R): the half angle by bisection
-    low, high = 1e-9, math.pi
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if math.sin(middle) / middle > span / LENGTH else (low, middle)
-    radius = 0.5 * LENGTH / low
-    angle = s / radius - low
-    return radius * np.column_stack([np.sin(angle) + math.sin(low), math.cos(low) - np.cos(angle)])
+    from scipy.optimize import brentq
+
+    # chord = 2 R sin(L/2R), by the half angle L/2R
+    half = brentq(lambda angle: math.sin(angle) / angle - span / LENGTH, 1e-9, math.pi, xtol=1e-15)
+    radius = 0.5 * LENGTH / half
+    angle = s / radius - half
+    return radius * np.column_stack([np.sin(angle) + math.sin(half), math.cos(half) - np.cos(angle)])
 
 
 def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]:

@@ -105,13 +105,13 @@ def overhang_weight(degrees: float) -> float:
     from scipy.optimize import newton
 
     target = math.tan(math.radians(degrees))
+
+    def off(weight: float) -> float:
+        tip = cantilever(weight)
+        return tip.drop / tip.reach - target
+
     # without a derivative this is the secant method
-    return float(newton(lambda weight: _slope(weight) - target, 1.0, x1=8.0 * target, tol=1e-12))
-
-
-def _slope(weight: float) -> float:
-    tip = cantilever(weight)
-    return tip.drop / tip.reach
+    return float(newton(off, 1.0, x1=8.0 * target, tol=1e-12))
 
 
 def _grown(
@@ -171,14 +171,9 @@ def _solved(
 
 
 def stretches(tension: Array, compliance: float) -> Array:
-    """Solve ½ (λ³ − λ) = tension × compliance for the stretch λ, by Newton's method."""
-    length = np.ones_like(tension)
-    for _ in range(50):
-        change = (0.5 * (length**3 - length) - compliance * tension) / (1.5 * length**2 - 0.5)
-        length = length - change
-        if np.abs(change).max() < 1e-15:
-            break
-    return length
+    """The stretch λ with ½ (λ³ − λ) = tension × compliance, the largest root of the cubic (Cardano)."""
+    angle = np.arccos(math.sqrt(27.0) * compliance * tension + 0.0j)
+    return np.asarray(2.0 / math.sqrt(3.0) * np.cos(angle / 3.0).real)
 
 
 @cache

@@ -358,27 +358,22 @@ def _measure_rows(
     return rows
 
 
-HEADINGS = ("n", "h", "value", "exact", "error", "order", "steps", "run time [s]")
+CELLS = {
+    "n": "{:g}", "h": "{:.4g}", "value": "{:.9g}", "exact": "{:.9g}", "error": "{:.2e}", "order": "{:.2f}",
+    "steps": "{}", "run time [s]": "{:.2f}",
+}  # fmt: skip
+"""Headings of the table of a quantity, and the formats of its cells."""
 
 
-def cells(row: ErrorRow) -> list[str]:
-    """The cells of a row in the table of a quantity."""
-    return [
-        f"{row.n:g}",
-        f"{row.h:.4g}",
-        f"{row.value:.9g}",
-        f"{row.exact:.9g}",
-        f"{row.error:.2e}",
-        "" if math.isnan(row.order) else f"{row.order:.2f}",
-        str(row.steps),
-        f"{row.wall_seconds:.2f}",
-    ]
-
-
-def headings(unit: str) -> list[str]:
-    """The headings of ``cells``, with the unit of the quantity."""
-    suffix = "" if unit == "1" else f" [{unit}]"
-    return [name + suffix if name in ("value", "exact") else name for name in HEADINGS]
+def cells(rows: Sequence[ErrorRow]) -> list[list[str]]:
+    """The table of a quantity, headings first."""
+    unit = "" if rows[0].unit == "1" else f" [{rows[0].unit}]"
+    table = [[name + unit if name in ("value", "exact") else name for name in CELLS]]
+    for row in rows:
+        values = [row.n, row.h, row.value, row.exact, row.error, row.order, row.steps, row.wall_seconds]
+        texts = zip(CELLS.values(), values, strict=True)
+        table.append(["" if math.isnan(value) else text.format(value) for text, value in texts])
+    return table
 
 
 class VerificationView(View[VerificationOutcome]):
@@ -399,8 +394,7 @@ class VerificationView(View[VerificationOutcome]):
         for quantity, rows in outcome.tables().items():
             if not rows[0].problem:
                 yield f"  {quantity}", ""
-                table = [headings(rows[0].unit), *map(cells, rows)]
-                yield from ((line, "") for line in align_columns(table, text_columns=0))
+                yield from ((line, "") for line in align_columns(cells(rows), text_columns=0))
             yield verdict_line(outcome.verdicts[quantity])
         yield "", ""
 
@@ -426,11 +420,8 @@ class VerificationView(View[VerificationOutcome]):
             "scale where that is zero; the order is that between a row and the one before; the run time of "
             "a row is that of all its simulations, set-up included."
         )
-        heads, verdicts = (
-            ["case", "what is compared", "verdict", "run time"],
-            {True: "passed", False: "FAILED"},
-        )
-        table = [[o.case.name, o.case.title, verdicts[o.passed], seconds(o.seconds)] for o in outcomes]
+        heads = ["case", "what is compared", "verdict", "run time"]
+        table = [[o.case.name, o.case.title, o.status, seconds(o.seconds)] for o in outcomes]
         report.table(heads, table, marked=[not o.passed for o in outcomes])
         for outcome in outcomes:
             case = outcome.case
@@ -438,9 +429,9 @@ class VerificationView(View[VerificationOutcome]):
             report.paragraph(f"{case.title}. Source: {case.source}. n: {case.counts}.")
             for quantity, rows in outcome.tables().items():
                 if not rows[0].problem:
-                    report.table(headings(rows[0].unit), [cells(row) for row in rows], caption=quantity)
-                verdict = outcome.verdicts[quantity]
-                report.paragraph(f"{'Passed' if verdict.passed else 'FAILED'}: {verdict.message}.")
+                    heads, *table = cells(rows)
+                    report.table(heads, table, caption=quantity)
+                report.paragraph(f"{outcome.verdicts[quantity].line}.")
             if plots:
                 _figures(report, outcome)
 
@@ -453,15 +444,14 @@ def _figures(report: Report, outcome: VerificationOutcome) -> None:
         for quantity, rows in outcome.tables().items()
         if case.claim_of(quantity).has_order and len(rows) > 1 and not any(row.problem for row in rows)
     }
-    drawn: dict[str, tuple[str, str, Callable[..., Drawing]]] = {
-        "h": ("convergence", "h", convergence),
-        "wall_seconds": ("run-time", "run time", work_precision),
-    }
-    for x, (file, axis, draw) in drawn.items() if tables else ():
+    drawn: tuple[tuple[str, str, str, Callable[..., Drawing]], ...] = (
+        ("h", "h", "h", convergence), ("wall_seconds", "run time", "run time [s]", work_precision),
+    )  # fmt: skip
+    for x, axis, label, draw in drawn if tables else ():
         lines = [
             Series(quantity, [getattr(row, x) for row in rows], [row.error for row in rows])
             for quantity, rows in tables.items()
         ]
-        about = {"name": f"{PLOTS}/{case.name}-{file}", "caption": f"{case.name}: error against {axis}"}
-        label = axis if x == "h" else f"{axis} [s]"
+        file = f"{PLOTS}/{case.name}-{'convergence' if x == 'h' else 'run-time'}"
+        about = {"name": file, "caption": f"{case.name}: error against {axis}"}
         report.figure(draw(lines, **about, x_label=label, y_label="relative error"))

@@ -209,31 +209,27 @@ def _arc(turns: float) -> Cantilever:
     return Cantilever(math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle, angle, angle)
 
 
-def _part(pattern: str, turns: float) -> str:
-    return f"{pattern}, {turns:g} of a circle"
-
-
-def _of_arcs() -> dict[str, Claim]:
-    claims: dict[str, Claim] = {}
-    for turns in TURNS["criss-cross"]:
-        # bending to an arc dimples every cell, which costs membrane energy
-        for side in ("drop", "reach"):
-            claims[f"{side} / L, {_part('criss-cross', turns)}"] = at_finest(5e-3)
-    # in these cases the polygon of the cells ends exactly at the tip of the arc
-    for side, pattern, turns in (
-        ("reach", "alternating", 0.5),
-        ("drop", "diagonal", 1.0),
-        ("reach", "diagonal", 1.0),
-    ):
-        claims[f"{side} / L, {_part(pattern, turns)}"] = Exact(1e-6)
-    return claims
+ROLLED: dict[str, Claim] = {
+    # bending to an arc dimples every cell, which costs membrane energy
+    f"{side} / L, criss-cross, {turns:g} of a circle": at_finest(5e-3)
+    for turns in TURNS["criss-cross"]
+    for side in ("drop", "reach")
+} | dict.fromkeys(
+    # the polygon of the cells ends exactly at the tip of the arc
+    (
+        "reach / L, alternating, 0.5 of a circle",
+        "drop / L, diagonal, 1 of a circle",
+        "reach / L, diagonal, 1 of a circle",
+    ),
+    Exact(1e-6),
+)
 
 
 @case(
     "Clamped strip that its rest curvature rolls up: tip against the arc; error over its displacement",
     source="closed form; the shape of K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551",
     claim=Converges(2.0, 1e-4),
-    claims=_of_arcs(),
+    claims=ROLLED,
     **HINGED,
 )
 def roll_up(bench: Bench, n: float) -> Sequence[Measured]:
@@ -242,7 +238,7 @@ def roll_up(bench: Bench, n: float) -> Sequence[Measured]:
         curved = {"rest_curvature": [-2.0 * math.pi * turns, 0.0, 0.0]}
         # without tension or weight the membrane does not stretch; a softer one needs fewer iterations
         scene = each.scene(membrane=1e4, material=curved)
-        found += _compared(bench, scene, _arc(turns), _part(each.label, turns))
+        found += _compared(bench, scene, _arc(turns), f"{each.label}, {turns:g} of a circle")
     return found
 
 
@@ -284,15 +280,12 @@ def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
         scene = strip("diagonal", n, stiff, gravity=[0, 0, -nominal / DENSITY])
         with bench.simulation(scene) as trial:
             x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0)
-        exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / stiff))
-        reach, sideways, drop = exact
-        tip_displacement = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
-        label = f"Γ = {weight:g}"
-        found += [
-            Measured(f"drop / L, {label}", float(-z), drop, scale=tip_displacement),
-            Measured(f"reach / L, {label}", float(x), reach, scale=tip_displacement),
-            Measured(f"sideways / L, {label}", float(y) - 0.5 / n, sideways, scale=tip_displacement),
-        ]
+        exact = partial(heavy_coupled_strip, nominal, 1.0 / stiff)
+        reach, sideways, drop = on_root(bench.comm, exact)
+        size = math.hypot(1.0 - reach, sideways, drop)
+        tip = {"drop": (-z, drop), "reach": (x, reach), "sideways": (y - 0.5 / n, sideways)}
+        for name, (value, of) in tip.items():
+            found.append(Measured(f"{name} / L, Γ = {weight:g}", float(value), of, scale=size))
     return found
 
 

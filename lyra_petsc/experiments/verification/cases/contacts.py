@@ -1,10 +1,9 @@
-"""Contact: sheets at rest, with friction on slopes, over a cylinder and on each other, and colliding."""
+"""Contact: sheets at rest, with friction on slopes, on each other and over a cylinder, and colliding."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,40 +37,51 @@ SLIDING = (0.99, 0.9, 0.5)
 
 STICKS = 1.01
 GAP, STEP = 0.01, 0.01
-CLEAR = 0.94
-"""Initial distance over the gap, near the equilibrium distance."""
+CLEAR, SIDE = 0.94, 0.4
+"""Initial distance over the gap, near the equilibrium distance; side of a sheet [m]"""
 
 SETTLED, END, SLID = 1.0, 3.0, 1.5
 """Times [s]: when a sticking sheet has settled, end of its simulation, end for a sliding sheet."""
 
 
+def placed(mesh: dict[str, Any], shift: Sequence[float], degrees: float = 0.0) -> dict[str, Any]:
+    """A mesh block that is turned about y, so that its x descends, and then moved [m]."""
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": degrees}
+    return mesh | {"transform": {"rotate": turn, "translate": list(shift)}}
+
+
+def cloth(mesh: Any, contact: dict[str, Any], time: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """The scene of a heavy cloth of the library in contact."""
+    given = {"gravity": [0.0, 0.0, -G], "contact": contact} | more
+    return scene(mesh, {"cloth": "gray-interlock"}, time, **given)
+
+
+def slope_of(degrees: float) -> tuple[float, Array, Array]:
+    """Angle [rad] of a slope that descends along x, its direction downwards and its normal, (3,)."""
+    angle = math.radians(degrees)
+    cos, sin = math.cos(angle), math.sin(angle)
+    return angle, np.array([cos, 0.0, -sin]), np.array([sin, 0.0, cos])
+
+
 def sheet_on_slope(
     degrees: float, friction: float, cells: int, end: float, integrator: str = "beuler"
 ) -> dict[str, Any]:
-    """A free sheet on a slope that descends along x."""
-    angle = math.radians(degrees)
-    normal = [math.sin(angle), 0.0, math.cos(angle)]
-    side = 0.4
-    grid = {"width": side, "height": side, "nx": cells, "ny": cells, "pattern": "alternating"}
-    turn = {"axis": [0.0, 1.0, 0.0], "degrees": degrees}
-    shift = [CLEAR * GAP * component for component in normal]
-    return {
-        "mesh": {"grid": grid, "transform": {"rotate": turn, "translate": shift}},
-        "material": {"cloth": "gray-interlock"},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": GAP, "friction": friction, "self": False},
-        "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": normal}}},
-        "time": {"end": end, "step": STEP, "integrator": integrator},
-    }
+    """A free sheet on a slope."""
+    _, _, normal = slope_of(degrees)
+    return cloth(
+        placed(grid(SIDE, SIDE, cells, cells, "alternating"), (CLEAR * GAP * normal).tolist(), degrees),
+        {"gap": GAP, "friction": friction, "self": False},
+        {"end": end, "step": STEP, "integrator": integrator},
+        obstacles={"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": normal.tolist()}}},
+    )
 
 
 def _roof(bench: Bench, degrees: float) -> dict[str, Any]:
     """The slope as a triangle mesh that does not match the sheet's; collective."""
-    angle = math.radians(degrees)
+    _, down, _ = slope_of(degrees)
     flat, faces = rectangle(23, 5, 14.0, 1.5)
     flat = flat + np.random.default_rng(1).uniform(-0.1, 0.1, flat.shape) * [1.0, 1.0, 0.0]
-    x, y = flat[:, 0] - 1.0, flat[:, 1] - 0.5
-    return {"mesh": bench.mesh(np.column_stack([math.cos(angle) * x, y, -math.sin(angle) * x]), faces)}
+    return {"mesh": bench.mesh(np.outer(flat[:, 0] - 1.0, down) + (flat - 0.5) * [0.0, 1.0, 0.0], faces)}
 
 
 def _creep(trial: Trial, down: Array) -> float:
@@ -94,8 +104,7 @@ def _creep(trial: Trial, down: Array) -> float:
 def incline(bench: Bench, n: float) -> Sequence[Measured]:
     creep, accelerations, friction_error = 0.0, [], 0.0
     for degrees, triangles in (*((degrees, False) for degrees in SLOPES), (SLOPES[1], True)):
-        angle = math.radians(degrees)
-        down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
+        angle, down, _ = slope_of(degrees)
         slope = {"obstacles": {"slope": _roof(bench, degrees)}} if triangles else {}
         for integrator in ("beuler", "midpoint") if degrees == SLOPES[0] else ("beuler",):
             sticks = sheet_on_slope(degrees, STICKS * math.tan(angle), round(n), END, integrator)
@@ -123,9 +132,6 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
 
 # -- at rest ---------------------------------------------------------------------------------------------
 
-SIDE = 0.4
-"""[m]"""
-
 FLOORS: dict[str, tuple[dict[str, Any], float, float]] = {
     "plane": (FLOOR, 0.0, 1e-3),
     "sphere": ({"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}, 0.0, 1e-3),
@@ -148,25 +154,18 @@ def rest(bench: Bench, n: float) -> Iterator[Measured]:
     half = 0.5 * SIDE
     flat, faces = irregular_rectangle(round(n), round(n), SIDE, SIDE)
     for label, (floor, tilt, gap) in FLOORS.items():
-        turn = {"axis": [0.0, 1.0, 0.0], "degrees": tilt}
         middle = half * math.cos(math.radians(tilt))
         shift = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
-        content = {
-            "mesh": bench.mesh(flat, faces) | {"transform": {"rotate": turn, "translate": shift}},
-            "material": {"cloth": "gray-interlock"},
-            "gravity": [0.0, 0.0, -G],
-            "contact": {"gap": gap, "friction": 0.3, "self": False},
-            "obstacles": {label: floor},
-            # long steps of backward Euler damp the motion
-            "time": {"end": 4.0, "step": 0.1},
-        }
-        pressure = np.empty(0)
+        content = cloth(
+            placed(bench.mesh(flat, faces), shift, tilt),
+            {"gap": gap, "friction": 0.3, "self": False},
+            {"end": 4.0, "step": 0.1},  # long steps of backward Euler damp the motion
+            obstacles={label: floor},
+        )
         with bench.simulation(content) as trial:
             force = trial.run().simulation.energy_balance.obstacle_forces(1)[0, :3]
             weight = G * float(trial.mass.sum())
-            if label == "plane":
-                compute = FIELDS["contact_pressure"].compute
-                pressure = trial.gather(compute(trial.simulation.problem))
+            pressure = trial.gather(FIELDS["contact_pressure"].compute(trial.simulation.problem))
         error = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
         yield Measured(f"force on the {label} besides the weight", error, 0.0, scale=1.0)
         if label == "plane":
@@ -256,59 +255,33 @@ THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3), ("
 """Integrators and coefficients of friction"""
 
 
-@dataclass
-class CollisionBalance:
-    """Largest violations of balances over all steps of a collision.
+def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[str, float]:
+    """Largest violations of balances over all steps of a collision, by name; collective.
 
-    Attributes
-    ----------
-    force, moment : float
-        Resultant and moment of the contact forces of a step, over the sums of their sizes.
-    friction_force, friction_moment : float
-        The same for friction, whose moments refer to the start of the step.
-    momentum, angular : float
-        Changes of momentum and angular momentum over their sizes at the start.
-    energy : float
-        Increase of the energy over its value at the start.
+    A sheet and a smaller, tilted one above it fly towards each other. Resultant and moment of the contact
+    forces of a step are over the sums of their sizes, as are those of friction, whose moments refer to the
+    start of the step; changes of momentum and angular momentum over their sizes at the start; the increase of
+    the energy over its value at the start.
     """
-
-    force: float = 0.0
-    moment: float = 0.0
-    friction_force: float = 0.0
-    friction_moment: float = 0.0
-    momentum: float = 0.0
-    angular: float = 0.0
-    energy: float = 0.0
-
-    def update(self, **found: float) -> None:
-        """Raise each value to at least the given one."""
-        for name, value in found.items():
-            setattr(self, name, max(getattr(self, name), value))
-
-
-def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> CollisionBalance:
-    """Simulate a sheet and a smaller, tilted one above it that fly towards each other; collective."""
-    # speed [m/s], duration [s], cells along a side
-    speed, flight, thrown = 2.0, 0.1, 8
-    side, small = 0.3, 0.24
+    # speed [m/s], cells along a side of a sheet, sides [m]
+    speed, cells, side, small = 2.0, 8, 0.3, 0.24
     turn = {"axis": [0.3, 1.0, 0.2], "degrees": 50.0}
     upper = {"transform": {"rotate": turn, "translate": [0.05, 0.05, 0.25]}}
-    content = {
-        "mesh": [
-            grid(side, side, thrown, thrown, "alternating"),
-            grid(small, small, thrown, thrown) | upper,
-        ],
-        "material": {"cloth": "gray-interlock"},
-        "contact": {"gap": 0.005, "friction": friction},
-        "time": {"end": flight, "step": 1.0 / n, "integrator": integrator},
-    }
-    found = CollisionBalance()
+    content = cloth(
+        [grid(side, side, cells, cells, "alternating"), grid(small, small, cells, cells) | upper],
+        {"gap": 0.005, "friction": friction},
+        {"end": 0.1, "step": 1.0 / n, "integrator": integrator},
+        gravity=[0.0, 0.0, 0.0],
+    )
+    names = ["resultant", "moment", *(["resultant of friction", "moment of friction"] if friction else [])]
+    names += ["angular momentum", "momentum", "energy"]
+    largest = np.zeros(len(names))
     with bench.simulation(content) as trial:
         system, contact = trial.simulation.problem.system, trial.simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)
         friction_term = trial.simulation.problem.terms.get("friction", contact)
         assert isinstance(friction_term, Elastic)
-        below = (np.arange(len(trial.start)) < (thrown + 1) ** 2)[:, None]
+        below = (np.arange(len(trial.start)) < (cells + 1) ** 2)[:, None]
         trial.set_state(v=np.where(below, [0.2 * speed, 0.0, speed], [0.0, 0.0, -speed]))
         mass = trial.mass[:, None]
 
@@ -316,13 +289,13 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Collisi
             momentum = mass * trial.v
             return np.stack([momentum, np.cross(trial.x, momentum)])
 
-        def imbalance(term: Elastic, x: Array, points: Array) -> Array:
+        def imbalance(term: Elastic, x: Array, points: Array) -> list[float]:
             gradient = np.zeros((system.points.n_local, 3))
             term.add_gradient(x, system.active.frozen[term], gradient)
             forces = trial.gather(gradient)
             each = np.stack([forces, np.cross(points, forces)])
             resultant = np.abs(each.sum(axis=1)).max(axis=1)
-            return np.asarray(resultant / np.maximum(np.abs(each).sum(axis=(1, 2)), 1e-300))
+            return (resultant / np.maximum(np.abs(each).sum(axis=(1, 2)), 1e-300)).tolist()
 
         first, energy = momenta(), trial.simulation.budget.total
         before, sizes = first.sum(axis=1), np.abs(first).sum(axis=(1, 2))
@@ -330,19 +303,12 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Collisi
             begin = trial.x
             trial.step()
             x = system.evaluated.x
-            force, moment = imbalance(contact, x, trial.gather(x))
-            if friction:
-                friction_force, friction_moment = map(float, imbalance(friction_term, x, begin))
-                found.update(friction_force=friction_force, friction_moment=friction_moment)
-            changed = np.abs(momenta().sum(axis=1) - before).max(axis=1) / sizes
-            found.update(
-                force=float(force),
-                moment=float(moment),
-                momentum=float(changed[0]),
-                angular=float(changed[1]),
-                energy=trial.simulation.budget.total / energy - 1.0,
-            )
-    return found
+            now = imbalance(contact, x, trial.gather(x))
+            now += imbalance(friction_term, x, begin) if friction else []
+            momentum, angular = np.abs(momenta().sum(axis=1) - before).max(axis=1) / sizes
+            now += [angular, momentum, trial.simulation.budget.total / energy - 1.0]
+            largest = np.maximum(largest, now)
+    return dict(zip(names, largest.tolist(), strict=True))
 
 
 @case(
@@ -367,16 +333,9 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Collisi
 )
 def collision(bench: Bench, n: float) -> Iterator[Measured]:
     for integrator, friction in THROWS:
-        found = _thrown(bench, integrator, friction, n)
-        label = f"{integrator}, with friction" if friction else integrator
-        yield Measured(f"resultant, {label}", found.force, 0.0, scale=1.0)
-        yield Measured(f"moment, {label}", found.moment, 0.0, scale=1.0)
-        if friction:
-            yield Measured(f"resultant of friction, {integrator}", found.friction_force, 0.0, scale=1.0)
-            yield Measured(f"moment of friction, {integrator}", found.friction_moment, 0.0, scale=1.0)
-        yield Measured(f"angular momentum, {label}", found.angular, 0.0, scale=1.0)
-        yield Measured(f"momentum, {label}", found.momentum, 0.0, scale=1.0)
-        yield Measured(f"energy, {label}", found.energy, 0.0, scale=1.0)
+        for name, value in _thrown(bench, integrator, friction, n).items():
+            with_friction = ", with friction" if friction and "friction" not in name else ""
+            yield Measured(f"{name}, {integrator}{with_friction}", value, 0.0, scale=1.0)
 
 
 # -- a block of layers -----------------------------------------------------------------------------------
@@ -404,21 +363,16 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
 
     def sheet(side: float, cells: int, number: int) -> dict[str, Any]:
         shift = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
-        return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": shift}}
+        return placed(grid(side, side, cells, cells, "alternating"), shift)
 
     part = NARROW**2 / (NARROW**2 + LAYERS * WIDE**2)
     deceleration = friction * G / (1.0 - part)
-    content = {
-        "mesh": [
-            *(sheet(WIDE, wide_cells, number) for number in range(LAYERS)),
-            sheet(NARROW, narrow_cells, LAYERS),
-        ],
-        "material": {"cloth": "gray-interlock"},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": LAYER_GAP, "friction": friction},
-        "obstacles": {"floor": FLOOR | {"friction": 0.0}},
-        "time": {"end": settle + 1.4 * push / deceleration, "step": 1.0 / n},
-    }
+    content = cloth(
+        [*(sheet(WIDE, wide_cells, number) for number in range(LAYERS)), sheet(NARROW, narrow_cells, LAYERS)],
+        {"gap": LAYER_GAP, "friction": friction},
+        {"end": settle + 1.4 * push / deceleration, "step": 1.0 / n},
+        obstacles={"floor": FLOOR | {"friction": 0.0}},
+    )
     with bench.simulation(content) as trial:
         trial.run_to(settle)
         number = np.minimum(np.arange(len(trial.start)) // (wide_cells + 1) ** 2, LAYERS)
@@ -443,21 +397,18 @@ LEAN, BED, BEGIN, RAN = 30.0, (1.6, 0.6), 0.2, 0.5
 
 def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tuple[dict[str, Any], int]:
     """A sheet of n cells a side on a larger, fixed one with another mesh; number of vertices of that one."""
-    angle, cells = math.radians(LEAN), (round(2.3 * n), round(0.87 * n))
-    turn = {"axis": [0.0, 1.0, 0.0], "degrees": LEAN}
-    x, y, z = 0.1, 0.5 * (BED[1] - SIDE), CLEAR * LAYER_GAP
-    shift = [x * math.cos(angle) + z * math.sin(angle), y, z * math.cos(angle) - x * math.sin(angle)]
-    lower = grid(*BED, *cells, "diagonal") | {"transform": {"rotate": turn}}
-    upper = grid(SIDE, SIDE, n, n, "alternating") | {"transform": {"rotate": turn, "translate": shift}}
+    cells = round(2.3 * n), round(0.87 * n)
+    _, down, normal = slope_of(LEAN)
+    shift = 0.1 * down + CLEAR * LAYER_GAP * normal + [0.0, 0.5 * (BED[1] - SIDE), 0.0]
+    lower = placed(grid(*BED, *cells, "diagonal"), [0.0, 0.0, 0.0], LEAN)
+    upper = placed(grid(SIDE, SIDE, n, n, "alternating"), shift.tolist(), LEAN)
     count = (cells[0] + 1) * (cells[1] + 1)
-    return {
-        "mesh": [lower, upper],
-        "material": {"cloth": "gray-interlock"},
-        "gravity": [0.0, 0.0, -G],
-        "contact": {"gap": LAYER_GAP, "friction": friction},
-        "handles": [{"nodes": list(range(count))}],
-        "time": {"end": end, "step": STEP, "integrator": integrator},
-    }, count
+    return cloth(
+        [lower, upper],
+        {"gap": LAYER_GAP, "friction": friction},
+        {"end": end, "step": STEP, "integrator": integrator},
+        handles=[{"nodes": list(range(count))}],
+    ), count
 
 
 @case(
@@ -473,8 +424,7 @@ def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tup
     quick=1,
 )
 def sheets(bench: Bench, n: float) -> Iterator[Measured]:
-    angle = math.radians(LEAN)
-    down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
+    angle, down, _ = slope_of(LEAN)
     for integrator in SLIDERS:
         accelerations = []
         for part in SLIDING[1:]:

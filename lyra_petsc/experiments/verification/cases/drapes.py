@@ -1,4 +1,4 @@
-"""Sheets that bend over obstacles: rucks, strips at a pole and at the edge of a table, drapes."""
+"""Sheets that bend over obstacles: a ruck, strips at a pole and at the edge of a table, drapes."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from lyra_petsc.experiments.drape import (
     shadow,
 )
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, ring_disc, square_to_disc
+from lyra_petsc.experiments.verification.cases.contacts import placed
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.verification_case import (
     FLOOR,
@@ -98,7 +99,6 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
         obstacles={"floor": FLOOR},
         solver={"force_tolerance": 1e-7, "step_tolerance": 1e-7},
     )
-    found: list[Measured] = []
     with bench.simulation(content) as trial:
         for (force, half_length, _, height), frame in zip(rows, frames[2::2], strict=True):
             trial.run_to(frame["time"])
@@ -106,17 +106,11 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
             z = trial.x[:, 2] - trial.x[ends[1], 2].mean()
             root = np.cbrt(z / z.max())
             foot = (root > 0.1) & (root < 0.45)  # the range in which it is linear along the sheet
+            lifted = float(np.polyfit(root[foot], along[foot], 1)[1])
             label = f"P = {force:g} B/l²"
-            found += [
-                Measured(f"P l²/B, {label}", -float(push.sum()) * n / half, force),
-                Measured(f"height / l, {label}", float(z.max()), height),
-                Measured(
-                    f"half length / l, {label}",
-                    float(np.polyfit(root[foot], along[foot], 1)[1]),
-                    half_length,
-                ),
-            ]
-    yield from found
+            yield Measured(f"P l²/B, {label}", -float(push.sum()) * n / half, force)
+            yield Measured(f"height / l, {label}", float(z.max()), height)
+            yield Measured(f"half length / l, {label}", lifted, half_length)
 
 
 # -- against a pole, over an edge ------------------------------------------------------------------------
@@ -132,7 +126,8 @@ def _refined(
     bench: Bench,
     n: float,
     end: float,
-    transform: Callable[[float], dict[str, Any]],
+    shift: Callable[[float], list[float]],
+    degrees: float,
     held: list[dict[str, Any]],
     obstacles: dict[str, Any],
     friction: float = 0.0,
@@ -140,7 +135,7 @@ def _refined(
     """Change of the ends of a strip at ``end`` [s] when Δt, h or gap are refined from 2/n to 1/n of the
     coarsest.
 
-    ``transform`` places the strip as a function of the gap [m].
+    The strip is turned by ``degrees`` and moved by ``shift`` [m], a function of the gap [m].
     """
     # length of a strip [m]; cells along it, Δt [s] and gap [m], of which one at a time is refined
     length, coarse_cells, coarse_step, coarse_gap = 0.3, 12, 0.004, 0.002
@@ -159,7 +154,7 @@ def _refined(
             gap = coarse_gap / part if label == "gap" else coarse_gap
             cells = round(coarse_cells * part) if label == "h" else coarse_cells
             strip = scene(
-                grid(length, length / cells, cells, 1, "alternating") | {"transform": transform(gap)},
+                placed(grid(length, length / cells, cells, 1, "alternating"), shift(gap), degrees),
                 FABRIC,
                 {"end": end, "step": step},
                 contact={"gap": gap, "self": False, "friction": friction},
@@ -185,9 +180,8 @@ REFINED: dict[str, Any] = {
 @case("Hanging strip that swings against a pole: ends, when Δt, h or the gap is halved", **REFINED)
 def pole(bench: Bench, n: float) -> Iterator[Measured]:
     low, high = ([-0.03, y, -0.15] for y in ALONG_Y)
-    aside = {"rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 30.0}}
     obstacles = {"pole": {"capsule": {"from": low, "to": high, "radius": 0.02}}}
-    yield from _refined(bench, n, 0.3, lambda gap: aside, [{"group": "left"}], obstacles)
+    yield from _refined(bench, n, 0.3, lambda gap: [0.0, 0.0, 0.0], 30.0, [{"group": "left"}], obstacles)
 
 
 @case("Strip that slides off a table's edge with friction: ends, when Δt, h or the gap is halved", **REFINED)
@@ -195,10 +189,10 @@ def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
     low, high = ALONG_Y
     obstacles = {"table": {"box": {"min": [-1.0, low, -0.5], "max": [0.0, high, 0.0]}}}
 
-    def on_it(gap: float) -> dict[str, Any]:
-        return {"translate": [-0.13, 0.0, 0.95 * gap]}
+    def on_it(gap: float) -> list[float]:
+        return [-0.13, 0.0, 0.95 * gap]
 
-    yield from _refined(bench, n, 0.2, on_it, [], obstacles, friction=0.2)
+    yield from _refined(bench, n, 0.2, on_it, 0.0, [], obstacles, friction=0.2)
 
 
 # -- Cusick's drape test ---------------------------------------------------------------------------------

@@ -111,9 +111,9 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
         Measured("energy per area", energy, stored, "J/m²", max(stiffness, stored)),
         Measured("largest force on an inner vertex", float(residual), 0.0, "N", nodal),
     ]
-    for k, name in enumerate(("S11", "S22", "S12")):
-        value, known = worst_value(stress[:, k], exact[k]), float(exact[k])
-        measured.append(Measured(f"{name} of the triangle farthest off", value, known, "N/m", scale))
+    for name, values, known in zip(("S11", "S22", "S12"), stress.T, exact.tolist(), strict=True):
+        quantity = f"{name} of the triangle farthest off"
+        measured.append(Measured(quantity, worst_value(values, known), known, "N/m", scale))
     return measured
 
 

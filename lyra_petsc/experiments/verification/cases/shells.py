@@ -56,19 +56,55 @@ def sze_strip(kind: str, n: float, loads: list[dict[str, Any]]) -> dict[str, Any
     return scene(mesh, STRIP, handles=[{"group": "left", "clamp": True}], loads=loads)
 
 
-def _tips(
-    bench: Bench, n: float, kind: str, loads: list[dict[str, Any]], rows: Sequence[Sequence[float]]
+Probe = Callable[[Trial], Array]
+
+
+def worst_of_table(
+    bench: Bench,
+    content: dict[str, Any],
+    table: str,
+    probe: Probe,
+    measure: Callable[[Array, Array], list[Measured]],
 ) -> tuple[list[Measured], Array]:
-    """Largest error of the tip over the loads of a table, and the displacement (−U, W) at full load."""
-    length, tip, found = LENGTHS[kind], np.zeros(2), []
-    table = {round(row[0], 6): np.array(row[1:]) for row in rows}
-    for factor, trial in increments(bench, sze_strip(kind, n, loads), INCREMENT):
-        end = trial.x[np.isclose(trial.start[:, 0], length)].mean(axis=0)
-        tip = np.array([length - end[0], end[2]])
-        exact = table.get(round(factor, 6))
+    """The largest errors over the loads of a table, and the probe at full load; collective.
+
+    ``measure`` compares a probe with the row of the table.
+    """
+    rows = {round(row[0], 6): np.array(row[1:]) for row in TABLES[table]["rows"]}
+    found, value = [], np.empty(0)
+    for factor, trial in increments(bench, content, INCREMENT):
+        value, exact = probe(trial), rows.get(round(factor, 6))
         if exact is not None:
-            found.append([vector_error("displacement of the tip, worst load of the table", tip, exact)])
-    return worst(found), tip
+            found.append(measure(value, exact))
+    return worst(found), value
+
+
+def of_points(points: str, label: str, unit: str) -> Callable[[Array, Array], list[Measured]]:
+    """Compares one component of each of some points; ``label`` has a place for the name of the point."""
+    return lambda value, exact: [
+        Measured(label.format(point), float(one), float(of), unit)
+        for point, one, of in zip(points, value, exact, strict=True)
+    ]
+
+
+def tip(length: float) -> Probe:
+    """Displacement (−U, W) of the end of a strip along x."""
+
+    def displacement(trial: Trial) -> Array:
+        x, _, z = trial.x[np.isclose(trial.start[:, 0], length)].mean(axis=0)
+        return np.array([length - x, z])
+
+    return displacement
+
+
+def _tips(bench: Bench, n: float, kind: str, loads: list[dict[str, Any]]) -> tuple[list[Measured], Array]:
+    """Largest error of the tip over the loads of a table, and its displacement at full load."""
+
+    def measure(u: Array, exact: Array) -> list[Measured]:
+        return [vector_error("displacement of the tip, worst load of the table", u, exact)]
+
+    strip = sze_strip(kind, n, loads)
+    return worst_of_table(bench, strip, f"cantilever_end_{kind}", tip(LENGTHS[kind]), measure)
 
 
 @case(
@@ -82,11 +118,11 @@ def _tips(
 )
 def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
     loads = [{"group": "right", "force": [0.0, 0.0, 4.0]}]
-    found, tip = _tips(bench, n, "shear", loads, TABLES["cantilever_end_shear"]["rows"])
+    found, end = _tips(bench, n, "shear", loads)
     length, membrane = LENGTHS["shear"], 1.2e6 * 0.1
     exact = cantilever(0.0, 4.0 * length**2 / STIFFNESS, STIFFNESS / (membrane * length**2))
     u = np.array([1.0 - exact.reach, exact.drop]) * length
-    return [*found, vector_error("displacement of the tip at full load", tip, u, "m")]
+    return [*found, vector_error("displacement of the tip at full load", end, u, "m")]
 
 
 @case(
@@ -101,8 +137,8 @@ def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
 def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
     length = LENGTHS["moment"]
     loads = [{"group": "right", "moment": 2.0 * math.pi * STIFFNESS / length}]
-    found, tip = _tips(bench, n, "moment", loads, TABLES["cantilever_end_moment"]["rows"])
-    return [*found, Measured("−U at full load", float(tip[0]), length, "m")]
+    found, end = _tips(bench, n, "moment", loads)
+    return [*found, Measured("−U at full load", float(end[0]), length, "m")]
 
 
 @case(
@@ -122,12 +158,9 @@ def pressed_strip(bench: Bench, n: float) -> Sequence[Measured]:
     for factor, trial in increments(bench, content, 0.1):
         load = next((each for each in pressures if math.isclose(each, factor * pressures[-1])), None)
         if load is not None:
-            end = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
             x, z = pressed_tip(load)
-            u = np.array([1.0 - end[0], end[2]])
-            found.append(
-                vector_error(f"displacement of the tip, q L³/B = {load:g}", u, np.array([1.0 - x, z]), "m")
-            )
+            name, exact = f"displacement of the tip, q L³/B = {load:g}", np.array([1.0 - x, z])
+            found.append(vector_error(name, tip(1.0)(trial), exact, "m"))
     return found
 
 
@@ -226,24 +259,15 @@ def supported_disc(bench: Bench, n: float) -> Iterator[Measured]:
     quick=1,
 )
 def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
-    content = TABLES["slit_annulus"]
-    table = {round(row[0], 6): row[1:] for row in content["rows"]}
     plate, ends = slit_annulus_scene(bench, round(n))
-    found, height = [], np.zeros(2)
-    for factor, trial in increments(bench, plate, INCREMENT):
-        height = trial.x[list(ends), 2]
-        exact = table.get(round(factor, 6))
-        if exact is not None:
-            found.append(
-                [
-                    Measured(f"height of {end}, worst load of the table", float(z), of, "m")
-                    for end, z, of in zip("AB", height, exact, strict=True)
-                ]
-            )
-    return worst(found) + [
-        Measured(f"height of {end} at full load", float(z), of, "m")
-        for end, z, of in zip("AB", height, content["kirchhoff_love"], strict=True)
-    ]
+    measure = of_points("AB", "height of {}, worst load of the table", "m")
+
+    def heights(trial: Trial) -> Array:
+        return trial.x[list(ends), 2]
+
+    found, height = worst_of_table(bench, plate, "slit_annulus", heights, measure)
+    full = np.array(TABLES["slit_annulus"]["kirchhoff_love"])
+    return found + of_points("AB", "height of {} at full load", "m")(height, full)
 
 
 # -- curved shells, linear -----------------------------------------------------------------------------
@@ -267,25 +291,30 @@ def symmetric(axes: str, size: float) -> list[dict[str, Any]]:
     return [{"box": plane_box(axis, 0.0, size), "symmetry": axis} for axis in axes]
 
 
-def _curved(
-    bench: Bench,
-    n: int,
-    pattern: str,
-    surface: Callable[[Array, Array], tuple[Array, Array, Array]],
-    material: dict[str, Any],
-    **more: Any,
-) -> tuple[Array, Array]:
-    """Positions (V, 3) [m] of n × n cells on a surface, and their displacements [m]; collective."""
-    flat, faces = rectangle(n, n, 1.0, 1.0, alternating=pattern == "alternating")
+Surface = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+
+def curved_mesh(
+    bench: Bench, cells: tuple[int, int], pattern: str, surface: Surface
+) -> tuple[dict[str, Any], Array]:
+    """The mesh block of cells on a surface of s and t in [0, 1], and its vertices (V, 3) [m]; collective."""
+    flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
     vertices = np.column_stack(surface(flat[:, 0], flat[:, 1]))
+    return bench.mesh(vertices, faces), vertices
+
+
+def _curved(
+    bench: Bench, n: int, pattern: str, surface: Surface, material: dict[str, Any], **more: Any
+) -> Array:
+    """Displacements (V, 3) [m] of n × n cells on a surface; collective."""
+    mesh, vertices = curved_mesh(bench, (n, n), pattern, surface)
     tight = {"solver": {"force_tolerance": 1e-8}, "petsc": {"ksp_rtol": 1e-8}}
     given = {"gravity": [0, 0, 0]} | tight | more
-    shell = scene(bench.mesh(vertices, faces), material, STATIC | {"step": 1.0}, **given)
-    with bench.simulation(shell) as trial:
-        return vertices, trial.run().x - vertices
+    with bench.simulation(scene(mesh, material, STATIC | {"step": 1.0}, **given)) as trial:
+        return trial.run().x - vertices
 
 
-def cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Array], Any]:
+def cylinder(radius: float, angle: float, length: float) -> Surface:
     """Part of a cylinder with axis y, as a function of s and t in [0, 1]; s = 0 is the crown."""
 
     def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
@@ -309,7 +338,7 @@ def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
         gravity = [0.0, 0.0, -90.0 * part]
         held = [*symmetric("xy", 25.0), {"box": plane_box("y", half, 25.0), "axes": ["x", "z"]}]
         surface = cylinder(25.0, math.radians(40.0), half)
-        _, u = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
+        u = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
         found = float(-u[round(n), 2]) / part
         yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
         yield Measured(f"deflection, {pattern}, deep shell", found, LINEAR["deep_roof"], "m")
@@ -336,7 +365,7 @@ def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
         held = [{"box": plane_box("y", 300.0, 300.0), "axes": ["x", "z"]}, *symmetric("xyz", 300.0)]
         given = (cylinder(300.0, 0.5 * math.pi, 300.0), material)
         coarse, fine = (
-            float(-_curved(bench, cells, pattern, *given, loads=loads, handles=held)[1][0, 2]) / force
+            float(-_curved(bench, cells, pattern, *given, loads=loads, handles=held)[0, 2]) / force
             for cells in (round(n) // 2, round(n))
         )
         last = fine + (fine - coarse) / (2.0**ORDER - 1.0)
@@ -360,13 +389,10 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
 
         def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
             around, up = 0.5 * math.pi * s, math.radians(72.0) * t
-            return (
-                10.0 * np.cos(up) * np.cos(around),
-                10.0 * np.cos(up) * np.sin(around),
-                10.0 * np.sin(up),
-            )
+            ring = 10.0 * np.cos(up)
+            return ring * np.cos(around), ring * np.sin(around), 10.0 * np.sin(up)
 
-        _, u = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
+        u = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
         mean = 0.5 * float(u[0, 0] - u[cells, 1]) / part
         yield Measured(f"displacement of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
 
@@ -389,11 +415,9 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
             x, y = s - 0.5, 0.5 * t
             return x, y, x**2 - y**2
 
-        _, u = _curved(bench, cells, pattern, surface, material, gravity=gravity, handles=held)
-        deflection = float(-u[cells, 2]) / part
-        yield Measured(
-            f"deflection, {pattern}", deflection, TABLES["hyperbolic_paraboloid"]["deflection"], "m"
-        )
+        u = _curved(bench, cells, pattern, surface, material, gravity=gravity, handles=held)
+        exact = TABLES["hyperbolic_paraboloid"]["deflection"]
+        yield Measured(f"deflection, {pattern}", float(-u[cells, 2]) / part, exact, "m")
 
 
 @case(
@@ -406,12 +430,14 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
 )
 def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
     length, width, force = 12.0, 1.1, 1e-6
+
+    def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
+        turned, beside = 0.5 * math.pi * s, width * (t - 0.5)
+        return length * s, beside * np.cos(turned), beside * np.sin(turned)
+
+    along, across = round(n), round(n / 12)
     for pattern in PATTERNS:
-        along, across = round(n), round(n / 12)
-        flat, faces = rectangle(along, across, 1.0, width, alternating=pattern == "alternating")
-        turned, beside = 0.5 * math.pi * flat[:, 0], flat[:, 1] - 0.5 * width
-        vertices = np.column_stack([length * flat[:, 0], beside * np.cos(turned), beside * np.sin(turned)])
-        mesh = bench.mesh(vertices, faces)
+        mesh, vertices = curved_mesh(bench, (along, across), pattern, surface)
         end = [along + row * (along + 1) for row in range(across + 1)]
         for name, axis in (("in_plane", 2), ("out_of_plane", 1)):
             content = scene(
@@ -425,9 +451,8 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
             )
             with bench.simulation(content) as trial:
                 u = float((trial.run().x - vertices)[end[len(end) // 2], axis])
-            yield Measured(
-                f"displacement {name.replace('_', ' ')}, {pattern}", u, TABLES["twisted_beam"][name], "in"
-            )
+            quantity = f"displacement {name.replace('_', ' ')}, {pattern}"
+            yield Measured(quantity, u, TABLES["twisted_beam"][name], "in")
 
 
 # -- curved shells, large rotations --------------------------------------------------------------------
@@ -437,15 +462,10 @@ def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, A
     """An eighth of the cylinder, n cells around; vertices (V, 3), the middle one of its side; collective."""
     radius, half = 4.953, 5.175
     cells = n, round(n * half / (0.5 * math.pi * radius))
-    flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
-    vertices = np.column_stack(cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
-    made = scene(
-        bench.mesh(vertices, faces),
-        {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
-        handles=symmetric("xyz", radius),
-        loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
-    )
-    return made, vertices, n
+    mesh, vertices = curved_mesh(bench, cells, pattern, cylinder(radius, 0.5 * math.pi, half))
+    material = {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0}
+    loads = [{"nodes": [0], "force": [0.0, 0.0, 1e4]}]
+    return scene(mesh, material, handles=symmetric("xyz", radius), loads=loads), vertices, n
 
 
 @case(
@@ -457,22 +477,15 @@ def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, A
     quick=1,
 )
 def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
-    table = {round(row[0], 6): row[1:] for row in TABLES["open_cylinder"]["rows"]}
     for pattern in PATTERNS:
         content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
-        found = []
-        for factor, trial in increments(bench, content, INCREMENT):
+
+        def displacements(trial: Trial, vertices: Array = vertices, side: int = around) -> Array:
             u = trial.x - vertices
-            components = u[0, 2], -u[around, 0], -u[-1, 0]
-            found.append(
-                [
-                    Measured(
-                        f"displacement of {point}, worst load of the table, {pattern}", float(value), of, "in"
-                    )
-                    for point, value, of in zip("ABC", components, table[round(factor, 6)], strict=True)
-                ]
-            )
-        yield from worst(found)
+            return np.array([u[0, 2], -u[side, 0], -u[-1, 0]])
+
+        measure = of_points("ABC", f"displacement of {{}}, worst load of the table, {pattern}", "in")
+        yield from worst_of_table(bench, content, "open_cylinder", displacements, measure)[0]
 
 
 @case(
@@ -490,10 +503,9 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
     radius, half, angle = 2540.0, 254.0, 0.1
     loads, deflections = np.array(TABLES["hinged_roof"]["rows"]).T
     for pattern in PATTERNS:
-        flat, faces = rectangle(round(n), round(n), 1.0, 1.0, alternating=pattern == "alternating")
-        vertices = np.column_stack(cylinder(radius, angle, half)(flat[:, 0], flat[:, 1]))
+        mesh, _ = curved_mesh(bench, (round(n), round(n)), pattern, cylinder(radius, angle, half))
         content = scene(
-            bench.mesh(vertices, faces),
+            mesh,
             {"young": 3102.75, "poisson": 0.3, "thickness": 12.7, "density": 1.0},
             handles=[
                 *symmetric("xy", radius),
