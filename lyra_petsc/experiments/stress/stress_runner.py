@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from lyra_petsc.experiments.stress.verdicts import (
     RunRecord,
     judge_physics,
     judge_speed,
+    median,
     ratio,
 )
 from lyra_petsc.kernels.compilation import COMPILATION
@@ -165,7 +166,7 @@ def run_case(
         outcome.verdicts = judge_physics(record)
         if clock is not None and before is not None:
             wall, cpu_seconds = 0.5 * (before + clock.measure())
-            ratios = record.median_seconds / wall, record.median_cpu / cpu_seconds
+            ratios = record.median_seconds / wall, median(record.cpu_seconds) / cpu_seconds
             outcome.wall_ratio, outcome.cpu_ratio = comm.bcast(tuple(map(float, ratios)), root=0)
             if case.is_timed:
                 outcome.verdicts["speed"] = judge_speed(record, outcome.wall_ratio, outcome.cpu_ratio)
@@ -256,12 +257,6 @@ def launched(launcher: Launcher, case: StressCase, arguments: Sequence[str], wat
 MAX_FIGURES = 6
 """Number of the worst cases whose figures the page shows."""
 
-HEADINGS = {
-    "case": 28, "verdict": 7, "steps": 7, "rejected": 0, "least Δt": 8, "Newton": 8, "linear": 7,
-    "energy off [J]": 8, "tolerance [J]": 8, "stretch": 13, "step": 8, "over base": 0, "CPU": 5,
-}  # fmt: skip
-"""Headings of the table and minimum widths of its columns."""
-
 
 def csv_row(outcome: StressOutcome) -> dict[str, Any]:
     """The row of a case in the CSV file; energies in J, times in s, NaN where a value is missing."""
@@ -283,7 +278,7 @@ def csv_row(outcome: StressOutcome) -> dict[str, Any]:
         "dt": record.nominal,
         "smallest_dt": record.smallest_step,
         "rejected": record.rejected,
-        "newton_median": record.median_newton,
+        "newton_median": median(record.newton),
         "newton_worst": max(record.newton, default=0),
         "linear_iterations": record.linear,
         "residual_over_promised": max((ratio(b.residual, b.promised) for b in balances), default=nan),
@@ -303,24 +298,28 @@ def csv_row(outcome: StressOutcome) -> dict[str, Any]:
     }
 
 
+HEADINGS: dict[str, tuple[int, Callable[[Mapping[str, Any]], str]]] = {
+    "case": (28, lambda row: row["case"]),
+    "verdict": (7, lambda row: row["verdict"]),
+    "steps": (7, lambda row: f"{row['steps']}"),
+    "rejected": (0, lambda row: f"{row['rejected']}"),
+    "least Δt": (8, lambda row: seconds(row["smallest_dt"])),
+    "Newton": (8, lambda row: f"{short(row['newton_median'])}, {row['newton_worst']}"),
+    "linear": (7, lambda row: f"{row['linear_iterations']}"),
+    "energy off [J]": (8, lambda row: short(row["energy_defect"], 2)),
+    "tolerance [J]": (8, lambda row: short(row["energy_tolerance"], 2)),
+    "stretch": (13, lambda row: f"{short(row['smallest_stretch'])} – {short(row['largest_stretch'])}"),
+    "step": (8, lambda row: seconds(row["step_wall_seconds"])),
+    "over base": (0, lambda row: short(row["step_over_base"])),
+    "CPU": (5, lambda row: short(row["step_over_base_cpu"])),
+}
+"""The columns of the table: headings, minimum widths, and cells by the row of the CSV file."""
+
+
 def cells(outcome: StressOutcome) -> list[str]:
     """The row of a case in the table with the columns `HEADINGS`."""
     row = csv_row(outcome)
-    return [
-        outcome.case.name,
-        outcome.verdict,
-        f"{row['steps']}",
-        f"{row['rejected']}",
-        seconds(row["smallest_dt"]),
-        f"{short(row['newton_median'])}, {row['newton_worst']}",
-        f"{row['linear_iterations']}",
-        short(row["energy_defect"], 2),
-        short(row["energy_tolerance"], 2),
-        f"{short(row['smallest_stretch'])} – {short(row['largest_stretch'])}",
-        seconds(row["step_wall_seconds"]),
-        short(row["step_over_base"]),
-        short(row["step_over_base_cpu"]),
-    ]
+    return [cell(row) for _, cell in HEADINGS.values()]
 
 
 class StressView(View[StressOutcome]):
@@ -400,7 +399,7 @@ class StressView(View[StressOutcome]):
             for outcome in run
             for name, verdict in outcome.failures.items()
         ]
-        if any(not outcome.passed for outcome in run):
+        if failed:
             report.heading("What failed")
             report.bullets(failed)
         report.heading("The worst cases")
@@ -410,14 +409,10 @@ class StressView(View[StressOutcome]):
             if plots:
                 _figures(report, outcome)
         report.heading("What was judged")
-        report.table(
-            ["case", "what", "verdict"],
-            [
-                [outcome.case.name, name, verdict.line]
-                for outcome in run
-                for name, verdict in outcome.verdicts.items()
-            ],
-        )
+        judged = [
+            [one.case.name, name, verdict.line] for one in run for name, verdict in one.verdicts.items()
+        ]
+        report.table(["case", "what", "verdict"], judged)
         left_out = [f"{one.case.name}: {one.left_out}" for one in outcomes if one.left_out]
         if left_out:
             report.heading("Left out")
@@ -431,7 +426,7 @@ def severity(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
 
 
 def _aligned_cells(texts: Sequence[str]) -> str:
-    widths = [max(len(name), minimum) for name, minimum in HEADINGS.items()]
+    widths = [max(len(name), minimum) for name, (minimum, _) in HEADINGS.items()]
     first, *others = zip(texts, widths, strict=True)
     return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
 

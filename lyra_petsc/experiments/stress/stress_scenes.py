@@ -163,22 +163,12 @@ STEP = 0.005
 
 def hanging_sheet(cells: int) -> Content:
     """The default base scene: a square metre of cotton hung by two corners."""
-    # kg/m², N/m, N·m, s
-    density, stiffness, bending, damping = 0.15, 120.0, 1e-5, 0.005
+    stiffness = 120.0  # N/m
+    membrane = {"c11": stiffness, "c22": stiffness, "c12": stiffness / 3.0, "c33": 0.25 * stiffness}
     return {
         "title": "A square of cotton hung by two corners",
         "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells, "pattern": "alternating"}},
-        "material": {
-            "density": density,
-            "membrane": {
-                "c11": stiffness,
-                "c22": stiffness,
-                "c12": stiffness / 3.0,
-                "c33": 0.25 * stiffness,
-            },
-            "bending": bending,
-            "damping": damping,
-        },
+        "material": {"density": 0.15, "membrane": membrane, "bending": 1e-5, "damping": 0.005},
         "gravity": [0.0, 0.0, -9.81],
         "handles": [{"nodes": [0, cells]}],
         "time": {"end": 20 * STEP, "step": STEP},
@@ -255,10 +245,10 @@ def scale(
     return content
 
 
-def set_damping(content: Content, seconds: float) -> Content:
-    """Set the damping γ [s] of every material."""
+def set_material(content: Content, **values: Any) -> Content:
+    """Set keys of every material."""
     for block in materials(content):
-        block["damping"] = seconds
+        block |= values
     return content
 
 
@@ -276,13 +266,6 @@ def anisotropic(content: Content, ratio: float) -> Content:
             bending = {"bending": plate, "bending_model": shell.model}
         base_with.append({"density": shell.density, "membrane": membrane, **bending, **kept})
     content["material"] = base_with
-    return content
-
-
-def use_directors(content: Content) -> Content:
-    """Select the bending model with directors on edges for every material."""
-    for block in materials(content):
-        block["bending_model"] = "midedge"
     return content
 
 

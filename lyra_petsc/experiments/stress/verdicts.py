@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,11 @@ from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import StepReport
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
+
+
+def median(values: Sequence[float]) -> float:
+    """The median; NaN of no values."""
+    return float(statistics.median(values)) if values else math.nan
 
 
 @dataclass
@@ -102,17 +107,7 @@ class RunRecord:
     @property
     def median_seconds(self) -> float:
         """Median wall time of a step [s]; NaN without any."""
-        return statistics.median(r.wall_seconds for r in self.reports) if self.reports else math.nan
-
-    @property
-    def median_cpu(self) -> float:
-        """Median CPU time of a step [s]; NaN without any."""
-        return statistics.median(self.cpu_seconds) if self.cpu_seconds else math.nan
-
-    @property
-    def median_newton(self) -> float:
-        """Median Newton iterations of a step; NaN without any."""
-        return float(statistics.median(self.newton)) if self.reports else math.nan
+        return median([report.wall_seconds for report in self.reports])
 
     @property
     def dissipation(self) -> float:
@@ -275,10 +270,10 @@ def judge_speed(record: RunRecord, wall_ratio: float, cpu_ratio: float) -> Verdi
     newton_median, newton_max = 10, 30
     # allowed median time per step of a stiff sheet over that of the base scene
     max_ratio = 5.0
-    median, worst = record.median_newton, max(record.newton, default=0)
-    good = median <= newton_median and worst <= newton_max and min(wall_ratio, cpu_ratio) <= max_ratio
+    typical, worst = median(record.newton), max(record.newton, default=0)
+    good = typical <= newton_median and worst <= newton_max and min(wall_ratio, cpu_ratio) <= max_ratio
     text = (
-        f"Newton iterations {short(median)} in the median and {worst} at worst "
+        f"Newton iterations {short(typical)} in the median and {worst} at worst "
         f"({newton_median} and {newton_max} allowed), {short(wall_ratio)} times the base's wall time, "
         f"{short(cpu_ratio)} times its CPU time ({max_ratio:g} allowed)"
     )

@@ -72,7 +72,7 @@ def _edge_positions(trial: Trial) -> Array:
 def step_inextensible_chain(x: Array, v: Array, dt: float, length: float) -> tuple[Array, Array]:
     """One backward Euler step of an inextensible chain with equal joint masses and fixed ends.
 
-    Newton's method on the equations with Lagrange multipliers, starting from the present shape.
+    Solves the equations with Lagrange multipliers, starting from the present shape.
 
     Parameters
     ----------
@@ -82,24 +82,19 @@ def step_inextensible_chain(x: Array, v: Array, dt: float, length: float) -> tup
     length : float
         Length of a link [m].
     """
-    n = len(x) - 1
-    rows = 2 * (n - 1)
-    free_x = x + dt * v + dt**2 * np.array([0.0, -G])
-    x_new, force = x.copy(), np.zeros(n)
-    # maps inner joints to links
-    difference = np.diff(np.eye(n + 1), axis=0)[:, 1:-1]
-    for _ in range(100):
-        links = np.diff(x_new, axis=0)
-        slope = (difference[:, :, None] * links[:, None, :]).reshape(n, rows)
-        curvature = np.kron(difference.T @ (force[:, None] * difference), np.eye(2))
-        matrix = np.block([[np.eye(rows) + curvature, slope.T], [slope, np.zeros((n, n))]])
-        too_short = 0.5 * (length**2 - np.sum(links**2, axis=1))
-        right = np.concatenate([(free_x - x_new)[1:-1].ravel() - slope.T @ force, too_short])
-        change = np.linalg.solve(matrix, right)
-        x_new[1:-1] += change[:rows].reshape(-1, 2)
-        force += change[rows:]
-        if np.abs(change[:rows]).max() < 1e-15 * LENGTH:
-            break
+    from scipy.optimize import root
+
+    free_x, pull = x + dt * v + dt**2 * np.array([0.0, -G]), np.diff(np.eye(len(x)), axis=0).T
+
+    def residual(unknowns: Array) -> Array:
+        """Of the equations of motion of the inner joints, and of the lengths of the links."""
+        inner, force = unknowns[: x[1:-1].size].reshape(-1, 2), unknowns[x[1:-1].size :]
+        links = np.diff(np.vstack([x[0], inner, x[-1]]), axis=0)
+        moved = (inner - free_x[1:-1]) + (pull @ (force[:, None] * links))[1:-1]
+        return np.append(moved.ravel(), 0.5 * (np.sum(links**2, axis=1) - length**2))
+
+    found = root(residual, np.append(x[1:-1].ravel(), np.zeros(len(x) - 1)), tol=1e-15).x
+    x_new = np.vstack([x[0], found[: x[1:-1].size].reshape(-1, 2), x[-1]])
     return x_new, (x_new - x) / dt
 
 

@@ -36,9 +36,8 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     remove_handles,
     scale,
     scale_gravity,
-    set_damping,
+    set_material,
     set_wind,
-    use_directors,
 )
 from lyra_petsc.experiments.stress.verdicts import RunRecord
 from lyra_petsc.experiments.verification.verification_case import grid
@@ -114,8 +113,8 @@ anisotropy = family(
 damping = family(
     "damping",
     "γ 0 and 10 s",
-    StressCase("damping-0", "no damping", base_with(set_damping, seconds=0.0)),
-    StressCase("damping-10s", "damping γ = 10 s", base_with(set_damping, seconds=10.0), level=QUICK),
+    StressCase("damping-0", "no damping", base_with(set_material, damping=0.0)),
+    StressCase("damping-10s", "damping γ = 10 s", base_with(set_material, damping=10.0), level=QUICK),
 )
 
 
@@ -181,14 +180,17 @@ def _crumpled(x: Array, spacing: float) -> Array:
     return np.asarray(y + x.mean(axis=0))
 
 
-def _folded(x: Array, spacing: float) -> Array:
-    """Folded flat: one half is mirrored at the vertex that is nearest to the middle of the longest side."""
-    axis = int(np.argmax(np.ptp(x, axis=0)))
-    middle = 0.5 * (x[:, axis].min() + x[:, axis].max())
+def _folded(x: Array, spacing: float, degrees: float = 180.0) -> Array:
+    """Folded by an angle at the vertex that is nearest to the middle of the longest side."""
+    along, angle = int(np.argmax(np.ptp(x, axis=0))), np.radians(degrees)
+    up = 2 if along != 2 else 0
+    middle = 0.5 * (x[:, along].min() + x[:, along].max())
     # through a vertex: cells that are folded in their middle would lose all their area
-    crease = x[np.argmin(np.abs(x[:, axis] - middle)), axis]
-    y = x.copy()
-    y[:, axis] = crease - np.abs(x[:, axis] - crease)
+    crease = x[np.argmin(np.abs(x[:, along] - middle)), along]
+    y, beyond = x.copy(), x[:, along] > crease
+    offset, height = x[beyond, along] - crease, x[beyond, up]
+    y[beyond, along] = crease + np.cos(angle) * offset - np.sin(angle) * height
+    y[beyond, up] = np.sin(angle) * offset + np.cos(angle) * height
     return y
 
 
@@ -347,26 +349,11 @@ compression = family(
 )  # fmt: skip
 
 
-CREASE = np.radians(179.0)
-"""Angle of a crease [rad]"""
-
 CRUSHED, CRUMPLED = 0.02, 0.3
 """Final length of a crushed strip and final width of a crumpled sheet, over the initial ones."""
 
 MANY, FEW, LONG = 80, 20, 0.02
 """Numbers of steps of slow and fast cases, and Δt [s] of the fast ones."""
-
-
-def _creased(x: Array, spacing: float) -> Array:
-    """Folded along a crease in the middle of x until one half nearly lies on the other."""
-    middle = 0.5 * (x[:, 0].min() + x[:, 0].max())
-    crease = x[np.argmin(np.abs(x[:, 0] - middle)), 0]
-    y = x.copy()
-    beyond = y[:, 0] > crease
-    offset, height = y[beyond, 0] - crease, y[beyond, 2].copy()
-    y[beyond, 0] = crease + np.cos(CREASE) * offset - np.sin(CREASE) * height
-    y[beyond, 2] = np.sin(CREASE) * offset + np.cos(CREASE) * height
-    return y
 
 
 def _stiffer(content: Content) -> Content:
@@ -402,11 +389,14 @@ def _directors(
     name: str, title: str, *changes: Callable[..., Content], case: Any = (), **numbers: Any
 ) -> StressCase:
     """A case with directors on edges and further changes; ``case`` holds arguments of `StressCase`."""
-    return StressCase(f"directors-{name}", title, base_with(use_directors, *changes, **numbers), **dict(case))
+    # as the first change, since the last one receives the numbers
+    scene = base_with(partial(set_material, bending_model="midedge"), *changes, **numbers)
+    return StressCase(f"directors-{name}", title, scene, **dict(case))
 
 
 SLOW = {"steps": MANY, "own_scene": True}
 FAST = {"steps": FEW, "step": LONG, "own_scene": True}
+CREASED = {"shape": partial(_folded, degrees=179.0)}
 TWICE, THRICE = _twist(720.0, MANY * STEP, 16), _twist(1080.0, FEW * LONG, FEW)
 
 directors = family(
@@ -418,7 +408,12 @@ directors = family(
     _directors("bending-1e6", "bending × 1e6", scale, bending=1e6),
     _directors("wind-200", "wind 200 m/s", set_wind, speed=200.0),
     _directors("spin", "handles turn ten times a second", _turning, case={"steps": FEW, "level": FULL}),
-    _directors("folded", "a crease of 179°, no handle", remove_handles, case={"shape": _creased}),
+    _directors(
+        "folded",
+        "a crease of 179°, no handle",
+        remove_handles,
+        case={"shape": partial(_folded, degrees=179.0)},
+    ),
     _directors("twist", "a stiff strip twisted by 720°", _stiffer, _strip, frames=TWICE, case=SLOW),
     _directors("twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", _strip, frames=THRICE, case=FAST),
     _directors("twist-bdf2", "the same with bdf2", _strip, frames=THRICE, integrator="bdf2", case=FAST),
