@@ -110,11 +110,6 @@ class Body:
         """The rest shape with its materials."""
         return RestShape(self.scene, self.mesh)
 
-    @cached_property
-    def mass(self) -> float:
-        """Total mass [kg]."""
-        return float(self.rest.mass.sum())
-
     @property
     def gravity(self) -> Array:
         """Gravity (3,) [m/s²]; zero if the scene has none."""
@@ -127,24 +122,12 @@ class Body:
         return np.asarray((0.0, 0.0, 0.0) if initial is None else initial.velocity, dtype=np.float64)
 
     @cached_property
-    def potential(self) -> float:
-        """Potential energy −Σ m g·x [J] at t = 0."""
-        return -float(self.rest.mass @ (self.mesh.positions @ self.gravity))
-
-    @cached_property
     def stretch(self) -> Array:
         """Start length over rest length of the sides of all triangles, (F, 3)."""
         corners, flat = self.mesh.positions[self.mesh.triangles], self.mesh.triangle_uv
         start = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         rest = np.linalg.norm(flat - np.roll(flat, -1, axis=1), axis=2)
         return np.asarray(start / rest)
-
-    @cached_property
-    def normals(self) -> Array:
-        """Unit normals (F, 3) of the start shape."""
-        corners = self.mesh.positions[self.mesh.triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
     @property
     def is_bent(self) -> bool:
@@ -233,7 +216,9 @@ def _solution(
 
 
 def _translation(body: Body, path: Callable[[float], tuple[Array, Array]]) -> ExactMotion:
-    return Translation(body.mass, body.gravity, body.potential, path)
+    mass, gravity = body.rest.mass, body.gravity
+    potential = -float(mass @ (body.mesh.positions @ gravity))
+    return Translation(float(mass.sum()), gravity, potential, path)
 
 
 def _holding(conditions: Mapping[str, object]) -> list[str]:
@@ -251,44 +236,26 @@ def _free_path(start: Array, g: Array, t: float) -> tuple[Array, Array]:
     return start * t + 0.5 * g * t * t, start + g * t
 
 
-def _in_still_air(body: Body, drag: str) -> list[str]:
-    """Violations of a fall through still air; ``drag`` is the key of the wind that causes its drag."""
-    wind, densities = body.scene.wind, body.rest.per_triangle("density")
+def _in_still_air(body: Body, drag: str, cosine: float, otherwise: str) -> list[str]:
+    """Violations of a fall through still air.
+
+    ``drag`` is the key of the wind that causes its drag, ``cosine`` that of the angle between the sheet's
+    normal and gravity, ``otherwise`` what is said of sheets with another one.
+    """
+    wind, densities, g = body.scene.wind, body.rest.per_triangle("density"), body.gravity
     air = {
-        "no gravity": not body.gravity.any(),
+        "no gravity": not g.any(),
         "initial.velocity": body.start_velocity.any(),
         "no air (wind with velocity [0, 0, 0])": wind is None,
         "wind that is not still": wind is not None and any(wind.velocity),
         f"wind.{drag} 0": wind is not None and getattr(wind, drag) == 0.0,
         "materials of different densities": np.ptp(densities) > SAME * densities.max(),
     }
-    return [*_holding(air), *body.strained()]
-
-
-def _cosines(body: Body) -> Array:
-    """Cosines of the angles between normals and gravity, (F,)."""
-    g = body.gravity
-    return np.asarray(body.normals @ (g / np.linalg.norm(g)))
-
-
-def level_violations(body: Body) -> list[str]:
-    """Properties of a scene that contradict a level sheet falling in still air."""
-    level = not body.gravity.any() or np.abs(np.abs(_cosines(body)) - 1.0).max() <= SAME
-    return _in_still_air(body, "density") + ([] if level else ["a sheet that is not flat and level"])
-
-
-@_solution(
-    "terminal-fall",
-    "level sheet falling in still air, v = vt tanh(g t/vt)",
-    RIGID | {"wind"},
-    level_violations,
-)
-def flat_fall(body: Body) -> ExactMotion:
-    """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
-
-    Drag grows with the square of the velocity.
-    """
-    return _translation(body, partial(_level_path, math.sqrt(_weight_to_drag(body, "density")), body.gravity))
+    corners = body.mesh.positions[body.mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    along = np.abs(normals @ g) - cosine * np.linalg.norm(normals, axis=1) * np.linalg.norm(g)
+    turned = np.abs(along).max() > SAME * np.linalg.norm(normals, axis=1).max() * np.linalg.norm(g)
+    return [*_holding(air), *body.strained(), *_holding({otherwise: turned})]
 
 
 def _weight_to_drag(body: Body, drag: str) -> float:
@@ -297,39 +264,55 @@ def _weight_to_drag(body: Body, drag: str) -> float:
     return density * float(np.linalg.norm(body.gravity)) / float(getattr(body.scene.wind, drag))
 
 
-def _level_path(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
+Law = Callable[[float, float, float], tuple[float, float]]
+"""Depth [m] and speed [m/s] by terminal speed [m/s], gravity [m/s²] and time [s]"""
+
+
+def _fall(law: Law, terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
     g = math.hypot(*gravity)
+    depth, speed = law(terminal, g, t)
+    return depth / g * gravity, speed / g * gravity
+
+
+def _level_law(terminal: float, g: float, t: float) -> tuple[float, float]:
     a = g * t / terminal
     # ln cosh a without overflow
-    fallen = terminal**2 / g * (a + math.log1p(math.exp(-2.0 * a)) - math.log(2.0))
-    return fallen / g * gravity, terminal * math.tanh(a) / g * gravity
+    depth = terminal**2 / g * (a + math.log1p(math.exp(-2.0 * a)) - math.log(2.0))
+    return depth, terminal * math.tanh(a)
 
 
-def edge_violations(body: Body) -> list[str]:
-    """Properties of a scene that contradict an upright sheet falling edge-on in still air."""
-    upright = not body.gravity.any() or np.abs(_cosines(body)).max() <= SAME
-    return _in_still_air(body, "drag") + ([] if upright else ["a sheet that is not upright"])
+@_solution(
+    "terminal-fall",
+    "level sheet falling in still air, v = vt tanh(g t/vt)",
+    RIGID | {"wind"},
+    partial(_in_still_air, drag="density", cosine=1.0, otherwise="a sheet that is not flat and level"),
+)
+def flat_fall(body: Body) -> ExactMotion:
+    """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
+
+    Drag grows with the square of the velocity.
+    """
+    terminal = math.sqrt(_weight_to_drag(body, "density"))
+    return _translation(body, partial(_fall, _level_law, terminal, body.gravity))
+
+
+def _edge_law(terminal: float, g: float, t: float) -> tuple[float, float]:
+    part = -math.expm1(-g * t / terminal)
+    return terminal * (t - terminal / g * part), terminal * part
 
 
 @_solution(
     "edge-fall",
     "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
     RIGID | {"wind"},
-    edge_violations,
+    partial(_in_still_air, drag="drag", cosine=0.0, otherwise="a sheet that is not upright"),
 )
 def edge_fall(body: Body) -> ExactMotion:
     """An upright flat sheet released at rest: v = vt (1 − exp(−g t / vt)), vt = ρ_sheet g / drag.
 
     Drag grows with the velocity.
     """
-    return _translation(body, partial(_edge_path, _weight_to_drag(body, "drag"), body.gravity))
-
-
-def _edge_path(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
-    g = math.hypot(*gravity)
-    rate = g / terminal
-    fallen = terminal * (t + math.expm1(-rate * t) / rate)
-    return fallen / g * gravity, -terminal * math.expm1(-rate * t) / g * gravity
+    return _translation(body, partial(_fall, _edge_law, _weight_to_drag(body, "drag"), body.gravity))
 
 
 @dataclass(frozen=True)
