@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -181,8 +180,8 @@ class Bench:
     ----------
     steps : int
         Accepted steps so far.
-    latest : (int, float)
-        Accepted steps and wall time [s] of the latest simulation, set-up included.
+    started : int
+        Number of simulations so far.
     """
 
     def __init__(
@@ -197,7 +196,7 @@ class Bench:
         self._direct, self._trust_mesh = direct, trust_mesh
         self.watch = watch or (lambda: None)
         self.steps = 0
-        self.latest = (0, 0.0)
+        self.started = 0
         self._folder: TemporaryDirectory[str] | None = None
         self._files = 0
 
@@ -296,7 +295,6 @@ class Bench:
         scene = validated(Scene, filled, file="scene of the case")
         if self._trust_mesh:
             scene = scene.trusting_meshes()
-        began, steps = time.perf_counter(), self.steps
+        self.started += 1
         with open_simulation(self.comm, scene, stops=stops) as simulation:
             yield Trial(self, simulation)
-        self.latest = (self.steps - steps, time.perf_counter() - began)

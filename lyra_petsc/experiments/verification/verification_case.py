@@ -6,7 +6,7 @@ import json
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from typing import Any, ClassVar
@@ -183,9 +183,8 @@ class VerificationCase(Case):
     Attributes
     ----------
     measure : callable (bench, n) → Measured, one by one
-        Collective; the same result on every rank. Rows of a generator, which yields results as soon as a
-        simulation has ended, have the steps and run time of this simulation; rows of other iterables those
-        of all simulations.
+        Collective; the same result on every rank. A row has the steps and run time of the simulations since
+        the row before; rows without one between them share theirs.
     source : str
         Source of the solution.
     resolutions : sequence of float
@@ -332,24 +331,21 @@ def _measure_rows(
     comm.Barrier()
     began, h = time.perf_counter(), case.size(n)
     rows: list[ErrorRow] = []
-    problem = ""
-    measured: Iterable[Measured] = ()
+    problem, seen, spent = "", (0, 0), (0, 0.0)
     with Bench(comm, watch) as bench:
         bench.watch()
         try:
-            measured = case.measure(bench, n)
-            for one in measured:
+            for one in case.measure(bench, n):
+                if (bench.steps, bench.started) != seen:
+                    spent = bench.steps - seen[0], time.perf_counter() - began
+                    began, seen = began + spent[1], (bench.steps, bench.started)
                 row = ErrorRow(one.quantity, one.unit, n, h, one.value, one.exact, one.error)
-                row.steps, row.wall_seconds = bench.latest
+                row.steps, row.wall_seconds = spent
                 rows.append(row)
         except (InputError, SolverError) as error:
             problem = failure_message(comm, error)
         except ModuleNotFoundError as error:  # on all ranks
             problem = install_hint([str(error.name)])
-    if not isinstance(measured, Generator):
-        whole = time.perf_counter() - began
-        for row in rows:
-            row.steps, row.wall_seconds = bench.steps, whole
     slowest = np.max(comm.allgather([row.wall_seconds for row in rows]), axis=0)
     for row, wall in zip(rows, slowest, strict=True):
         row.wall_seconds = float(wall)
