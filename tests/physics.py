@@ -243,7 +243,7 @@ class Simulation:
         term = self.problem.terms[name]
         assert isinstance(term, Elastic)
         return float(
-            self.comm.allreduce(float(term.energies(self.system.x, self.system.active.frozen[term]).sum()))
+            self.comm.allreduce(float(term.energies(self.system.x, self.system.step.frozen[term]).sum()))
         )
 
     # -- steps -----------------------------------------------------------------------------------------

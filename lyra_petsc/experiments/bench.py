@@ -144,7 +144,7 @@ class Trial:
                 directors = term.reset_frames(problem.system.x)
                 problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
-                problem.system.active.refreeze({term: term.frames})
+                problem.system.refreeze({term: term.frames})
         self.simulation.energy_balance.measure()  # the next step compares its energies with these
         if self.simulation.guard is not None:
             self.simulation.guard.forget_end()

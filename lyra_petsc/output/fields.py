@@ -77,7 +77,7 @@ def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTria
         out += _density_on_vertices(problem, hinges.stencil[:, :2].ravel(), halves)
     if "midedge" in problem.terms:
         midedge = cast("MidEdge", problem.terms["midedge"])
-        thirds = np.repeat(of_triangles(midedge, x, problem.system.active.frozen[midedge]) / 3.0, 3)
+        thirds = np.repeat(of_triangles(midedge, x, problem.system.step.frozen[midedge]) / 3.0, 3)
         out += _density_on_vertices(problem, midedge.stencil.ravel(), thirds)
     return out
 
@@ -104,7 +104,7 @@ def _curvature(problem: Problem) -> Array:
 
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
-    found = midedge.curvatures(problem.system.x, problem.system.active.frozen[midedge])[: midedge.n_owned]
+    found = midedge.curvatures(problem.system.x, problem.system.step.frozen[midedge])[: midedge.n_owned]
     out = np.zeros((problem.membrane.n_owned, 3))  # stays zero for triangles without bending stiffness
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)
@@ -117,7 +117,7 @@ def _contact_pressure(problem: Problem) -> Array:
     """Contact pressure from the sum of the normal forces on both sides; collective."""
     contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
     forces = np.zeros_like(system.x)
-    forces[:, 0] = contact.normal_forces(system.x, system.active.frozen[contact])
+    forces[:, 0] = contact.normal_forces(system.x, system.step.frozen[contact])
     system.points.add_to_owners(forces)
     return _density_on_vertices(
         problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0])

@@ -64,7 +64,7 @@ class Accuracy:
         """Record the step that was accepted after ``step`` others at ``time`` [s]."""
         self.local_error.record_step(v_before, dt)
         self.estimated += self._error
-        usual, minimum = self._system.usual, self.minimum_dt()
+        usual, minimum = self._system.integrators.usual, self.minimum_dt()
         if usual.order == 1 and step >= FIRST_ORDER_STEPS:
             notes.once(
                 "order",

@@ -1,4 +1,4 @@
-"""The terms of a problem, their frozen data in the present step, and sums over them."""
+"""The terms of a problem, their frozen data in a step, and sums over them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,16 @@ from lyra_petsc.terms.protocols import (
 )
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
+
+Frozen = Mapping[Term, Any]
+
+
+def gradient(terms: Sequence[Elastic | Viscous], at: Array, frozen: Frozen, layout: Layout) -> Array:
+    """Gradient (n_owned, 3) [N] of the sum of ``terms`` at positions or velocities (n_local, 3)."""
+    out = np.zeros((layout.n_local, 3))
+    for term in terms:
+        term.add_gradient(at, frozen[term], out)
+    return out[: layout.n_owned]
 
 
 class ActiveTerms:
@@ -50,8 +60,6 @@ class ActiveTerms:
         Terms with directors.
     coarse : dict of Elastic → Elastic
         The terms that replace terms with unknowns of edges on coarse levels of multigrid.
-    frozen : dict of Term
-        Frozen data of each term in the step.
     """
 
     def __init__(self, terms: Sequence[Term], obstacles: Elastic | None = None) -> None:
@@ -71,53 +79,55 @@ class ActiveTerms:
         self.sliding: list[Any] = [term for term in self.constraints if term.registration.of_contact]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.coarse: dict[Elastic, Elastic] = {}
-        self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
-    def freeze(self, step: UpcomingStep) -> None:
-        """Freeze the data of all terms that depend on positions or velocities."""
-        self.frozen = {}  # frees the old data first, to save memory
-        self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
+    def freeze(self, step: UpcomingStep) -> Frozen:
+        """Data of all terms that depend on positions or velocities and are constant in the step."""
+        return {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
 
-    def refreeze(self, changed: Mapping[Any, Any]) -> None:
-        """Replace the frozen data of terms, and of the terms that share it as their partners."""
+    def refreeze(self, frozen: Frozen, changed: Mapping[Any, Any]) -> Frozen:
+        """Other data of some terms, and of the terms that share them as their partners."""
         partners: dict[Term, Any] = {
             term: changed[term.partner]
             for term in self.elastic
             if isinstance(term, SharesFrozen) and term.partner in changed
         }
-        self.frozen = {**self.frozen, **changed, **partners}
+        return {**frozen, **changed, **partners}
 
-    def move_targets(self, step: UpcomingStep) -> None:
-        """Set moving targets and springs to their positions at ``step.target_time``."""
-        self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
+    def with_targets(self, frozen: Frozen, step: UpcomingStep) -> Frozen:
+        """The data with moving targets and springs at their positions at ``step.target_time``."""
+        return {**frozen, **{term: term.freeze(step) for term in (*self.moving, *self.constraints)}}
 
-    def gradient(self, terms: Sequence[Elastic | Viscous], at: Array, layout: Layout) -> Array:
-        """Gradient (n_owned, 3) [N] of the sum of ``terms`` at positions or velocities (n_local, 3)."""
-        out = np.zeros((layout.n_local, 3))
-        for term in terms:
-            term.add_gradient(at, self.frozen[term], out)
-        return out[: layout.n_owned]
+    def moving_energy(self, x: Array, frozen: Frozen) -> float:
+        """Energy [J] of this rank's terms with moving targets, without obstacles, at these targets."""
+        return sum(float(term.energies(x, frozen[term]).sum()) for term in self.targets)
 
-    def moving_energy(self, x: Array) -> float:
-        """Energy [J] of this rank's terms with moving targets, without obstacles, at the present targets."""
-        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in self.targets)
+    def limits_act(self, x: Array, frozen: Frozen, layout: Layout) -> bool:
+        """Whether any term that limits steps acts at positions x (n_local, 3): its forces change too abruptly
+        for one linear solve; collective.
+        """
+        terms = self.limiting
+        return bool(terms) and any(
+            layout.global_max(any(term.energies(x, frozen[term]).any() for term in terms))
+        )
 
-    def accept_substep(self, x: Array, start: tuple[Array, Mapping[Any, Any]] | None) -> Array:
+    def accept_substep(
+        self, x: Array, frozen: Frozen, start: tuple[Array, Mapping[Any, Any]] | None
+    ) -> Array:
         """Accept a part of a static load step as `CoulombFriction.accept_substep`, with ``start`` a
         `contact_state`; returns the sum of the results on this rank.
         """
         landed = np.zeros(3)
         for term in self.sliding:
-            landed += term.accept_substep(x, self.frozen[term], start and (start[0], start[1][term]))
+            landed += term.accept_substep(x, frozen[term], start and (start[0], start[1][term]))
         return landed
 
-    def friction_lag(self, x: Array) -> dict[str, Array]:
+    def friction_lag(self, x: Array, frozen: Frozen) -> dict[str, Array]:
         """The results of `Elastic.friction_lag` of all terms."""
-        return {name: sums for t in self.sliding for name, sums in t.friction_lag(x, self.frozen[t]).items()}
+        return {name: sums for t in self.sliding for name, sums in t.friction_lag(x, frozen[t]).items()}
 
-    def slip_under_changed_forces(self, x: Array, dx: Array) -> Array:
+    def slip_under_changed_forces(self, x: Array, dx: Array, frozen: Frozen) -> Array:
         """The sums of `Elastic.slip_under_changed_forces` over all terms, (2,)."""
-        sums = [t.slip_under_changed_forces(x, dx, self.frozen[t]) for t in self.sliding]
+        sums = [t.slip_under_changed_forces(x, dx, frozen[t]) for t in self.sliding]
         return np.sum(sums, axis=0)
 
     def contact_state(self) -> dict[Any, Any]:

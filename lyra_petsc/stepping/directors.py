@@ -1,18 +1,20 @@
 """Directors on edges in a step: the frames of their angles, and how an increment turns them.
 
-Only terms with unknowns of edges (`ActiveTerms.with_edges`) have directors; without them nothing is done.
+Only terms with directors (`ActiveTerms.with_edges`) have them; without them nothing is done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.terms.protocols import LARGEST_ROTATION
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.stepping.active_terms import Frozen
+from lyra_petsc.terms.protocols import LARGEST_ROTATION, HasDirectors
 from lyra_petsc.terms.term import Term
 
 if TYPE_CHECKING:
@@ -23,73 +25,45 @@ MIN_EDGE_STIFFNESS = 1e-10
 
 
 class Directors:
-    """The directors of the terms of a `StageEquations`.
+    """The directors of a problem.
 
     Parameters
     ----------
-    system : StageEquations
+    terms : sequence of HasDirectors
+    layout : Layout
 
     Attributes
     ----------
     min_stiffness : (n,)
         Stiffness [N/m] that Jacobians add to the diagonal of the block rows of edges. Without it the rows of
         edges whose triangles have lost their area would be zero.
+    frozen_in_step : mapping of Term or None
+        Frozen data of terms in the last step, if its frames were updated at its end.
     """
 
-    _frozen_before: Mapping[Term, Any] | None = None
-
-    def __init__(self, system: StageEquations) -> None:
-        self._system, self._terms, points = system, system.active.with_edges, system.points
-        self._end_frames: dict[Term, Any] = {}  # at the end of the last step
-        stiffness = np.zeros((points.n_local, 3))
-        for term in self._terms:
+    def __init__(self, terms: Sequence[HasDirectors], layout: Layout) -> None:
+        self._terms, self._comm = terms, layout.comm
+        self._end_frames: Frozen = {}  # at the end of the last step
+        self.frozen_in_step: Frozen | None = None
+        stiffness = np.zeros((layout.n_local, 3))
+        for term in terms:
             stiffness.reshape(-1)[term.edge_indices] += MIN_EDGE_STIFFNESS * term.edge_stiffness()
-        self.min_stiffness = stiffness[points.n_vertices : points.n_owned].max(axis=1)
+        self.min_stiffness = stiffness[layout.n_vertices : layout.n_owned].max(axis=1)
 
-    def begin_step(self) -> bool:
-        """Begin a step; returns whether its frames differ from those at the end of the last step."""
-        frozen, self._frozen_before = self._system.active.frozen, None
+    def frames_differ(self, frozen: Frozen) -> bool:
+        """Whether the frames of a step that begins differ from those at the end of the last step."""
+        self.frozen_in_step = None
         return any(frozen[term] is not self._end_frames.get(term) for term in self._terms)
 
-    @property
-    def frozen_in_step(self) -> Mapping[Term, Any]:
-        """Frozen data of terms in the step, before `move_frames_to_end`."""
-        return self._system.active.frozen if self._frozen_before is None else self._frozen_before
-
-    def move_frames_to_end(self) -> None:
-        """Update the frames at the end of a step that is one linear solve.
+    def frames_at_end(self, x: Array, frozen: Frozen) -> dict[Term, Any]:
+        """Frames at the end x (n_local, 3) of a step that is one linear solve.
 
         The forces at the end are then those with which the next step begins.
         """
-        system, integrator, frozen = self._system, self._system.integrator, self._system.active.frozen
-        if self._terms and integrator.lagged_loads and integrator.dynamic:
-            system.active.refreeze({term: term.frames_at_end(system.x, frozen[term]) for term in self._terms})
-            self._frozen_before = frozen
-            system.change()
-            self._end_frames = {term: system.active.frozen[term] for term in self._terms}
-
-    def update_frames(self, x: Array) -> bool:
-        """Update the frames of edges that have turned far from theirs to positions x (n_local, 3).
-
-        Returns whether any changed, and with them the forces on vertices; collective.
-        """
-        system = self._system
-        found: dict[Term, Any] = {}
-        for term in () if system.solving_edges else self._terms:
-            updated = term.updated_frames(x, system.active.frozen[term], system.prescribed.mask)
-            found |= {} if updated is None else {term: updated}
-        if not system.points.comm.allreduce(len(found), MPI.MAX):
-            return False
-        system.active.refreeze(found)
-        system.change()
-        return True
-
-    def transport_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
-        """Transport the frames, those in use or in ``frozen``, to the present positions."""
-        for term in self._terms:
-            term.accept(self._system.x, (frozen or self._system.active.frozen)[term])
-        if self._terms:
-            self._system.change()  # where directors are loaded, those on vertices depend on the frames
+        self.frozen_in_step = frozen
+        ends: dict[Term, Any] = {term: term.frames_at_end(x, frozen[term]) for term in self._terms}
+        self._end_frames = ends
+        return ends
 
     def forget(self) -> None:
         """Discard the remembered directors, whose memory the linear solve needs."""
@@ -99,41 +73,72 @@ class Directors:
     def largest_turn(self, displacement: Array) -> float:
         """Largest angle [rad] by which directors turn in a displacement (n_owned, 3) [m]; collective."""
         turn = max((term.largest_rotation(displacement) for term in self._terms), default=0.0)
-        return float(self._system.points.comm.allreduce(turn, MPI.MAX))
+        return float(self._comm.allreduce(turn, MPI.MAX))
 
-    def turn_with_triangles(self, v: Array, increment: Array) -> bool:
-        """Turn directors with their triangles where an increment (n_owned, 3) [m/s] from v turns them far.
 
-        Changes ``increment``; returns whether it did; collective. The linear increment leads vertices off
-        their circles, and directors much too far.
-        """
-        system, changed = self._system, 0
-        if not self._terms or system.stage.c * self.largest_turn(increment) <= LARGEST_ROTATION:
-            return False
-        x, displacement = system.displacement(v, increment)
-        for term in self._terms:
-            changed += self._set(
-                increment, *term.edge_increments(x, displacement, system.active.frozen[term])
-            )
-        return bool(system.points.comm.allreduce(changed, MPI.MAX))
+def move_frames_to_end(system: StageEquations) -> None:
+    """Update the frames at the end of a step that is one linear solve."""
+    if system.active.with_edges and system.step.lagged and system.integrator.dynamic:
+        system.refreeze_end(system.directors.frames_at_end(system.x, system.step.frozen))
 
-    def match(self, v: Array, increment: Array, curved: Array) -> None:
-        """Set the edges' unknowns in ``curved`` (n_owned, 3) [m/s], an increment from v along arcs.
 
-        Each director gets the same angle to its triangles as by the linear ``increment``; collective.
-        """
-        system = self._system
-        along = system.displacement(v, curved)[1]
-        x, displacement = system.displacement(v, increment)
-        for term in self._terms:
-            self._set(curved, *term.edge_increments(x, displacement, system.active.frozen[term], along))
+def update_frames(system: StageEquations, x: Array) -> bool:
+    """Update the frames of edges that have turned far from theirs to positions x (n_local, 3).
 
-    def _set(self, increment: Array, indices: Ints, values: Array) -> bool:
-        """Put displacements (m,) [m] of the free unknowns ``indices`` (m,) into ``increment`` (n_owned, 3).
+    Returns whether any changed, and with them the forces on vertices; collective.
+    """
+    found: dict[Term, Any] = {}
+    for term in () if system.step.of_edges else system.active.with_edges:
+        updated = term.updated_frames(x, system.step.frozen[term], system.step.prescribed.mask)
+        found |= {} if updated is None else {term: updated}
+    if not system.points.comm.allreduce(len(found), MPI.MAX):
+        return False
+    system.refreeze(found)
+    return True
 
-        Returns whether there were any.
-        """
-        own = indices < increment.size
-        own[own] = self._system.prescribed.free.ravel()[indices[own]]
-        increment.reshape(-1)[indices[own]] = values[own] / self._system.stage.c
-        return bool(own.any())
+
+def transport_frames(system: StageEquations, frozen: Frozen | None = None) -> None:
+    """Transport the frames, those in use or in ``frozen``, to the present positions."""
+    frozen = system.step.frozen if frozen is None else frozen
+    for term in system.active.with_edges:
+        term.accept(system.x, frozen[term])
+    if system.active.with_edges:
+        system.change()  # where directors are loaded, forces on vertices depend on the frames
+
+
+def turn_with_triangles(system: StageEquations, v: Array, increment: Array) -> bool:
+    """Turn directors with their triangles where an increment (n_owned, 3) [m/s] from v turns them far.
+
+    Changes ``increment``; returns whether it did; collective. The linear increment leads vertices off their
+    circles, and directors much too far.
+    """
+    terms, changed, reach = system.active.with_edges, 0, system.step.stage.c
+    if not terms or reach * system.directors.largest_turn(increment) <= LARGEST_ROTATION:
+        return False
+    x, displacement = system.displacement(v, increment)
+    for term in terms:
+        changed += _set(system, increment, *term.edge_increments(x, displacement, system.step.frozen[term]))
+    return bool(system.points.comm.allreduce(changed, MPI.MAX))
+
+
+def match(system: StageEquations, v: Array, increment: Array, curved: Array) -> None:
+    """Set the edges' unknowns in ``curved`` (n_owned, 3) [m/s], an increment from v along arcs.
+
+    Each director gets the same angle to its triangles as by the linear ``increment``; collective.
+    """
+    along = system.displacement(v, curved)[1]
+    x, displacement = system.displacement(v, increment)
+    for term in system.active.with_edges:
+        found = term.edge_increments(x, displacement, system.step.frozen[term], along)
+        _set(system, curved, *found)
+
+
+def _set(system: StageEquations, increment: Array, indices: Ints, values: Array) -> bool:
+    """Put displacements (m,) [m] of the free unknowns ``indices`` (m,) into ``increment`` (n_owned, 3) [m/s].
+
+    Returns whether there were any.
+    """
+    own = indices < increment.size
+    own[own] = system.step.prescribed.free.ravel()[indices[own]]
+    increment.reshape(-1)[indices[own]] = values[own] / system.step.stage.c
+    return bool(own.any())

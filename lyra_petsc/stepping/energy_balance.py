@@ -14,6 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.directors import move_frames_to_end
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
 from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
@@ -99,6 +100,26 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
+def _obstacle_work(system: StageEquations) -> float:
+    """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
+    contact, step = system.contact, system.step
+    if contact is None or not contact.obstacles_move:
+        return 0.0
+    at = step.at_stage if system.integrator.dynamic else step.end
+    work = contact.barrier.work(system.evaluated.x, at, step.start, step.end)
+    return work + (contact.impulses.work if contact.impulses else 0.0)
+
+
+def _move_targets_to_end(system: StageEquations) -> float:
+    """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
+    step, active = system.step, system.active
+    if step.ends_at_stage or not (active.moving or active.constraints):
+        return 0.0
+    frozen = active.with_targets(step.frozen, system.targets_at(step.end))
+    system.change(frozen=frozen)
+    return active.moving_energy(system.x, frozen) - active.moving_energy(system.x, step.frozen)
+
+
 class EnergyBalance:
     """The ledger: the budget of the present state, and the account of each step; collective.
 
@@ -117,7 +138,7 @@ class EnergyBalance:
         self._system = system
         named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
         self._columns = [name for name in named if name not in (*ENERGIES, "")]
-        self._at = system.prescribed.indices
+        self._at = system.step.prescribed.indices
         self._reactions = self.damping = np.zeros(len(self._at))
         self._ends: tuple[Array, list[tuple[Array, Array]]] | None = None
         if not system.integrator.dynamic:
@@ -145,7 +166,7 @@ class EnergyBalance:
         energies, moving = dict.fromkeys(names, 0.0), 0.0
         for term in system.active.elastic:
             if name := term.registration.energy:
-                frozen = system.active.frozen[term]
+                frozen = system.step.frozen[term]
                 energy = float(term.energies(system.x, frozen).sum())
                 energy -= term.heat(system.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
@@ -179,10 +200,10 @@ class EnergyBalance:
     def account_of(self, x_before: Array) -> StepAccount:
         """The account of the step just taken from x_before (n_owned, 3)."""
         system = self._system
-        system.directors.move_frames_to_end()
+        move_frames_to_end(system)
         external, self.damping, damped = self._external_forces(system.forces_at_stage())
-        by_obstacles = system.obstacle_work()
-        by_targets = system.moving_energy_before + by_obstacles
+        by_obstacles = _obstacle_work(system)
+        by_targets = system.step.moving_energy + by_obstacles
         if self._ends is not None:  # the stage of a load step is at its end: take the mean of both ends
             pull, targets = self._ends
             self._ends = external, self._moving_targets()
@@ -191,12 +212,12 @@ class EnergyBalance:
                 0.5 * float(np.vdot(pull + pull0, at - at0))
                 for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
             )
-        by_targets += system.move_targets_to_end()
+        by_targets += _move_targets_to_end(system)
         work = _work_of(external, x_before, system.x) + by_targets
         del external  # to save memory
-        fabric = sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.dissipating)
+        fabric = sum(term.heat(system.x, system.step.frozen[term]) for term in system.active.dissipating)
         impacts = system.contact_impulses.heat if system.contact_impulses else 0.0
-        inertia = kinetic_energy(system.mass, system.stage_velocity - system.history)
+        inertia = kinetic_energy(system.mass, system.stage_velocity - system.step.v_h)
         before, moving_before = self.budget, self._moving_energy
         local = work, damped, fabric, impacts, by_obstacles, inertia
         energies, moving, sums = self._measured(before, *local)
@@ -217,14 +238,14 @@ class EnergyBalance:
     def _moving_targets(self) -> list[tuple[Array, Array]]:
         """Positions of the targets that move with handles, and the forces on them, by term."""
         active, x = self._system.active, self._system.x
-        return [term.targets(x, active.frozen[term]) for term in active.targets]
+        return [term.targets(x, self._system.step.frozen[term]) for term in active.targets]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
         """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
         without a potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
         """
         system = self._system
-        self._at = at = system.prescribed.indices
+        self._at = at = system.step.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
         if system.contact_impulses:
             self._reactions += system.contact_impulses.handle_force
@@ -233,16 +254,16 @@ class EnergyBalance:
             if load.registration.energy:  # loads with a potential do no external work
                 load.add_force(system.x, 0.0, 0.0, weight)
         external = weight[: system.points.n_owned]
-        external *= -system.applied.factor
+        external *= -system.load_case.factor
         for name, part in parts:
             self._reactions += part.take(at)
             if name in ("loads", "springs", "friction", "wind"):
                 external -= part
             elif name == "damping":
                 damping = part.take(at)
-                heat = system.dt * float(np.vdot(system.stage_velocity, part))
+                heat = system.step.dt * float(np.vdot(system.stage_velocity, part))
             del part  # to save memory before the next part is computed
-        system.prescribed.overwrite(external, external.take(at) + self._reactions)
+        system.step.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -270,7 +291,7 @@ class EnergyBalance:
             reductions = term.registration.columns
             if not reductions:
                 continue
-            mine = term.history(system.x, system.active.frozen[term])
+            mine = term.history(system.x, system.step.frozen[term])
             for name, how in reductions.items():
                 found[name] = float(system.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
         return found
@@ -279,11 +300,11 @@ class EnergyBalance:
         """Total force (3,) [N] of each of a scene's ``count`` handles in the last step; collective."""
         system = self._system
         local = np.zeros((count, 3))
-        for number, forces, _ in system.held.shares(system.t0, system.t1, self.reaction):
+        for number, forces, _ in system.held.shares(system.step.start, system.step.end, self.reaction):
             local[number] = forces.sum(axis=0)
         for term in system.active.elastic:
             if isinstance(term, PullsHandles):
-                local += term.handle_forces(system.x, system.active.frozen[term], count)
+                local += term.handle_forces(system.x, system.step.frozen[term], count)
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)
         return list(total)
@@ -295,7 +316,7 @@ class EnergyBalance:
         """
         system, total = self._system, np.zeros((count, 8))
         if system.contact is not None:
-            total += system.contact.obstacle_loads(system.x, system.active.frozen)[:count]
+            total += system.contact.obstacle_loads(system.x, system.step.frozen)[:count]
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 
@@ -305,12 +326,12 @@ class EnergyBalance:
         edges, numbers = system.held.edges, system.held.with_slopes
         if edges is None:
             return {}
-        frames = system.active.frozen[edges.term]
+        frames = system.step.frozen[edges.term]
         local = np.zeros((len(numbers), 10))  # moment about the origin, force, positions, count
         for row, number in zip(local, numbers, strict=True):
             mine = system.held.vertices(number)
             row[6:9], row[9] = x[mine].sum(axis=0), len(mine)
-        for number, forces, turning in system.held.shares(system.t0, system.t1, self.reaction):
+        for number, forces, turning in system.held.shares(system.step.start, system.step.end, self.reaction):
             if number in numbers:
                 row = local[numbers.index(number)]
                 row[:3] = np.cross(x[system.held.vertices(number)], forces).sum(axis=0)

@@ -120,20 +120,20 @@ class EndForces:
             x0, v0 = (layout.extended(values) for values in (x0, v0))
         x1, v1, n, self._end = system.x, system.v, layout.n_owned, {}
         moved = x1[:n] - x0[:n]
-        moved[: layout.n_vertices] -= system.dt * self._drift
+        moved[: layout.n_vertices] -= system.step.dt * self._drift
         account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
         if uniform := self._moves_otherwise:
             # at the middle, the displacements of a rotation cause no strain
-            force = system.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / system.dt)
-            damping = force.take(system.prescribed.indices)
+            force = system.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / system.step.dt)
+            damping = force.take(system.step.prescribed.indices)
             uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
         work = self._load_work(x0, v0, x1, v1, moved) + self._handle_work(x0, x1, moved, damping)
         by_targets, rise, springs0, springs1 = self._target_works(x0, x1)
         # rounded positions at both ends of a step differ in energy, and in velocity
         largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        stiff = (self._stiffness_sum + float(system.mass.sum()) / system.dt**2) * largest**2
-        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, system.t0)
-        local = *energies, self._potential(x1, system.t1), work + by_targets, rise, springs0, springs1
+        stiff = (self._stiffness_sum + float(system.mass.sum()) / system.step.dt**2) * largest**2
+        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, system.step.start)
+        local = *energies, self._potential(x1, system.step.end), work + by_targets, rise, springs0, springs1
         sums = layout.global_sum(*local, stiff, uniform_heat).tolist()
         free0, all0, free1, all1, potential0, potential1, work, rise, springs0, springs1, stiff, warm = sums
         before, after = account.before, account.after
@@ -159,7 +159,7 @@ class EndForces:
     def _kinetic(self, v: Array) -> tuple[float, float]:
         """Kinetic energy [J] of this rank's free coordinates, and of all, at velocities v (n_local, 3)."""
         system = self._system
-        at, square = system.prescribed.indices, np.square(v[: len(system.mass)] - self._drift)
+        at, square = system.step.prescribed.indices, np.square(v[: len(system.mass)] - self._drift)
         driven, whole = np.vdot(system.mass.take(at // 3), square.take(at)), np.sum(system.mass @ square)
         return 0.5 * float(whole - driven), 0.5 * float(whole)
 
@@ -177,7 +177,7 @@ class EndForces:
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
         """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
         system = self._system
-        step = UpcomingStep(system.t0, system.t1, at, x, system.reference.at)
+        step = UpcomingStep(system.step.start, system.step.end, at, x, system.reference.at)
         return {term: term.freeze(step) for term in terms}
 
     def _target_works(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
@@ -187,12 +187,12 @@ class EndForces:
         system, rise, springs = self._system, 0.0, [0.0, 0.0]
         contact, work = system.contact, system.contact_impulses.work if system.contact_impulses else 0.0
         if contact is not None and contact.obstacles_move:
-            for x, time in ((x0, system.t0), (x1, system.t1)):
-                work += 0.5 * contact.barrier.work(x, time, system.t0, system.t1)
+            for x, time in ((x0, system.step.start), (x1, system.step.end)):
+                work += 0.5 * contact.barrier.work(x, time, system.step.start, system.step.end)
         barrier = None if contact is None else contact.barrier
         turning = [term for term in self._targets if term.n_elements and term is not barrier]
-        first = self._frozen(turning, system.t0, x0)
-        last = self._frozen(turning, system.t1, x1)
+        first = self._frozen(turning, system.step.start, x0)
+        last = self._frozen(turning, system.step.end, x1)
         for term in turning:
             frozen = first[term], last[term]
             before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
@@ -205,7 +205,7 @@ class EndForces:
             if not term.registration.energy:
                 springs = [springs[0] + before, springs[1] + after]
         if self._drift.any():
-            work += system.dt * float(self._force_of_targets(x0, x1) @ self._drift)
+            work += system.step.dt * float(self._force_of_targets(x0, x1) @ self._drift)
         return work, rise, springs[0], springs[1]
 
     def _force_of_targets(self, x0: Array, x1: Array) -> Array:
@@ -214,14 +214,14 @@ class EndForces:
         both: list[Elastic] = [term for term in self._targets if not term.registration.of_contact]
         if contact is not None:
             both.append(contact.barrier)
-        for x, time in ((x0, system.t0), (x1, system.t1)):
+        for x, time in ((x0, system.step.start), (x1, system.step.end)):
             for term, frozen in self._frozen(both, time, x).items():
                 term.add_gradient(x, frozen, force)
         force *= 0.5
         if contact is not None and contact.friction is not None:
             # by the force at the stage, which the impulses complete
             friction = contact.friction
-            friction.add_gradient(system.evaluated.x, system.active.frozen[friction], force)
+            friction.add_gradient(system.evaluated.x, system.step.frozen[friction], force)
         total: Array = force[: system.points.n_vertices].sum(axis=0)
         return total + (system.contact_impulses.loads[:, :3].sum(axis=0) if system.contact_impulses else 0.0)
 
@@ -233,7 +233,7 @@ class EndForces:
         force = np.zeros_like(x1)
         for load in self._forces:
             for x in (x0, x1) if load.is_follower else (x1, x1):
-                load.add_force(x, system.t0, system.t1, force)
+                load.add_force(x, system.step.start, system.step.end, force)
         n = len(moved)
         force = force[:n]
         if system.active.viscous:
@@ -241,20 +241,20 @@ class EndForces:
             force -= self._wind(x0, v0, n) if start is None else start
             self._end["wind"] = end = self._wind(x1, v1, n)
             force -= end
-        free = np.where(system.prescribed.free, moved, 0.0)
+        free = np.where(system.step.prescribed.free, moved, 0.0)
         return 0.5 * float(np.vdot(force, free))
 
     def _wind(self, x: Array, v: Array, n: int) -> Array:
         """Gradient (n, 3) [N] of the wind's potential at x and v (n_local, 3)."""
         system, out = self._system, np.zeros_like(x)
         for term in system.active.viscous:
-            step = UpcomingStep(system.t0, system.t1, system.t0, x, system.reference.at)
+            step = UpcomingStep(system.step.start, system.step.end, system.step.start, x, system.reference.at)
             term.add_gradient(v, term.freeze(step), out)
         return out[:n]
 
     def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
         """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
-        system, at = self._system, self._system.prescribed.indices
+        system, at = self._system, self._system.step.prescribed.indices
         displacement = moved.take(at)
         if not displacement.any():
             return 0.0
@@ -264,11 +264,11 @@ class EndForces:
         self._end["pull"] = end
         force = 0.5 * (start + end).take(at)
         targets, weight = np.zeros_like(x1), np.zeros_like(x1)
-        for time, x in ((system.t0, x0), (system.t1, x1)):
+        for time, x in ((system.step.start, x0), (system.step.end, x1)):
             for term, frozen in self._frozen(self._targets, time, x).items():
                 term.add_gradient(x, frozen, targets)
         for load in self._weights:
-            load.add_force(x1, system.t0, system.t1, weight)
+            load.add_force(x1, system.step.start, system.step.end, weight)
         force += 0.5 * targets.ravel()[at] - weight.ravel()[at] + damping
         if system.contact_impulses:
             force += system.contact_impulses.handle_force
@@ -278,5 +278,5 @@ class EndForces:
     def _stiffness_sum(self) -> float:
         """Sum [N/m] of the stiffnesses of this rank's elements."""
         if self._stiffness is None:
-            self._stiffness = sum(float(each.sum()) for each in self._system.stiffnesses.values())
+            self._stiffness = sum(float(each.sum()) for each in self._system.forces.stiffnesses.values())
         return self._stiffness

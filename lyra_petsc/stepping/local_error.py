@@ -58,12 +58,12 @@ class LocalError:
             error = system.integrator.error_constant * dt**3 * third
         # edge unknowns follow the vertices and have no error of their own
         vertices = slice(0, system.points.n_vertices)
-        largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.prescribed.free[vertices]))
+        largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.step.prescribed.free[vertices]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
     def record_step(self, v_before: Array, dt: float) -> None:
         """Record the slope of the accepted step."""
-        if self._system.usual.order > 1:
+        if self._system.integrators.usual.order > 1:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
 

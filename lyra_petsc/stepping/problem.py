@@ -489,7 +489,7 @@ def refuse_overrun(system: StageEquations, scene: Scene, when: str) -> None:
     InputError
         Names the worst element.
     """
-    frozen = system.active.frozen
+    frozen = system.step.frozen
     worst = max((term.overrun(system.x, frozen[term]) for term in system.active.limiting), default=(0.0, ""))
     _, text = max(system.points.comm.allgather(worst))
     if text:
@@ -509,7 +509,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: flo
         return
     from lyra_petsc.contact.nearest_pair import nearest_pair
 
-    near = nearest_pair(contact, system.x, system.active.frozen[contact.barrier])
+    near = nearest_pair(contact, system.x, system.step.frozen[contact.barrier])
     if near is None or near.gap > minimum:
         return
     distance, remedy = "not apart", "move them apart"

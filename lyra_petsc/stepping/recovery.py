@@ -138,24 +138,28 @@ def _iterations_key() -> str:
 
 def _contact_integrator_waits(run: SteppedScene, step: RejectedStep) -> bool:
     system = run.problem.system
-    return system.integrator is system.usual is not system.in_contact
+    return system.integrator is system.integrators.usual is not system.integrators.in_contact
 
 
 def _take_contact_integrator(run: SteppedScene, step: RejectedStep) -> None:
-    run.problem.system.integrator = run.problem.system.in_contact
+    run.problem.system.integrators.take(run.problem.system.integrators.in_contact)
 
 
 def _is_substitute(run: SteppedScene) -> bool:
     """Whether backward Euler takes the place of the scene's integrators."""
     system = run.problem.system
-    return system.integrator not in (system.usual, system.in_contact)
+    return system.integrator not in (system.integrators.usual, system.integrators.in_contact)
 
 
 def _backward_euler_may_help(run: SteppedScene, step: RejectedStep) -> bool:
     """The midpoint rule, which conserves angular momentum, is not replaced because of a gain."""
     system = run.problem.system
     kept = step.trouble is Trouble.GAIN and system.integrator.moves_uniformly
-    return system.usual.dynamic and system.usual.name != "beuler" and not (kept or _is_substitute(run))
+    return (
+        system.integrators.usual.dynamic
+        and system.integrators.usual.name != "beuler"
+        and not (kept or _is_substitute(run))
+    )
 
 
 def _is_unresolved(run: SteppedScene, step: RejectedStep) -> bool:
@@ -177,7 +181,9 @@ def _follows_jump(run: SteppedScene, step: RejectedStep) -> bool:
 
 def _take_backward_euler(run: SteppedScene, step: RejectedStep) -> None:
     system = run.problem.system
-    system.integrator = LaggedBackwardEuler() if system.usual.lagged_loads else BackwardEuler()
+    system.integrators.take(
+        LaggedBackwardEuler() if system.integrators.usual.lagged_loads else BackwardEuler()
+    )
     if step.trouble is Trouble.UNRESOLVED:
         return
     why = "finds no collision-free step"
@@ -187,7 +193,7 @@ def _take_backward_euler(run: SteppedScene, step: RejectedStep) -> None:
     touches = system.has_active_pairs and not _follows_jump(run, step)
     run.run_notes.once(
         "impact" if touches else "energy",
-        f"{_at(run)}: {system.usual.name} {why}{' in contact' if touches else ''}; "
+        f"{_at(run)}: {system.integrators.usual.name} {why}{' in contact' if touches else ''}; "
         "such steps are repeated by backward Euler",
     )
 

@@ -19,7 +19,7 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
     With them `resume` continues as if the run had never stopped.
     """
     system, time = run.problem.system, run.time
-    arrays, integrator = system.saved_histories()
+    arrays, integrator = system.integrators.saved_state()
     balance, budget = run.energy_balance.saved_state()
     of_stepper, stepper = run.stepper.saved_state(time)
     arrays = arrays | balance | of_stepper
@@ -72,7 +72,7 @@ def resume(
     run.control.restore(scalars)
     if run.equilibrium is not None:
         run.equilibrium.restore(arrays, scalars["equilibrium"], run.time)
-    system.restore_histories(arrays, scalars["integrator"])
+    system.integrators.restore(arrays, scalars["integrator"])
     if run.guard is not None:
         run.guard.restore(scalars["energy"], same=scalars["scheme"] == run.scene.time.scheme)
     if run.accuracy is not None:

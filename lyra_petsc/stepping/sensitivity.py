@@ -35,6 +35,8 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping import edge_solve
+from lyra_petsc.stepping.edge_solve import EdgeSolve
 from lyra_petsc.stepping.energy_balance import EnergyBalance
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.problem import Problem, build_problem
@@ -101,6 +103,12 @@ class Neighbour:
     energy_balance: EnergyBalance | None = None
     jacobian: Array | None = None
     prescribed_force: Array | None = None
+    edges: EdgeSolve | None = None
+
+    def end_edges(self, v: Array) -> None:
+        """End the solve for its edges' unknowns at velocities v (n_owned, 3) [m/s]; collective."""
+        assert self.edges is not None
+        self.edges.end(self.system, self.system.evaluate(v))
 
     @property
     def system(self) -> StageEquations:
@@ -216,10 +224,10 @@ class Sensitivities:
         for neighbour in neighbours:
             system = neighbour.system
             if self._static:
-                system.applied.factor = 0.0
+                system.take_loads(factor=0.0)
                 system.begin_step(0.0, 0.0)
-                if self._system.applied.unbalanced is not None:
-                    system.applied.unbalanced = -system.out_of_balance()
+                if self._system.load_case.unbalanced is not None:
+                    system.take_loads(unbalanced=-system.out_of_balance())
             if reactions:
                 neighbour.energy_balance = EnergyBalance(system)
         self.tangents.append(tangent)
@@ -229,26 +237,26 @@ class Sensitivities:
         system, n = self._system, self._system.points.n_owned
         start, vertices = system.x[:n].copy(), self._system.points.n_vertices
         frames = [term.frames for term in _edged(system)]
-        system.initial_edge_moments()
-        system.begin_edge_solve(start)
+        edge_solve.initial_moments(system)
+        edges = EdgeSolve.begin(system, start)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
                 change = each.offset * delta
                 each.system.state.set(start + change * tangent.x, system.v[:n] + change * tangent.v)
                 for term, own in zip(_edged(each.system), frames, strict=True):
                     term.frames = own
-                each.system.initial_edge_moments()
-                each.system.begin_edge_solve(start + change * tangent.x)
+                edge_solve.initial_moments(each.system)
+                each.edges = EdgeSolve.begin(each.system, start + change * tangent.x)
                 self._use_frames(each.system, frames)
         still = np.zeros_like(start)
         with self._solver(still, set_up=True, keep=False) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, still):
-                    each.system.end_edge_solve(each.system.evaluate(v))
+                    each.end_edges(v)
                     self._change_frames(each.system)
                 rates = _difference(neighbours, delta, lambda each: each.system.x[:n])
                 tangent.x[vertices:] = rates[vertices:]
-        system.end_edge_solve(system.evaluate(still))
+        edges.end(system, system.evaluate(still))
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -283,11 +291,11 @@ class Sensitivities:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each in neighbours:
                     if taken is not usual:
-                        each.system.integrator = type(taken)()
+                        each.system.integrators.take(type(taken)())
                     self._begin_step(each, before, tangent, delta, end, semi=semi)
                 for each, v in self._solve_stages(solve, neighbours, delta, velocity):
                     each.system.accept(each.system.evaluate(v))
-        if system.solves_edges_at_end:
+        if edge_solve.is_needed(system):
             self._differentiate_edges(before)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
@@ -319,8 +327,8 @@ class Sensitivities:
             start = np.zeros_like(before.x)
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()
-            system.jacobian(system.linearised(start), 1.0, each.jacobian)
-            each.prescribed_force = system.prescribed_force
+            at = system.linearised(start)
+            each.prescribed_force = system.forces.jacobian(at, 1.0, each.jacobian)
 
     def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
         """Set the frames of a neighbour's directors.
@@ -328,19 +336,19 @@ class Sensitivities:
         They are its own, or those of the simulation if it has updated its frames since the ``started`` ones.
         """
         pairs = zip(_edged(system), _edged(self._system), started, strict=True)
-        used = [(mine, self._system.directors.frozen_in_step[theirs], start) for mine, theirs, start in pairs]
+        frozen = self._system.directors.frozen_in_step or self._system.step.frozen
+        used = [(mine, frozen[theirs], start) for mine, theirs, start in pairs]
         found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
-            system.active.refreeze(found)
-            system.change()
+            system.refreeze(found)
 
     def _solve_stages(
         self, solve: Callable[[Array], Array], neighbours: Neighbours, delta: float, velocity: Array
     ) -> list[tuple[Neighbour, Array]]:
         """Solve for the velocities (n_owned, 3) of the stages of a number's neighbours."""
-        change = _difference(neighbours, delta, lambda each: each.system.prescribed.velocity)
+        change = _difference(neighbours, delta, lambda each: each.system.step.prescribed.velocity)
         prescribed = np.zeros_like(velocity)
-        self._system.prescribed.overwrite(prescribed, change)
+        self._system.step.prescribed.overwrite(prescribed, change)
         derivative = partial(self._stage_derivative, neighbours, delta, velocity)
         dv = self._solve_affine(solve, derivative, prescribed, delta)
         stages = []
@@ -367,7 +375,7 @@ class Sensitivities:
         return self._free(_difference(neighbours, delta, residual))
 
     def _free(self, values: Array) -> Array:
-        return np.where(self._system.prescribed.free, values, 0.0)
+        return np.where(self._system.step.prescribed.free, values, 0.0)
 
     def _update_tangent(self, tangent: Tangent, neighbours: Neighbours, delta: float) -> None:
         """Compute the derivatives of the state from the states of the neighbours."""
@@ -387,7 +395,7 @@ class Sensitivities:
         changed = False
         for term, reference in zip(_edged(system), _edged(self._system), strict=True):
             indices, ends, length, _ = term.of_edges
-            old: Frames = system.active.frozen[term]
+            old: Frames = system.step.frozen[term]
             new = reference.frames
             if old is new:
                 continue
@@ -409,17 +417,17 @@ class Sensitivities:
     def _differentiate_edges(self, before: _StepStart) -> None:
         """Solve for the edges' unknowns at the end of the step of all neighbours."""
         system, n = self._system, self._system.points.n_owned
-        system.begin_edge_solve(before.x)
-        rates = (system.x[:n] - before.x) / system.stage.c
+        edges = EdgeSolve.begin(system, before.x)
+        rates = (system.x[:n] - before.x) / system.step.stage.c
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
-                each.system.begin_edge_solve(before.x + each.offset * delta * tangent.x)
+                each.edges = EdgeSolve.begin(each.system, before.x + each.offset * delta * tangent.x)
                 self._use_frames(each.system, before.frames)
         with self._solver(rates, set_up=True, keep=False) as solve:
             for neighbours, delta in zip(self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, rates):
-                    each.system.end_edge_solve(each.system.evaluate(v))
-        system.end_edge_solve(system.evaluate(rates))
+                    each.end_edges(v)
+        edges.end(system, system.evaluate(rates))
 
     # -- equilibria --------------------------------------------------------------------------------
 
@@ -433,14 +441,14 @@ class Sensitivities:
         pseudo = integrator.pseudo_dt
         integrator.pseudo_dt = math.sqrt(MAX_GROWTH) * self._fall_time()
         system.begin_step(now.before, now.factor)
-        reach = system.stage.c
+        reach = system.step.stage.c
         with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 # sets the goals of handles
                 self._force_derivative(now, neighbours, delta, np.zeros_like(now.x))
                 prescribed = np.zeros_like(now.x)
-                change = _difference(neighbours, delta, lambda each: each.system.prescribed.goal)
-                system.prescribed.overwrite(prescribed, change)
+                change = _difference(neighbours, delta, lambda each: each.system.step.prescribed.goal)
+                system.step.prescribed.overwrite(prescribed, change)
                 _drop_roundoff(prescribed, now.x, delta)
                 forces = partial(self._force_derivative, now, neighbours, delta)
                 tangent.x = self._solve_affine(lambda r: reach * solve(r), forces, prescribed, delta)
@@ -462,7 +470,7 @@ class Sensitivities:
             system.state.set(now.x + each.offset * delta * dx, np.zeros_like(now.x))
             for term, frames in zip(_edged(system), now.frames, strict=True):
                 term.frames = frames
-            system.applied.factor = self._system.applied.factor
+            system.take_loads(factor=self._system.load_case.factor)
             system.begin_step(now.before, now.factor)
             return -system.out_of_balance()
 
@@ -471,7 +479,7 @@ class Sensitivities:
     def _fall_time(self) -> float:
         """Time [s] in which the loads move a sheet of this mass by its size."""
         system = self._system
-        loads, mass = np.linalg.norm(system.applied.force), system.mass.sum()
+        loads, mass = np.linalg.norm(system.step.loads.force), system.mass.sum()
         force, total = system.points.global_sum(float(loads) ** 2, float(mass))
         return math.sqrt(self.simulation.problem.whole.size * total / math.sqrt(force)) if force else 1.0
 

@@ -21,6 +21,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping import contact_steps
 from lyra_petsc.stepping.accuracy import Accuracy
 from lyra_petsc.stepping.compression_watch import CompressionWatch
 from lyra_petsc.stepping.energy_balance import Budget, EnergyBalance
@@ -211,7 +212,7 @@ class SteppedScene:
         v_owned = v_before[: self.problem.points.n_owned]
         newton = linear = rejected = gains = 0
         jumps, failed = False, []
-        system.integrator = system.in_contact if system.touches else system.usual
+        system.integrators.take(system.integrators.in_contact if system.touches else system.integrators.usual)
         while True:
             end = self.control.next_end(self.time)
             dt, histories = end - self.time, self._histories()
@@ -232,10 +233,10 @@ class SteppedScene:
             gains += trouble is Trouble.GAIN
             rejected += 1
         self.last_integrator = system.integrator
-        if system.integrator is system.in_contact is not system.usual and system.usual.iterates:
-            name = system.in_contact.name
-            note = f"{name} takes the steps in which something touches or nears a limit"
-            self.run_notes.once("in contact", note)
+        usual, in_contact = system.integrators.usual, system.integrators.in_contact
+        if system.integrator is in_contact is not usual and usual.iterates:
+            text = f"{in_contact.name} takes the steps in which something touches or nears a limit"
+            self.run_notes.once("in contact", text)
         if self.accuracy is not None:
             self.accuracy.record_step(v_owned, dt, self.step_number, self.time, self.run_notes)
         system.follow_step(v_owned)
@@ -254,7 +255,7 @@ class SteppedScene:
                 self.energy_balance.record(x_before[: len(v_owned)])
         note_step(self, attempt)
         for term in system.active.stateful:
-            term.accept(system.x, system.active.frozen[term])
+            term.accept(system.x, system.step.frozen[term])
         system.set_references(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
@@ -269,7 +270,7 @@ class SteppedScene:
         if not attempt.converged:
             return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
         system, n = self.problem.system, self.problem.points.n_owned
-        if not (system.resolves_contact() if system.suits_contact else not system.touches_at_stage):
+        if not contact_steps.is_resolved(system):
             return Trouble.UNRESOLVED
         if self.accuracy is not None and not self.accuracy.accepts(v_before[:n], dt):
             return Trouble.INACCURATE
@@ -284,13 +285,13 @@ class SteppedScene:
     def _histories(self) -> tuple[Any, Any]:
         """Histories of the integrators and of the local error, for `_return_to`."""
         accuracy = self.accuracy
-        return self.problem.system.saved_histories(), accuracy and accuracy.local_error.saved_state()
+        return self.problem.system.integrators.saved_state(), accuracy and accuracy.local_error.saved_state()
 
     def _return_to(self, x: Array, v: Array, integrators: Any, error: Any) -> None:
         """Return to positions and velocities (n_local, 3) and histories before the step."""
         system, n = self.problem.system, self.problem.points.n_owned
         system.state.set(x[:n], v[:n])
-        system.restore_histories(*integrators)
+        system.integrators.restore(*integrators)
         if self.accuracy is not None:
             self.accuracy.local_error.restore(*error)
         self.stepper.start(self.time, self.step_number)

@@ -8,11 +8,13 @@ import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.integrator import NeedsAcceleration
-from lyra_petsc.terms.term import UpcomingStep
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.stage_equations import StageEquations
 
+
+JUST_AFTER = 1e-3
+"""Part of a step after which handles have the velocities with which it starts."""
 
 MAX_ITERATIONS = 100
 """Largest number of iterations for the rates of directors, whose equations are well-conditioned."""
@@ -26,7 +28,6 @@ class StartAcceleration:
 
     Parameters
     ----------
-    system : StageEquations
     events : list of float
         Times [s] at which forces may jump.
 
@@ -41,78 +42,84 @@ class StartAcceleration:
 
     starts_anew = False
 
-    def __init__(self, system: StageEquations, events: list[float]) -> None:
-        self._system, self._events = system, events
+    def __init__(self, events: list[float]) -> None:
+        self._events = events
         self.followers: list[NeedsAcceleration] = []
 
-    def begin_step(self, at: float) -> None:
+    def begin_step(self, system: StageEquations, at: float) -> None:
         """Compute accelerations at the start of the step where they are needed; collective.
 
         ``at`` [s] is the time of the step's stage. Whether forces jump at the start of the step is decided by
         its time alone, so that a resumed run decides alike.
         """
-        system = self._system
         everyone = (system.integrator, *self.followers)
-        jumping = {system.usual, system.in_contact, *everyone}
+        jumping = {system.integrators.usual, system.integrators.in_contact, *everyone}
         # the start of a step may differ from the time of an event by round-off
-        if any(abs(system.t0 - event) <= 1e-6 * system.dt for event in self._events):
+        if any(abs(system.step.start - event) <= 1e-6 * system.step.dt for event in self._events):
             for each in jumping:
                 each.restart()
         self.starts_anew = system.integrator.needs_acceleration
         asking = [each for each in everyone if each.needs_acceleration]
         if not asking:
             return
-        acceleration = self._computed(at)
+        acceleration = _computed(system, at)
         for each in asking:
             each.set_acceleration(acceleration)
 
-    def _computed(self, at: float) -> Array:
-        """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step; collective."""
-        system, active = self._system, self._system.active
-        x, v = system.frozen_positions(at), system.v.copy()
-        system.prescribed.overwrite_with_start_velocity(v[: system.points.n_owned])
-        system.points.update_ghosts(v)
-        turns = bool(active.moving or active.constraints)
-        if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
-            active.move_targets(UpcomingStep(system.t0, system.t1, system.t0, x, system.reference.at))
-        if system.damping.active and system.points.n_edges_global:
-            self._balance_moments(v)
-        force, mass = system.out_of_balance(v), system.mass[:, None]
-        if turns:
-            active.move_targets(UpcomingStep(system.t0, system.t1, at, x, system.reference.at))
-        acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
-        return system.held_by_friction(v, acceleration)
 
-    def _balance_moments(self, v: Array) -> None:
-        """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
+def _computed(system: StageEquations, at: float) -> Array:
+    """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step; collective."""
+    x, v, step, active = system.frozen_positions(at), system.v.copy(), system.step, system.active
+    if system.held and step.end > step.start:
+        # of handles just after the start, where they may jump
+        soon = step.start + JUST_AFTER * step.dt
+        rates = system.prescriptions.rates(step.prescribed, step.start, step.end, soon)
+        step.prescribed.overwrite(v[: len(system.mass)], rates)
+    system.points.update_ghosts(v)
+    turns = bool(active.moving or active.constraints)
+    if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
+        system.change(frozen=active.with_targets(step.frozen, system.targets_at(step.start, x)))
+    if system.damping.active and system.points.n_edges_global:
+        _balance_moments(system, v)
+    force, mass = system.out_of_balance(v), system.mass[:, None]
+    if turns:
+        system.change(frozen=step.frozen)
+    acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
+    if system.contact is None:
+        return acceleration
+    return system.contact.hold(system.step_end(v), acceleration, system.step.frozen)
 
-        Directors have no mass: damping balances their moments. Other rates would give the vertices the
-        accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
-        """
-        system, layout = self._system, self._system.points
-        edges, free = slice(layout.n_vertices, layout.n_owned), system.prescribed.free
-        diagonal, increment = np.zeros_like(v), np.zeros_like(v)
-        for term in system.active.with_edges:
-            if term.registration.damped:
-                damping = term.elements.data["damping"]
-                diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
-        scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
-        residual = system.out_of_balance(v)[edges]
-        direction = scale * residual
-        square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
-        for _ in range(MAX_ITERATIONS):
-            increment[edges] = direction
-            layout.update_ghosts(increment)
-            product = np.where(free, system.damping.product(increment), 0.0)[edges]
-            power = layout.global_sum(float(np.vdot(direction, product)))[0]
-            if not power > 0.0:
-                break
-            v[edges] += square / power * direction
-            residual -= square / power * product
-            before, square = square, layout.global_sum(float(np.vdot(residual, scale * residual)))[0]
-            if square <= ROUND_OFF**2 * first:
-                break
-            direction = scale * residual + square / before * direction
-        layout.update_ghosts(v)
-        system.v[edges] = v[edges]
-        system.state.update_ghosts()
+
+def _balance_moments(system: StageEquations, v: Array) -> None:
+    """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
+
+    Directors have no mass: damping balances their moments. Other rates would give the vertices the
+    accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
+    """
+    layout = system.points
+    edges, free = slice(layout.n_vertices, layout.n_owned), system.step.prescribed.free
+    diagonal, increment = np.zeros_like(v), np.zeros_like(v)
+    for term in system.active.with_edges:
+        if term.registration.damped:
+            damping = term.elements.data["damping"]
+            diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
+    scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
+    residual = system.out_of_balance(v)[edges]
+    direction = scale * residual
+    square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
+    for _ in range(MAX_ITERATIONS):
+        increment[edges] = direction
+        layout.update_ghosts(increment)
+        product = np.where(free, system.damping.product(increment), 0.0)[edges]
+        power = layout.global_sum(float(np.vdot(direction, product)))[0]
+        if not power > 0.0:
+            break
+        v[edges] += square / power * direction
+        residual -= square / power * product
+        before, square = square, layout.global_sum(float(np.vdot(residual, scale * residual)))[0]
+        if square <= ROUND_OFF**2 * first:
+            break
+        direction = scale * residual + square / before * direction
+    layout.update_ghosts(v)
+    system.v[edges] = v[edges]
+    system.state.update_ghosts()

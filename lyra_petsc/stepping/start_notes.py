@@ -48,7 +48,7 @@ def nothing_acts(
         for load in system.active.loads:
             load.add_force(system.x, t0, t1, force := np.zeros_like(system.x))
             acting += float(np.abs(force).max(initial=0.0))
-    gradient = system.active.gradient(system.active.elastic, system.x, system.points)
+    gradient = system.gradient_of(system.active.elastic, system.x)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
     if acting > 0.0 or square > floor**2:
         return []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
-from lyra_petsc.stepping.evaluation import Evaluation
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.time_step import Evaluation
 
 
 class State:
@@ -32,6 +36,13 @@ class State:
         layout = self._discretisation.layout
         for values in (self.x, self.v):
             layout.update_ghosts(values)
+
+    def set_edges(self, x: Array) -> None:
+        """Take the unknowns of edges from x (n_local, 3); collective."""
+        layout = self._discretisation.layout
+        rows = slice(layout.n_vertices, layout.n_owned)
+        self.x[rows] = x[rows]
+        self.update_ghosts()
 
     def resize(self) -> None:
         """Resize to the layout's present ghosts; collective."""

@@ -29,7 +29,10 @@ from lyra_petsc.linear.petsc_options import (
 from lyra_petsc.parallel import all_ranks_arrive
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.evaluation import Evaluation
+from lyra_petsc.stepping import contact_steps, edge_solve
+from lyra_petsc.stepping import motion_limits as limits
+from lyra_petsc.stepping.directors import turn_with_triangles, update_frames
+from lyra_petsc.stepping.edge_solve import EdgeSolve
 from lyra_petsc.stepping.newton.blend import Blend
 from lyra_petsc.stepping.newton.conditioning import expected_iterations
 from lyra_petsc.stepping.newton.convergence import Convergence
@@ -41,6 +44,7 @@ from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
 from lyra_petsc.stepping.newton.snes_callbacks import Newton
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.stepping.ts_options import hidden_options
 
 
@@ -134,7 +138,6 @@ class Stepper:
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
-        self._start: Array | None = None
         self._shape = (points.n_owned, 3)
         self._extrapolation = Extrapolation(points.comm)
         self._create_objects()
@@ -230,7 +233,7 @@ class Stepper:
             snes.setMonitor(
                 ContactMonitor(
                     system.contact,
-                    lambda v: (system.evaluate(v).x, system.active.frozen),
+                    lambda v: (system.evaluate(v).x, system.step.frozen),
                     lambda: newton.step_fraction,
                 )
             )
@@ -273,7 +276,7 @@ class Stepper:
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
-        if iteration > 0 and self._system.directors.update_frames(self._points.at(snes.getSolution()).x):
+        if iteration > 0 and update_frames(self._system, self._points.at(snes.getSolution()).x):
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
         self._follow_stencils()
@@ -327,23 +330,25 @@ class Stepper:
         with PETSc.Log.Event(FROZEN):
             system.begin_step(t0, t1)
         number = self.ts.getStepNumber()
-        before = system.x[: self._shape[0]].copy() if system.solves_edges_at_end else None
+        before = system.x[: self._shape[0]].copy() if edge_solve.is_needed(system) else None
         rate_before = system.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        blocked = WOULD_CROSS if not system.find_start() else BEYOND_LIMIT if not has_start(system) else ""
+        start, blocked = limits.find_start(system), ""
+        if start is None or not has_start(system, start):
+            blocked = WOULD_CROSS if start is None else BEYOND_LIMIT
         if blocked:
             self._trace.begin_solve()
             failed = self._trace.failed_solve(system.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=blocked, failed_solve=failed)
         n = self._shape[0]
-        solution, message = self._solve(t0)
+        solution, message = self._solve(t0, start)
         newton = linear = 0
         for _ in range(MAX_SOLVES - 1):
-            if solution is None or not (self._iterates and system.follow_contacts(solution)):
+            if solution is None or not (self._iterates and contact_steps.follow_contacts(system, solution)):
                 break
             newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
-            solution, message = self._solve(t0, solution.v[:n])
-        if solution is not None and not system.end_is_free(solution.v[:n]):
+            solution, message = self._solve(t0, start, solution.v[:n])
+        if solution is not None and not limits.end_is_free(system, solution.v[:n]):
             solution, message = None, WOULD_CROSS
         newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
         outcome = self._newton.convergence
@@ -354,7 +359,7 @@ class Stepper:
             system.accept(solution)
             if before is not None:
                 assert rate_before is not None
-                system.begin_edge_solve(before)
+                edges = EdgeSolve.begin(system, before)
                 rates, message = self._solve(t0)
                 newton, linear = (
                     newton + self.snes.getIterationNumber(),
@@ -362,7 +367,7 @@ class Stepper:
                 )
                 if rates is None:
                     failed, solution = self._trace.failed_solve(), None
-                system.end_edge_solve(rates)
+                edges.end(system, rates)
                 if rates is None:
                     system.state.set(before, rate_before)
         else:
@@ -390,9 +395,9 @@ class Stepper:
         """The solution, whose directors turn with their triangles if they turn far; collective."""
         system, staying = self._system, self._system.stationary_velocity()
         increment = solution.v[: len(staying)] - staying
-        if system.directors.turn_with_triangles(staying, increment):
+        if turn_with_triangles(system, staying, increment):
             solution = system.evaluate(staying + increment)
-        system.directors.update_frames(solution.x)
+        update_frames(system, solution.x)
         return solution
 
     def balance_edge_moments(self, floor: float) -> bool:
@@ -401,25 +406,30 @@ class Stepper:
         """
         system, n = self._system, self._shape[0]
         before = np.inf
-        while floor < (moments := system.initial_edge_moments()) < before:
+        while floor < (moments := edge_solve.initial_moments(system)) < before:
             before = moments if not self._iterates else 0.0
-            system.begin_edge_solve(system.x[:n].copy())
-            rates, _ = self._solve(system.t0)
-            system.end_edge_solve(rates)
-            self.start(system.t0, 0)
+            edges = EdgeSolve.begin(system, system.x[:n].copy())
+            rates, _ = self._solve(system.step.start)
+            edges.end(system, rates)
+            self.start(system.step.start, 0)
             if rates is None:
                 return False
         return True
 
-    def _solve(self, t0: float, start: Array | None = None) -> tuple[Evaluation | None, str]:
+    def _solve(
+        self, t0: float, start: Array | None = None, found: Array | None = None
+    ) -> tuple[Evaluation | None, str]:
         """The evaluation that solves the present stage, or None and why; collective.
 
-        ``start``: velocities (n_owned, 3) [m/s] of a solve of the stage with other contacts, where this one
-        starts.
+        ``start``, by default where the step starts, are velocities (n_owned, 3) [m/s] that no collision
+        hinders; ``found`` those of a solve of the stage with other contacts, where this one starts.
         """
-        system, stage, self._start = self._system, self._system.stage, start
+        system, stage = self._system, self._system.step.stage
+        if start is None:
+            system.prescribe(start := system.stationary_velocity())
+        self._starts = start, found
         self._follow_stencils()
-        self.velocity.setArray(system.history.ravel())
+        self.velocity.setArray(system.step.v_h.ravel())
         # a TS step whose stage is at the integrator's time and whose shift is the integrator's σ
         theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
@@ -465,7 +475,9 @@ class Stepper:
         velocity = reached.getArray(readonly=True).reshape(self._shape)
         if system.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
-        return self._points.at(reached) if system.evaluates_iterates else system.evaluate(velocity), ""
+        return self._points.at(reached) if self._iterates or system.step.of_edges else system.evaluate(
+            velocity
+        ), ""
 
     def _next_may_help(self, error: Exception) -> bool:
         """Whether an error of PETSc's on all ranks is one of this preset's set-up, not of a user's option,
@@ -552,19 +564,22 @@ class Stepper:
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
         v = u.getArray(readonly=True).reshape(self._shape)
-        self._system.residual(v, self._points.at(u), f.getArray().reshape(self._shape))
+        self._system.forces.residual(v, self._points.at(u), f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
-        if self._start is not None:
-            guess[:] = self._start
+        start, found = self._starts
+        if found is not None:
+            guess[:] = found
             return
-        if first_guess(self._system, guess):
-            self._newton.curve_guess(self._system.stationary_velocity(), guess)
+        if first_guess(self._system, start, guess):
+            self._newton.curve_guess(self._system.stationary_velocity(), start, guess)
         if not self._iterates:
             # the linear solve starts from the extrapolation; its tolerance stays relative to the full step
             system = self._system
-            ahead = self._extrapolation.extrapolate(system.t1, system.t0, system.v[: len(guess)])
+            ahead = self._extrapolation.extrapolate(
+                system.step.end, system.step.start, system.v[: len(guess)]
+            )
             system.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 

@@ -96,7 +96,7 @@ def restore_changing(
     friction = None if system.contact is None else system.contact.friction
     if friction is not None and friction.name in elements:
         friction.restore_pairs(*_send_to_owners(system, *elements[friction.name]), places)
-        friction.initialise_pairs(system.x, system.active.frozen[friction])
+        friction.initialise_pairs(system.x, system.step.frozen[friction])
 
 
 def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:

@@ -119,7 +119,7 @@ class Watched:
         system = self.system
         x = system.evaluated.x if x is None else x
         force = np.zeros((system.points.n_local, 3))
-        self.term.add_gradient(x, system.active.frozen[self.term], force)
+        self.term.add_gradient(x, system.step.frozen[self.term], force)
         own = -force[: system.points.n_owned]
         largest = self.comm.allreduce(float(np.abs(own).max(initial=0.0)), MPI.MAX)
         return np.asarray(system.points.global_sum(*own.sum(axis=0))), largest
@@ -247,7 +247,7 @@ def test_forces_balance_at_boundaries_between_ranks(comm: MPI.Comm) -> None:
             assert largest > 0.1
             assert np.abs(total).max() <= 1e-12 * largest
             force = np.zeros((run.system.points.n_local, 3))
-            run.term.add_gradient(x, run.system.active.frozen[run.term], force)
+            run.term.add_gradient(x, run.system.step.frozen[run.term], force)
             own = force[: run.system.points.n_owned]
             return on.allreduce(run.term.n_owned), gathered(run.system.points, own)
 

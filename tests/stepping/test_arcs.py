@@ -27,7 +27,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
     """Zero velocities, and the increment that is tangential to a rotation about the origin."""
     system, n = simulation.problem.system, simulation.problem.points.n_vertices
     system.begin_step(0.0, 1.0)
-    increment = np.zeros_like(system.history)
+    increment = np.zeros_like(system.step.v_h)
     increment[:n] = angle * np.cross(AXIS, system.x[:n])
     for term in system.active.with_edges:
         places = term.edge_indices
@@ -35,7 +35,7 @@ def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndar
         increment.reshape(-1)[places[own]] = (
             angle * (term.of_edges.length * (term.frames.direction @ AXIS))[own]
         )
-    return system.stationary_velocity(), increment / system.stage.c
+    return system.stationary_velocity(), increment / system.step.stage.c
 
 
 @pytest.mark.parallel(2, 3)
@@ -58,7 +58,7 @@ def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
 
     np.testing.assert_allclose(moved - middle(moved), turned - middle(turned), atol=1e-7)
     straight_end = there[0] + system.displacement(staying, increment)[1]
-    energy = [sum(float(t.energies(x, system.active.frozen[t]).sum()) for t in system.active.elastic)
+    energy = [sum(float(t.energies(x, system.step.frozen[t]).sum()) for t in system.active.elastic)
               for x in (there[0] + there[1], straight_end)]  # fmt: skip
     bending, tangent = (comm.allreduce(each) for each in energy)
     assert bending < 1e-9 * tangent

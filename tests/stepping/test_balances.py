@@ -59,7 +59,7 @@ def bracket(simulation: Simulation, before: Array) -> float:
     gradient = np.zeros_like(system.x)
     for term in system.active.elastic:
         if term.name != "spring":
-            frozen = system.active.frozen[term]
+            frozen = system.step.frozen[term]
             change += float(term.energies(system.x, frozen).sum() - term.energies(before, frozen).sum())
             term.add_gradient(system.x, frozen, gradient)
     change -= float(np.vdot(gradient[:n], system.x[:n] - before[:n]))

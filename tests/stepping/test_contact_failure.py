@@ -203,7 +203,7 @@ def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm)
         simulation = SteppedScene(comm, scene_of(scene | {"obstacles": obstacles}))
         simulation.step()
         system = simulation.problem.system
-        x, frozen = system.evaluated.x, system.active.frozen[system.contact.barrier]
+        x, frozen = system.evaluated.x, system.step.frozen[system.contact.barrier]
         nearest, obstacle = (find(system.contact, x, frozen) for find in (blocking_pair, nearest_obstacle))
         assert nearest is not None
         assert not nearest.obstacle

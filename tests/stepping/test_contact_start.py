@@ -153,7 +153,7 @@ def test_nearer_than_thickness(comm: MPI.Comm) -> None:
     with Simulation(scene | {"contact": {"gap": 0.02, "thickness": 0.002}}, comm) as simulation:
         system, contact = simulation.system, simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)
-        energies = contact.energies(system.x, system.active.frozen[contact])
+        energies = contact.energies(system.x, system.step.frozen[contact])
         total = comm.allreduce(float(energies.sum()))
     # 16 vertices inside the gap, in the first state, before any step
     stiffness, left, gap = contact.barrier.stiffness, 0.001, 0.02

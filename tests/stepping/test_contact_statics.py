@@ -156,7 +156,7 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     allowed = (
         MU
         * RADIUS
-        * float(term.find_contacts(system.x, system.active.frozen[term].stage, term.n_owned)[2].sum())
+        * float(term.find_contacts(system.x, system.step.frozen[term].stage, term.n_owned)[2].sum())
     )
     simulation.destroy()
     assert newton < 250

@@ -83,7 +83,7 @@ def test_a_part_touches_as_the_whole(comm: MPI.Comm, shared_tmp: Path, name: str
             system, term = run.problem.system, run.problem.terms["contact"]
             while not run.finished:
                 run.step()
-                here = float(term.energies(system.x, system.active.frozen[term]).sum())
+                here = float(term.energies(system.x, system.step.frozen[term]).sum())
                 energies.append([comm.allreduce(here), run.budget.dissipation, run.budget.membrane])
                 forces.append(run.energy_balance.obstacle_forces(len(scene.get("obstacles", {})))[:, 2])
             x = shape(run)
@@ -144,7 +144,7 @@ def test_a_part_touches_its_image_as_the_whole_itself(
             run.energy_balance.measure()
             while not run.finished:
                 run.step()
-                here = float(term.energies(system.x, system.active.frozen[term]).sum())
+                here = float(term.energies(system.x, system.step.frozen[term]).sum())
                 energies.append([comm.allreduce(here), run.budget.dissipation, run.budget.membrane])
                 if (gap := run.energy_balance.columns()["smallest_gap"]) < 0.9 * GAP:
                     apart.append(gap)

@@ -17,6 +17,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.failure.failure_report import Failure
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.statics import equilibrium
+from lyra_petsc.stepping.time_step import Evaluation
 
 pytestmark = pytest.mark.parallel(2)
 
@@ -46,13 +47,13 @@ def failing(
     with stepped(comm, {**SCENE, **scene}, **direct | dict(petsc)) as simulation:
         if spoil is not None:
             system = simulation.problem.system
-            plain = system.residual
+            plain = system.forces.residual
 
-            def spoiled(v: Array, vdot: Array, out: Array) -> None:
-                plain(v, vdot, out)
+            def spoiled(v: Array, at: Evaluation, out: Array) -> None:
+                plain(v, at, out)
                 spoil(simulation, out)
 
-            system.residual = spoiled  # type: ignore[method-assign]
+            system.forces.residual = spoiled  # type: ignore[method-assign]
 
         def run() -> None:
             while not simulation.finished:

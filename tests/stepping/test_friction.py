@@ -231,7 +231,7 @@ def first_accelerations(comm: MPI.Comm, content: dict[str, Any]) -> Array:
     """Accelerations [m/s²] of all vertices with which the integrator for contact starts."""
     content = content | {"time": {"end": 0.02, "step": 0.02, "integrator": "alpha2"}}
     simulation = SteppedScene(comm, scene_of(content))
-    integrator, found = simulation.problem.system.in_contact, []
+    integrator, found = simulation.problem.system.integrators.in_contact, []
     keep = integrator.set_acceleration
 
     def set_acceleration(acceleration: Array) -> None:

@@ -346,7 +346,7 @@ def test_a_fading_handle_weakens_with_the_fourth_power(soft: bool) -> None:
             simulation.step(DT)
             t = step * DT
             block = np.empty((1, 1, 1, 3, 3))
-            spring.hessians(simulation.system.x, simulation.system.active.frozen[spring], 0, 1, 0.0, block)
+            spring.hessians(simulation.system.x, simulation.system.step.frozen[spring], 0, 1, 0.0, block)
             share = 1.0 if t <= 0.1 + 1e-12 else max(0.0, 1.0 - (t - 0.1) / 0.2) ** 4
             if not soft and t <= 0.1 + 1e-12:
                 share = 0.0  # held exactly: no spring yet

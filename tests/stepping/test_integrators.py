@@ -119,7 +119,9 @@ def test_handles_follow_their_motion_exactly(integrator: str, comm: MPI.Comm) ->
         held = simulation.system.held
         points = simulation.problem.points
         goal = start[points.mesh_vertices].copy()
-        simulation.system.prescribed.targets(simulation.time, simulation.time, simulation.time, goal)
+        goal[:] = simulation.system.prescriptions.positions(
+            simulation.time, simulation.time, simulation.time, goal
+        )
         for number in held.active(simulation.time, simulation.time):
             rows = held.vertices(number)
             np.testing.assert_allclose(simulation.system.x[rows], goal[rows], rtol=0, atol=1e-14)

@@ -14,6 +14,7 @@ from physics import CLOTH, grid, options, scene_of, shape, stepped
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.stepping.time_step import Evaluation
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
@@ -30,14 +31,14 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     time = {"end": 0.12, "step": step, "integrator": integrator}
     with stepped(comm, SCENE | {"time": time}) as simulation:
         system, attempts = simulation.problem.system, 0
-        residual = system.residual
+        residual = system.forces.residual
 
-        def spoiled(v: Array, vdot: Array, out: Array) -> None:
-            residual(v, vdot, out)
+        def spoiled(v: Array, at: Evaluation, out: Array) -> None:
+            residual(v, at, out)
             if attempts in fail:
                 out[:] = np.nan
 
-        system.residual = spoiled  # type: ignore[method-assign]
+        system.forces.residual = spoiled  # type: ignore[method-assign]
         begin = system.begin_step
 
         def counted(t0: float, t1: float) -> None:

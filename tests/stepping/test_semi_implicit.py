@@ -37,7 +37,7 @@ def paper_step(system: StageEquations, time: float, dt: float) -> Array:
     mass = np.repeat(system.mass, 3)
     a, force = np.diag(mass), np.zeros_like(x)
     for term in system.active.elastic:
-        frozen = system.active.frozen[term]
+        frozen = system.step.frozen[term]
         force -= gradient(term, x, frozen)
         damping = GAMMA if term.name != "spring" else 0.0
         stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
@@ -45,11 +45,11 @@ def paper_step(system: StageEquations, time: float, dt: float) -> Array:
     for load in system.active.loads:
         load.add_force(x, time, time + dt, force)
     for wind in system.active.viscous:
-        force -= gradient(wind, v_old, system.active.frozen[wind])
+        force -= gradient(wind, v_old, system.step.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()
-    free = ~system.prescribed.mask.ravel()
+    free = ~system.step.prescribed.mask.ravel()
     v = np.zeros(len(b))
-    v[~free] = system.prescribed.velocity
+    v[~free] = system.step.prescribed.velocity
     v[free] = np.linalg.solve(a[np.ix_(free, free)], b[free] - a[np.ix_(free, ~free)] @ v[~free])
     return v.reshape(x.shape)
 

@@ -121,10 +121,10 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
     system = simulation.problem.system
-    system.applied.factor, system.applied.unbalanced = 0.7, None
+    system.take_loads(factor=0.7, unbalanced=None)
     system.x[:, 0] *= 0.95
     system.begin_step(0.3, 0.7)
-    free = np.flatnonzero(system.prescribed.free)
+    free = np.flatnonzero(system.step.prescribed.free)
     add_exact_hessian(system, values := system.discretisation.rows.zeros())
     matrix = AssembledMatrix(system.points, system.discretisation.rows.pattern, "aij")
     matrix.set(values)

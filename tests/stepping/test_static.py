@@ -261,7 +261,7 @@ def test_a_static_analysis_starts_in_equilibrium(comm: MPI.Comm) -> None:
     with motion(comm, **still, time={"analysis": "static"}) as simulation:
         system, left = simulation.problem.system, []
         for factor in (0.0, 0.5, 1.0):
-            system.applied.factor = factor
+            system.take_loads(factor=factor)
             system.begin_step(0.0, factor)
             left.append(comm.allreduce(np.abs(system.out_of_balance()).max(initial=0.0), MPI.MAX))
         assert left[0] < 1e-12 * left[2]

@@ -75,7 +75,7 @@ def at_rest(
     terms = [
         term for term in system.active.elastic if term.name in ("membrane", "hinge", "bending", "midedge")
     ]
-    energy = sum(float(term.energies(system.x, system.active.frozen[term]).sum()) for term in terms)
+    energy = sum(float(term.energies(system.x, system.step.frozen[term]).sum()) for term in terms)
     found = gathered(simulation.problem.points, system.x), comm.allreduce(energy), simulation.notes
     simulation.destroy()
     return found

@@ -212,7 +212,7 @@ class BalanceRecorder:
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
         self._system = system = simulation.problem.system
-        self._identity = system.usual.name == "beuler"
+        self._identity = system.integrators.usual.name == "beuler"
         constraints = system.active.constraints
         self._sheet_terms = [term for term in system.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
@@ -229,7 +229,7 @@ class BalanceRecorder:
 
     def _frozen(self, terms: Iterable[Elastic]) -> Terms:
         """Terms with their present frozen data."""
-        return {term: self._system.active.frozen[term] for term in terms}
+        return {term: self._system.step.frozen[term] for term in terms}
 
     def balance(self, report: StepReport) -> StepBalance:
         """The balance of the step just accepted, which started from the state recorded last."""
@@ -248,7 +248,7 @@ class BalanceRecorder:
         turned, inner, free_dx, all_dx, energy_noise, forces, powers, heights = layout.global_sum(
             energy(self._frozen(self._turning), x0) - self._turning_energy,
             float(np.vdot(parts["internal"], dx[:n])),
-            float(np.sum(dx[:n] ** 2, where=system.prescribed.free)),
+            float(np.sum(dx[:n] ** 2, where=system.step.prescribed.free)),
             float(np.sum(dx[:n] ** 2)),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
@@ -282,7 +282,7 @@ class BalanceRecorder:
         """Norms [N] of the residual, its promised bound, its round-off floor and the driving forces, and the
         displacement [m] by these; keys are fields of `StepBalance`."""
         system, simulation = self._system, self._simulation
-        free = system.prescribed.free
+        free = system.step.prescribed.free
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
         squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
@@ -301,13 +301,15 @@ class BalanceRecorder:
         """The terms of the residual at the stage of the step, each (n_owned, 3) [N], evaluated again; and the
         internal forces and those of damping without the terms that act from outside.
         """
-        system, n, stage = self._system, self._system.points.n_owned, self._system.stage
+        system, n, stage = self._system, self._system.points.n_owned, self._system.step.stage
         # before impacts, which act after the equations are solved
         x, v, y = system.evaluated.x, system.evaluated.v, self._x
         if self._simulation.last_integrator.centred:
             vertices = system.points.are_vertices(system.points.global_number)
             y = y + np.where(vertices[:, None], stage.offset * self._v, 0.0)
-        step = UpcomingStep(system.t0, system.t1, system.t0 + stage.offset, y, system.reference.at)
+        step = UpcomingStep(
+            system.step.start, system.step.end, system.step.start + stage.offset, y, system.reference.at
+        )
         frozen = dict(self._frozen(system.active.elastic))
         if stage.offset < dt:  # moving targets are at the end of the step by now
             moved = (
@@ -317,13 +319,13 @@ class BalanceRecorder:
             frozen |= {term: term.freeze(step) for term in moved}
         force, wind = np.zeros_like(x), np.zeros_like(x)
         for load in system.active.loads:
-            load.add_force(y, system.t0, system.t1, force)
+            load.add_force(y, system.step.start, system.step.end, force)
         for term in system.active.viscous:
             term.add_gradient(v, term.freeze(step), wind)
-        rate = stage.sigma * (v[:n] - system.history)
+        rate = stage.sigma * (v[:n] - system.step.v_h)
         if stage.offset < dt:  # handles do not have the integrator's accelerations
-            at = system.prescribed.indices
-            system.prescribed.overwrite(rate, (system.v[:n] - system.history).take(at) / dt)
+            at = system.step.prescribed.indices
+            system.step.prescribed.overwrite(rate, (system.v[:n] - system.step.v_h).take(at) / dt)
         sheet: Terms = {term: frozen[term] for term in self._sheet_terms}
         # clamps and obstacles store energy, but exert external forces as they are fixed in space
         inner = {
@@ -384,7 +386,7 @@ class BalanceRecorder:
         n, rows = system.points.n_owned, slice(0, system.points.n_vertices)
         reaction = self._simulation.energy_balance.reaction
         if system.contact_impulses is not None:
-            at = system.prescribed.indices
+            at = system.step.prescribed.indices
             reaction.put(at, reaction.take(at) - system.contact_impulses.handle_force)
         internal, damping = within
         damped = dt * (sum(parts.values()) - internal - reaction)

@@ -179,7 +179,7 @@ def small_motions(trial: Trial) -> SmallMotions:
     values = rows.zeros()
     for term in problem.terms.values():
         if isinstance(term, Elastic):
-            rows.add_stiffness(term, system.x, system.active.frozen[term], 0.0, 1.0, values)
+            rows.add_stiffness(term, system.x, system.step.frozen[term], 0.0, 1.0, values)
     matrix = AssembledMatrix(points, problem.pattern, "aij", prefix="verify_")
     matrix.set(values)
     mine = csr_array(matrix.mat.getValuesCSR()[::-1], shape=(3 * n, 3 * points.n_global))

@@ -235,7 +235,7 @@ def explain_failure(
     if (contact := system.contact) is not None:
         from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
 
-        x, frozen = system.evaluated.x, system.active.frozen[contact.barrier]
+        x, frozen = system.evaluated.x, system.step.frozen[contact.barrier]
         near = blocking_pair(contact, x, frozen)
         obstacle = nearest_obstacle(contact, x, frozen) if near is not None and not near.obstacle else None
     static, kind = not system.integrator.dynamic, diagnosis.kind

@@ -25,6 +25,7 @@ from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.stepping.directors import match
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 
@@ -69,7 +70,7 @@ class Arcs:
 
     def turns_notably(self, increment: Array) -> bool:
         """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
-        return self._system.directors.largest_turn(increment * self._system.stage.c) > MIN_TURN
+        return self._system.directors.largest_turn(increment * self._system.step.stage.c) > MIN_TURN
 
     def curve(self, v: Array, increment: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """An increment (n_owned, 3) [m/s] from v along arcs, and the linear one.
@@ -91,8 +92,8 @@ class Arcs:
         forces = [
             np.bincount(corners, element_forces[:, :, i].ravel(), len(x))[: len(increment)] for i in range(3)
         ]
-        curved = increment + self._solve(np.stack(forces, axis=1)) / system.stage.c
-        system.directors.match(v, increment, curved)
+        curved = increment + self._solve(np.stack(forces, axis=1)) / system.step.stage.c
+        match(system, v, increment, curved)
         return curved, increment
 
     def _gradients(self, x: Array) -> Array:
@@ -120,7 +121,7 @@ class Arcs:
 
     def _solve(self, forces: Array) -> Array:
         """Displacements (n_owned, 3) [m] of the free unknowns by the Poisson equation for ``forces``."""
-        mask, free = self._system.prescribed.mask, self._system.prescribed.free
+        mask, free = self._system.step.prescribed.mask, self._system.step.prescribed.free
         (changed,) = self._system.points.global_max(float(not np.array_equal(mask, self._held)))
         if changed:
             self._factor()
@@ -130,7 +131,7 @@ class Arcs:
 
     def _factor(self) -> None:
         self.destroy()
-        layout, mask, name = self._system.points, self._system.prescribed.mask, self._term.name
+        layout, mask, name = self._system.points, self._system.step.prescribed.mask, self._term.name
         pattern = BlockPattern({name: self._term.stencil}, layout.n_owned, layout.n_local)
         rows = BlockRows(pattern)
         self._held = mask.copy()

@@ -8,6 +8,7 @@ from petsc4py import PETSc
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.motion_limits import may_impact
 from lyra_petsc.stepping.newton.roundoff import limit_roundoff
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -127,7 +128,7 @@ class Convergence:
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
-            moved = increment * self._system.stage.c
+            moved = increment * self._system.step.stage.c
             if moved > self.max_displacement:
                 return int(Reason.DIVERGED_MAX_IT)
             self._estimate_remaining(moved)
@@ -184,11 +185,11 @@ class Convergence:
             return False
         enough, part = self.force_tolerance(), FINER_IN_CONTACT
         coarse = self.norm > part * enough or self.remaining > part * tolerance
-        return coarse and system.may_impact
+        return coarse and may_impact(system)
 
     def force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""
-        return float(self._tolerances.force_tolerance * self._system.largest_force())
+        return float(self._tolerances.force_tolerance * self._system.forces.largest_force())
 
     def correction_suffices(self, correction: float, last: float, residual: float) -> bool:
         """Whether a Newton step and its corrections meet the tolerances, so that no further one is needed.
@@ -199,7 +200,7 @@ class Convergence:
         """
         part = correction / last
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
-        self._after_correction = expected * self._system.stage.c
+        self._after_correction = expected * self._system.step.stage.c
         tolerance = self._tolerances.step_tolerance * self.spacing
         return self._after_correction <= tolerance and residual <= self.force_tolerance()
 

@@ -131,7 +131,7 @@ class Globalisation:
 
     def note_iterate(self, u: PETSc.Vec) -> None:
         """Note energy and residual of iterate u, with which trial points are compared; collective."""
-        self._energy = self._system.objective(self._iterates.at(u))
+        self._energy = self._system.forces.objective(self._iterates.at(u))
         self._norm = self._snes.getFunctionNorm()
         # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
         # would progress slowly
@@ -177,7 +177,7 @@ class Globalisation:
         value that every line search accepts.
         """
         at = self._iterates.at(u)
-        value, size = self._system.objective(at)
+        value, size = self._system.forces.objective(at)
         here, own_size = self._energy
         if value != here and np.isfinite(value) and (self._returns or self.takes_full_steps):
             return min(value, here - self._slope)
@@ -185,7 +185,7 @@ class Globalisation:
         if value == here or not abs(value - here) < noise:
             return value
         system, trial = self._system, np.empty(self._shape)
-        system.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
+        system.forces.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
         (square,) = system.points.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._norm)
         return here - noise if smaller else here + noise

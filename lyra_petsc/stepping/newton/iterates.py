@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 
 Key = tuple[int, int, int]
 
@@ -13,8 +13,8 @@ Key = tuple[int, int, int]
 class Iterates:
     """The last two points of one SNES: its iterate and a trial point; collective.
 
-    A vector is known again by its object state, which changes with its values, as long as the equations are
-    the same.
+    A vector is known again by its object state, which changes with its values, as long as the step is the
+    same.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Iterates:
         self._known = {}
 
     def _key(self, u: PETSc.Vec) -> Key:
-        return int(u.handle), int(u.stateGet()), self._system.version
+        return int(u.handle), int(u.stateGet()), self._system.step.number
 
     def at(self, u: PETSc.Vec) -> Evaluation:
         """The evaluation of the equations at velocities u."""

@@ -18,8 +18,9 @@ from lyra_petsc.linear.multigrid import Multigrid
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import is_incomplete, shows_negative_curvature
 from lyra_petsc.phases import JACOBIAN_AGAIN, logged
-from lyra_petsc.stepping.evaluation import Evaluation
+from lyra_petsc.stepping import contact_steps
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 
 MIN_SHIFT, MAX_SHIFT = 0.01, 1.0
 """Fractions of the diagonal blocks."""
@@ -106,7 +107,7 @@ class Reuse:
 
     def __init__(self, *, enabled: bool) -> None:
         self._enabled = enabled
-        self._for: tuple[float, object] | None = None
+        self._for: tuple[float, int] | None = None
         self.reused = False
         self.discard()
 
@@ -116,12 +117,12 @@ class Reuse:
 
     def begin_solve(self, system: StageEquations) -> bool:
         """Whether the next solve reuses the present preconditioner."""
-        reach, mask = system.stage.c, system.prescribed.mask
-        if self._for is None or self._for[1] is not mask or not _similar(reach, self._for[0]):
+        reach, held = system.step.stage.c, system.step.prescribed.number
+        if self._for is None or self._for[1] != held or not _similar(reach, self._for[0]):
             self.discard()
         self.reused = self._enabled and self._solves > 0
         if not self.reused:
-            self._for = reach, mask
+            self._for = reach, held
         return self.reused
 
     def end_solve(self, iterations: int) -> None:
@@ -199,18 +200,18 @@ class LinearSystem:
         if is_set("mat_type") or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
-            self.operator = BlockMatrix(layout, pattern, self._system.block_summary)
+            self.operator = BlockMatrix(layout, pattern, self._block_summary)
         self.preconditioner = self.operator
         if self.cycles:
             spare = self._regularised or isinstance(self.operator, AssembledMatrix)
             hierarchy = self._hierarchy(spare=spare)
             if spare:
-                summary = self._system.block_summary
+                summary = self._block_summary
                 entries = None if hierarchy.rows is None else hierarchy.entries
                 self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows, entries)
             assert isinstance(self.preconditioner, BlockMatrix)
             self._multigrid = Multigrid(
-                self.preconditioner, hierarchy, held=lambda: self._system.prescribed.mask
+                self.preconditioner, hierarchy, held=lambda: self._system.step.prescribed.mask
             )
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE
@@ -219,6 +220,9 @@ class LinearSystem:
             self.preconditioner = AssembledMatrix(
                 layout, pattern, "baij" if diagonal else kind, diagonal=diagonal
             )
+
+    def _block_summary(self) -> list[str]:
+        return contact_steps.block_summary(self._system)
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:
         discretisation = self._system.discretisation
@@ -268,7 +272,7 @@ class LinearSystem:
         """Prepare for a new solve, in which nothing of the last one can be kept."""
         self.kept_preconditioner = self.uses_operator = False
 
-    def assemble(self, at: Evaluation, blend: float, *, keep: bool, convex: bool) -> None:
+    def assemble(self, at: Evaluation, blend: float, *, keep: bool, convex: bool) -> Array | None:
         """Assemble the Jacobian and the preconditioning matrix at the `linearised` stage.
 
         Parameters
@@ -279,11 +283,17 @@ class LinearSystem:
             Whether the preconditioner of the last iteration can be kept.
         convex : bool
             Whether the Hessian was positive definite in the last solve.
+
+        Returns
+        -------
+        (n_owned, 3) or None
+            As `StageForces.jacobian`.
         """
-        self.assemble_operator(at, blend)
+        force = self.assemble_operator(at, blend)
         if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._system):
             self._set_preconditioner(at, keep=keep, convex=convex)
         self._system.directors.forget()
+        return force
 
     def _set_preconditioner(self, at: Evaluation, *, keep: bool, convex: bool) -> None:
         if not self._regularised:
@@ -301,13 +311,18 @@ class LinearSystem:
         elif not keep:
             self._set_regularised(at)
 
-    def assemble_operator(self, at: Evaluation, blend: float) -> None:
+    def assemble_operator(self, at: Evaluation, blend: float) -> Array | None:
         """Assemble the Jacobian at the `linearised` stage with this weight of the regularised Hessian."""
-        self._system.jacobian(at, blend, self.operator.rows)
+        force = self._jacobian(at, blend, self.operator.rows)
         self.operator.set(self.operator.rows)
+        return force
+
+    def _jacobian(self, at: Evaluation, blend: float, rows: Array) -> Array | None:
+        predicted = self._system.predicted_stress.positions
+        return self._system.forces.jacobian(at, blend, rows, predicted)
 
     def _set_regularised(self, at: Evaluation) -> None:
-        self._system.jacobian(at, 1.0, self.preconditioner.rows)
+        self._jacobian(at, 1.0, self.preconditioner.rows)
         self.preconditioner.set(self.preconditioner.rows, self.shift.value)
 
     def save_rows(self, at: Evaluation) -> None:
@@ -315,7 +330,7 @@ class LinearSystem:
         self._saved_rows = [self.operator.rows.copy()]
         if self.preconditioner is not self.operator and self._regularised and not self.uses_operator:
             if self.kept_preconditioner:
-                self._system.jacobian(at, 1.0, self.preconditioner.rows)
+                self._jacobian(at, 1.0, self.preconditioner.rows)
             self._saved_rows.append(self.preconditioner.rows.copy())
 
     def assemble_with(self, add: Callable[[Array], None]) -> None:
@@ -351,7 +366,7 @@ class LinearSystem:
         self.assemble_operator(at, blend)
 
     def _free(self, *, permanently: bool) -> None:
-        self._system.forget_rows()
+        self._system.damping.release_values()
         if self._multigrid is not None:
             self._multigrid.destroy(for_good=permanently)
             self._multigrid = None

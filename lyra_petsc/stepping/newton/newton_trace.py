@@ -126,24 +126,26 @@ class Trace:
 
         If a solve could not begin, ``velocity`` (n_owned, 3) [m/s] is its starting point.
         """
-        system, stage = self._system, self._system.stage
+        system, stage = self._system, self._system.step.stage
         n = system.points.n_owned
         if velocity is None:
             velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
         residual = system.residual_at(velocity)
         position = (system.x[:n] if stage.x is None else stage.x) + stage.c * velocity
         if system.held and system.integrator.handles_at_stage:
-            system.prescribed.targets(system.t0, system.t1, system.t0 + stage.offset, position)
+            step, held = system.step, system.step.prescribed
+            there = system.prescriptions.positions(step.start, step.end, step.at_stage, system.x)
+            held.overwrite(position, there.take(held.indices))
         square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
         return FailedSolve(
             tuple(self._iterations),
             float(np.sqrt(square)),
-            system.t0 + stage.offset,
+            system.step.start + stage.offset,
             velocity,
             position,
             residual,
             dict(system.forces_at_stage()),
-            system.prescribed.mask[:n].copy(),
+            system.step.prescribed.mask[:n].copy(),
             int(self._snes.getConvergedReason()),
             int(self._ksp.getConvergedReason()),
             np.array(self._ksp.getConvergenceHistory()),

@@ -8,9 +8,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.stepping.evaluation import Evaluation
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 
 
 class RepeatedSolves:
@@ -74,8 +74,8 @@ class RepeatedSolves:
 
         def constrained(values: Array) -> None:
             add(values)
-            if len((entries := system.prescribed.constrained).changed):
-                system.discretisation.rows.constrain(values, system.prescribed.mask, entries)
+            if len((entries := system.forces.constrained(system.step.prescribed)).changed):
+                system.discretisation.rows.constrain(values, system.step.prescribed.mask, entries)
 
         self._linear.assemble_with(constrained)
         ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)

@@ -28,7 +28,7 @@ def limit_roundoff(system: StageEquations) -> float:
     scale, size = np.zeros(points.n_local), points.global_max(float(np.abs(x).max(initial=0.0)))[0]
     contact = [] if system.contact is None else [system.contact.barrier]
     for term in (*contact, *system.active.limiting):
-        amount = term.stiffness(x, system.active.frozen[term]) * term.coordinate_scale(size)
+        amount = term.stiffness(x, system.step.frozen[term]) * term.coordinate_scale(size)
         scale += np.bincount(term.stencil.ravel(), np.repeat(amount, term.stencil.shape[1]), points.n_local)
     return _norm(system, scale[: points.n_owned])
 

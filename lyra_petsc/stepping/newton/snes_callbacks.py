@@ -14,7 +14,8 @@ from lyra_petsc.linear import failed_factors
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
-from lyra_petsc.stepping.evaluation import Evaluation
+from lyra_petsc.stepping import motion_limits as limits
+from lyra_petsc.stepping.directors import turn_with_triangles
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.blend import Blend
 from lyra_petsc.stepping.newton.convergence import Convergence
@@ -23,6 +24,7 @@ from lyra_petsc.stepping.newton.inexact import COLLISION, Forcing
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.time_step import Evaluation
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.newton.arcs import Arcs
@@ -134,7 +136,7 @@ class Newton:
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
         approach = COLLISION * self.convergence.spacing
-        collides = self._iterates and self._system.may_collide(approach)
+        collides = self._iterates and limits.may_collide(self._system, approach)
         self._points.forget()
         self._linear.begin_solve()
         self._linear.shift.decrease()
@@ -157,11 +159,12 @@ class Newton:
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
-        self._linear.assemble(at, blend, keep=self.convergence.fell_fast, convex=self._convex)
-        if self._system.prescribed_force is not None:
+        keep = self.convergence.fell_fast
+        by_prescribed = self._linear.assemble(at, blend, keep=keep, convex=self._convex)
+        if by_prescribed is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
-            force += self._system.prescribed_force
-        self._last_c = self._system.stage.c
+            force += by_prescribed
+        self._last_c = self._system.step.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -209,7 +212,7 @@ class Newton:
         curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
         if self._system.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
-        if self._system.limits_steps and not curved:
+        if limits.limits_steps(self._system) and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if full and self._corrects:
@@ -251,7 +254,7 @@ class Newton:
             return self._ease_linear_solve(x)
 
         solves = RepeatedSolves(self._ksp, self._system, self._linear, at, renew, ease)
-        model = ContactModel(*self._system.contact_at(self._array(x)))
+        model = ContactModel(*limits.contact_at(self._system, self._array(x)))
         changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
         self.contact_iterations += solves.iterations
         return changed
@@ -278,7 +281,7 @@ class Newton:
             if exact:
                 _apply_broyden(correction, steps)
             before, increment = size, -self._array(y) - self._array(correction)
-            if not self._system.moves_freely(v, increment):
+            if not limits.moves_freely(self._system, v, increment):
                 break
             size, force = self._residual(v + increment)
             if not size < MAX_REMAINING * before:
@@ -300,8 +303,9 @@ class Newton:
         (square,) = self._system.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
-    def curve_guess(self, v: Array, guess: Array) -> None:
-        """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs; collective.
+    def curve_guess(self, v: Array, start: Array, guess: Array) -> None:
+        """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs that moves freely from
+        ``start``; collective.
 
         Of all expected increments it takes the one whose end has the least energy.
         """
@@ -309,13 +313,13 @@ class Newton:
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
-        lowest, start = np.inf, self._system.start_velocity()
+        lowest = np.inf
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
             self._system.prescribe(end)
-            if not self._system.moves_freely(start, end - start):
+            if not limits.moves_freely(self._system, start, end - start):
                 continue
-            energy = self._system.objective(self._system.evaluate(end))[0] if others else 0.0
+            energy = self._system.forces.objective(self._system.evaluate(end))[0] if others else 0.0
             if energy < lowest:
                 lowest, guess[:] = energy, end
 
@@ -343,7 +347,7 @@ class Newton:
         before = y.copy()
         curved, increment = self._arcs.curve(v, -self._array(y))
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and self._system.moves_freely(v, curved)
+        descends = bool(residual.dot(y) > 0.0) and limits.moves_freely(self._system, v, curved)
         if descends:
             self._system.predicted_stress.take_uncorrected(self._system.evaluate(v + increment).x)
             self.step_fraction = 1.0
@@ -360,7 +364,7 @@ class Newton:
     def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
         increment = -self._array(y)
-        if not self._system.directors.turn_with_triangles(self._array(x), increment):
+        if not turn_with_triangles(self._system, self._array(x), increment):
             return False
         before = y.copy()
         y.setArray(-increment.ravel())
@@ -377,14 +381,14 @@ class Newton:
         """
         system, v = self._system, self._array(x)
         shortened = self._limit_displacement(y)
-        fraction = system.largest_step(v, -self._array(y))
+        fraction = limits.largest_step(system, v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
         correct = fraction < 1.0 or slow
-        separated = system.separated(v, -self._array(y)) if correct else None
+        separated = limits.separated(system, v, -self._array(y)) if correct else None
         if separated is not None:
             before = y.copy()
             y.setArray(-separated.ravel())
-            farther = system.largest_step(v, separated) if residual.dot(y) > 0.0 else 0.0
+            farther = limits.largest_step(system, v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:
@@ -402,7 +406,7 @@ class Newton:
             return False
         vertices = self._array(y)[: system.points.n_vertices]
         (largest,) = system.points.global_max(float(np.abs(vertices).max(initial=0.0)))
-        allowed = MAX_INCREMENT * self.convergence.spacing / system.stage.c
+        allowed = MAX_INCREMENT * self.convergence.spacing / system.step.stage.c
         if largest <= allowed:
             return False
         y.scale(allowed / largest)

@@ -63,7 +63,7 @@ class VertexEquations:
         """
         system, rows = self._system, self._rows
         x, vs = system.evaluated.x, system.evaluated.v
-        stage, damped = system.stage, system.damping.active
+        stage, damped = system.step.stage, system.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.update(x)
@@ -73,9 +73,9 @@ class VertexEquations:
             weight: Array | float = stage.c
             if damped and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, system.active.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, system.step.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(vs, system.active.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(vs, system.step.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, values)
             rows.constrain(values, held, self._constrained)
@@ -93,9 +93,9 @@ class VertexEquations:
         edge = head - tail
         normal = np.cross(edge, opposite - tail)
         square = np.sum(normal * normal, axis=1)
-        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._system.stage.c
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._system.step.stage.c
         if self._system.damping.active:
-            factor *= 1.0 + data["damping"][triangle] / self._system.stage.c
+            factor *= 1.0 + data["damping"][triangle] / self._system.step.stage.c
         # n nᵀ / height²
         factor *= np.divide(
             np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0

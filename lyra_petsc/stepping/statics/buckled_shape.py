@@ -16,6 +16,8 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping import motion_limits as limits
+from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.stability import Examination
 
@@ -117,8 +119,8 @@ class BuckledShape:
             largest = self._largest(change) / self._size
             if not largest < max(2.0 * before, 10.0 * step):
                 return None
-            if system.limits_steps:
-                change *= system.largest_step(np.zeros_like(change), change / system.stage.c)
+            if limits.limits_steps(system):
+                change *= limits.largest_step(system, np.zeros_like(change), change / system.step.stage.c)
             self._set_positions(system.x[:n] + change)
             if largest <= CONVERGED * step and abs(holding - last) <= CONVERGED * abs(holding):
                 return holding
@@ -137,7 +139,7 @@ class BuckledShape:
 
     def _set_positions(self, x: Array) -> None:
         self._system.state.set(x, np.zeros_like(x))
-        self._system.directors.transport_frames()
+        transport_frames(self._system)
 
     def _is_finite(self, values: Array) -> bool:
         return not any(self._system.points.global_max(float(not np.all(np.isfinite(values)))))

@@ -26,6 +26,8 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping import contact_steps
+from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve
@@ -141,14 +143,14 @@ class Equilibrium:
         )
         self._extrapolation = Extrapolation(system.points.comm)
         self._follows = bool(system.active.viscous or system.active.following)
-        system.applied.factor = 0.0
+        system.take_loads(factor=0.0)
         system.begin_step(0.0, 0.0)
         force = system.out_of_balance()
         self._scale = self._norm(force)
         # if the sheet slides, forces that hold its start shape would push it along
         held = not system.near
         if held and self._scale > floor and not self._unstable():
-            system.applied.unbalanced = -force
+            system.take_loads(unbalanced=-force)
 
     def _unstable(self) -> bool:
         """Whether the start shape with the forces that hold it is unstable, as if compressed; collective.
@@ -187,7 +189,7 @@ class Equilibrium:
         if self._whole_stiffness is None:
             return None
         system = self._system
-        system.applied.factor = factor
+        system.take_loads(factor=factor)
         guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
         found = self._whole_stiffness.find(before, factor, guess)
         if found is not None:
@@ -199,9 +201,9 @@ class Equilibrium:
         """Find the equilibrium as described at the top of the module; collective."""
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
-        system.applied.factor = factor
+        system.take_loads(factor=factor)
         newton = linear = solves = resumed = 0
-        moving_energy, last, solved_once = 0.0, np.inf, False
+        last, solved_once = np.inf, False
         contact = system.contact is not None
         judges_energy = contact and self._is_held()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
@@ -214,9 +216,9 @@ class Equilibrium:
             if not solves:
                 self._pseudo_time.start(fastest)
                 self._predict_by_tangent(before, factor)
-                moving_energy, frozen = system.moving_energy_before, system.active.frozen
+                frozen = system.step.frozen
             progress.record_force(force, attempt.linear_iterations if solves else None)
-            if solves and judges_energy and not system.has_friction_pairs:
+            if solves and judges_energy and not contact_steps.has_friction_pairs(system):
                 progress.record_potential(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             settled = self._friction.is_rough or (balanced and self._friction.is_settled())
@@ -227,7 +229,6 @@ class Equilibrium:
                 break
             if settled:
                 self._friction.record_success(factor - before)
-                system.moving_energy_before = moving_energy
                 self._record(factor)
                 self._pseudo_time.sufficed = self._integrator.pseudo_dt
                 linear += self._compute_tangent(x, before, factor)
@@ -251,8 +252,9 @@ class Equilibrium:
             leap, begin = self._pseudo_time.is_leap, system.x[:n].copy()
             attempt = self._proximal_step(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
-                relaxation.record(system.applied.force_at(system.x))
-            system.applied.override = system.applied.following = self._integrator.predicted = None
+                relaxation.record(system.step.loads.force_at(system.x))
+            system.take_loads(override=None, following=None)
+            self._integrator.predicted = None
             self._integrator.alternatives = []
             solves += 1
             newton += attempt.newton_iterations
@@ -265,7 +267,7 @@ class Equilibrium:
                 if not solved_once:  # the force before is smaller if handles move
                     progress.restart()
                 solved_once = True
-                system.directors.transport_frames()  # edges may turn far until they are in equilibrium
+                transport_frames(system)  # edges may turn far until they are in equilibrium
                 self._pseudo_time.record_success(attempt.newton_iterations)
             elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
                 resumed += 1
@@ -285,7 +287,7 @@ class Equilibrium:
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        system.directors.transport_frames(frozen)
+        transport_frames(system, frozen)
         system.active.restore_contacts(self._friction.contacts)
         return dataclasses.replace(
             attempt,
@@ -312,7 +314,7 @@ class Equilibrium:
         """
         system, n = self._system, len(start)
         step = factor - before
-        moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
+        moved = np.where(system.step.prescribed.free, 0.0, system.x[:n] - start)
         (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
         rate = self._load_rate
         if system.near:
@@ -341,11 +343,11 @@ class Equilibrium:
 
         Returns linear iterations; collective.
         """
-        system, now = self._system, self._system.applied.force.copy()
+        system, now = self._system, self._system.step.loads.force.copy()
         if self._whole_stiffness is None:
-            system.applied.override = relaxation.relax(now)
+            system.take_loads(override=relaxation.relax(now))
             return 0
-        loads = system.applied.following = self._whole_stiffness.linearise_loads(before, factor)
+        loads = self._whole_stiffness.linearise_loads(before, factor)
         displacement, iterations = None, 0
         if system.active.viscous:  # the wind's stiffness is not known
             pass
@@ -354,25 +356,26 @@ class Equilibrium:
         elif self._integrator.alternatives and self._tangent is not None:
             displacement = (factor - before) * self._tangent
         if displacement is None:
-            system.applied.override = relaxation.relax(now)
+            now = relaxation.relax(now)
         else:
-            system.applied.override = now + self._whole_stiffness.skew_force(loads, displacement)
+            now = now + self._whole_stiffness.skew_force(loads, displacement)
+        system.take_loads(override=now, following=loads)
         return iterations
 
     def _is_held(self) -> bool:
         """Whether handles hold vertices, and loads have a potential: it is then bounded below; collective."""
         system = self._system
         springs = any(not term.registration.of_contact for term in system.active.constraints)
-        holds = springs or len(system.prescribed.indices) > 0
+        holds = springs or len(system.step.prescribed.indices) > 0
         return not self._follows and any(system.points.global_max(float(holds)))
 
     def _potential_energy(self, start: Array) -> float:
         """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
-        system, frozen = self._system, self._system.active.frozen
+        system, frozen = self._system, self._system.step.frozen
         friction = None if system.contact is None else system.contact.friction
         terms = [term for term in system.active.elastic if term is not friction]
         energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
-        energy -= float(np.vdot(system.applied.force, system.x[: len(start)] - start))
+        energy -= float(np.vdot(system.step.loads.force, system.x[: len(start)] - start))
         return float(system.points.global_sum(energy)[0])
 
     def _proximal_step(self, before: float, factor: float, limit: int | None) -> Attempt:
@@ -394,19 +397,18 @@ class Equilibrium:
         """
         system = self._system
         ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
-        if not ran_out or self._follows or system.has_friction_pairs:
+        if not ran_out or self._follows or contact_steps.has_friction_pairs(system):
             return False
         lowest = self._stepper.lowest_energy_positions()
         if lowest is None:
             return False
         system.state.set(lowest, np.zeros_like(lowest))
-        system.directors.transport_frames()
+        transport_frames(system)
         return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:
         """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
         system, n = self._system, self._system.points.n_owned
-        moving_energy = system.moving_energy_before
         newton = linear = followed = 0
         message = ""
         while True:
@@ -447,7 +449,6 @@ class Equilibrium:
                 message = "from its lowest mode no other was found"
                 break
             followed += 1
-        system.moving_energy_before = moving_energy
         note = _note(found, followed, message)
         note = "; ".join(part for part in (note, friction_note) if part)
         return EquilibriumReport(found, newton, linear, note)
@@ -514,8 +515,8 @@ class Equilibrium:
             velocity=np.zeros_like(x),
             position=system.x[:n].copy(),
             residual=-force,
-            forces={"loads": -system.applied.force, "internal": system.applied.force - force},
-            prescribed=system.prescribed.mask[:n].copy(),
+            forces={"loads": -system.step.loads.force, "internal": system.step.loads.force - force},
+            prescribed=system.step.prescribed.mask[:n].copy(),
             snes_reason=0,
             ksp_reason=0,
             linear_residuals=np.empty(0),
@@ -541,7 +542,7 @@ class Equilibrium:
 
         Not that on the way to them: in a snap it may be 1e5 times as large.
         """
-        return max(self._scale, self._system.largest_force())
+        return max(self._scale, self._system.forces.largest_force())
 
     def _record(self, factor: float) -> None:
         """Record that the present state is the equilibrium at load factor ``factor``; collective."""

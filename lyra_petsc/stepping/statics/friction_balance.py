@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 LAG, ROUGH_LAG, MAX_ROUNDS = 1e-6, 1e-3, 20
@@ -86,7 +87,9 @@ class FrictionBalance:
         displacement = x.copy()
         displacement[: len(begin)] -= begin
         points.update_ghosts(displacement)
-        slip, normal = points.global_sum(*self._system.active.slip_under_changed_forces(x, displacement))
+        slip, normal = points.global_sum(
+            *self._system.active.slip_under_changed_forces(x, displacement, self._system.step.frozen)
+        )
         return bool(slip > MAX_SLIP * self._spacing * normal)
 
     def is_settled(self) -> bool:
@@ -109,7 +112,9 @@ class FrictionBalance:
 
     def accept_substep(self) -> None:
         """Accept the part of the load step that ends at the present positions."""
-        self._landed = self._system.active.accept_substep(self._system.x, self._start)
+        self._landed = self._system.active.accept_substep(
+            self._system.x, self._system.step.frozen, self._start
+        )
 
     def keeps_first_state(self, *, failed: bool) -> bool:
         """Go back to the first state in balance, and return True, if corrections from there fail; collective.
@@ -120,7 +125,7 @@ class FrictionBalance:
             return False
         x, contacts, self.lag = self._first
         self._system.state.set(x, np.zeros_like(x))
-        self._system.directors.transport_frames()
+        transport_frames(self._system)
         self._system.active.restore_contacts(contacts)
         self.is_rough = True
         return True
@@ -136,7 +141,7 @@ class FrictionBalance:
             self.lands = limited and increment > self._longest and landed > MAX_LANDED * force
 
     def _elastic_energy(self) -> float:
-        system, frozen = self._system, self._system.active.frozen
+        system, frozen = self._system, self._system.step.frozen
         terms = [term for term in system.active.elastic if term not in system.active.sliding]
         energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
         return float(system.points.global_sum(energy)[0])
@@ -190,7 +195,7 @@ class FrictionBalance:
 
     def _sums(self) -> tuple[float, str]:
         """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""
-        sums = self._system.active.friction_lag(self._system.x)
+        sums = self._system.active.friction_lag(self._system.x, self._system.step.frozen)
         if not sums:
             return 0.0, ""
         each = self._system.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)

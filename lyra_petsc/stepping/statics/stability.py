@@ -81,20 +81,20 @@ def add_exact_hessian(system: StageEquations, values: Array) -> FollowingLoads:
     """
     rows, active = system.discretisation.rows, system.active
     for term in active.elastic:
-        rows.add_stiffness(term, system.x, active.frozen[term], 0.0, 1.0, values)
+        rows.add_stiffness(term, system.x, system.step.frozen[term], 0.0, 1.0, values)
 
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
         if isinstance(term, Load):
-            term.add_force_on_vertices(x, system.t0, system.t1, out)
+            term.add_force_on_vertices(x, system.step.start, system.step.end, out)
         else:
             against = np.zeros_like(out)
-            step = UpcomingStep(system.t0, system.t1, system.t1, x, system.reference.at)
+            step = UpcomingStep(system.step.start, system.step.end, system.step.end, x, system.reference.at)
             term.add_gradient(np.zeros_like(x), term.freeze(step), against)
             out -= against
 
     following = [*active.following, *active.viscous]
-    loads = FollowingLoads(following, system.x, force_of, system.applied.factor)
+    loads = FollowingLoads(following, system.x, force_of, system.load_case.factor)
     loads.add_hessian(1.0, rows.pattern, values)
     return loads
 
@@ -128,11 +128,11 @@ class Examination:
         system.update_pattern()
         values = system.discretisation.rows.zeros()
         loads = add_exact_hessian(system, values)
-        held, unbalanced = system.prescribed.mask, system.out_of_balance()
+        held, unbalanced = system.step.prescribed.mask, system.out_of_balance()
         sheet = next(term for term in system.active.elastic if isinstance(term, Membrane))
         rigid = rigid_motions(points, sheet.stencil, system.x, held, size)
         square = points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]
-        force = float(np.sqrt(square)) + LOADS * system.largest_force()
+        force = float(np.sqrt(square)) + LOADS * system.forces.largest_force()
         # forces f at vertices turned by an angle θ do the work ½ θ² f · x, at most
         doubt = force * float(np.sqrt(points.n_vertices_global)) / size
         skew = np.array([np.where(held[:n], 0.0, -loads.skew_force(motion, n)) for motion in rigid])

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.statics.following_loads import FollowingLoads, Solve, newton_displacement
 from lyra_petsc.stepping.statics.stability import Examination, Stability
@@ -54,8 +55,9 @@ class WholeStiffness:
             return None
         x = system.x[:n].copy()
         system.begin_step(before, factor)
-        frozen, anchored, last = system.active.frozen, system.moving_energy_before, np.inf
-        system.prescribed.targets(before, factor, factor, guess)
+        frozen, last = system.step.frozen, np.inf
+        held = system.step.prescribed
+        held.overwrite(guess, held.goal)
         self._set_positions(guess)
         for iteration in range(MAX_ITERATIONS):
             system.begin_step(before, factor)
@@ -65,7 +67,6 @@ class WholeStiffness:
                 if not self._is_stable(factor):
                     break
                 system.evaluate_at_start()
-                system.moving_energy_before = anchored
                 return Attempt(True, iteration, 0, force)
             displacement = self._displacement_by_force(unbalanced, factor) if np.isfinite(force) else None
             if displacement is None or force > MAX_GROWTH * last:
@@ -73,12 +74,12 @@ class WholeStiffness:
             last = force
             self._set_positions(system.x[:n] + displacement)
         system.state.set(x, np.zeros_like(x))
-        system.directors.transport_frames(frozen)
+        transport_frames(system, frozen)
         return None
 
     def _set_positions(self, x: Array) -> None:
         self._system.state.set(x, np.zeros_like(x))
-        self._system.directors.transport_frames()
+        transport_frames(self._system)
 
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""
@@ -138,4 +139,4 @@ class WholeStiffness:
         local = np.zeros_like(system.x)
         local[: len(u)] = u
         system.points.update_ghosts(local)
-        return np.where(system.prescribed.free, loads.skew_force(local, len(u)), 0.0)
+        return np.where(system.step.prescribed.free, loads.skew_force(local, len(u)), 0.0)

@@ -32,7 +32,7 @@ def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
     stiffness = np.zeros((n, 3, n, 3))
     for term in problem.terms.values():
         if isinstance(term, Elastic):
-            blocks = blocks_of(term, problem.system.x, problem.system.active.frozen[term])
+            blocks = blocks_of(term, problem.system.x, problem.system.step.frozen[term])
             stiffness += summed(term.stencil, blocks, n)
     free = ~problem.system.held.mask(0.0, 0.0, n).ravel()
     root = np.sqrt(np.repeat(problem.system.mass, 3))[free]

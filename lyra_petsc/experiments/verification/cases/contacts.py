@@ -291,7 +291,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
 
         def imbalance(term: Elastic, x: Array, points: Array) -> list[float]:
             gradient = np.zeros((system.points.n_local, 3))
-            term.add_gradient(x, system.active.frozen[term], gradient)
+            term.add_gradient(x, system.step.frozen[term], gradient)
             forces = trial.gather(gradient)
             each = np.stack([forces, np.cross(points, forces)])
             resultant = np.abs(each.sum(axis=1)).max(axis=1)

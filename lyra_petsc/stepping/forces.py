@@ -1,0 +1,235 @@
+"""The equations F(v) = 0 of a step's stage, as functions of an `Evaluation`: F, its Jacobian and objective.
+
+Unknown v (the velocity of the integrator's stage), with its history x_h, v_h and numbers σ, c::
+
+    F(v, v̇) = M v̇ + ∇E(x_h + c v) + D v + ∇P(v) − f,  v̇ = σ (v − v_h)       Jacobian  σ M + c K + D + ∇∇P
+
+with the elastic energy E, damping D = γ K⁺, the wind's potential P and the loads f. F is the gradient of the
+objective. Backward Euler has x_h = x_n, v_h = v_n, σ = 1/c = 1/Δt: the Lyra paper, eq. 10-18, as a Newton
+iteration. The geometry of D, P and f is frozen during a step: at x_n for first-order integrators, at the
+extrapolated stage x_n + (t_s − t_n) v_n for second-order ones.
+
+Unknowns of edges have no mass: their rows of F are ∂E/∂φ, and they are in equilibrium at the stage.
+
+This module works on arrays only, without PETSc. Methods that return sums over ranks are collective.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.linear.block_rows import ConstrainedEntries, squared_norm_without
+from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.stepping.active_terms import ActiveTerms, Frozen, gradient
+from lyra_petsc.stepping.damping import Damping
+from lyra_petsc.stepping.prescribed import PrescribedUnknowns
+from lyra_petsc.stepping.state import kinetic_energy
+from lyra_petsc.stepping.time_step import Evaluation, TimeStep
+from lyra_petsc.terms.protocols import LimitsStep
+from lyra_petsc.terms.term import Elastic, Term, Viscous
+
+
+class StageForces:
+    """One rank's part of the equations.
+
+    Parameters
+    ----------
+    discretisation : Discretisation
+    mass : (n_owned,) [kg]
+        Mass of each block row: the lumped mass of a vertex, 0 for an edge.
+    active : ActiveTerms
+    damping : Damping
+    edge_stiffness : (n,)
+        Stiffness [N/m] that Jacobians add to the diagonal of the block rows of edges.
+    """
+
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        mass: Array,
+        active: ActiveTerms,
+        damping: Damping,
+        edge_stiffness: Array,
+    ) -> None:
+        self._discretisation, self._mass, self._active = discretisation, mass, active
+        self._damping, self._edge_stiffness = damping, edge_stiffness
+        self._squares: list[float] = []
+        self._constrained: tuple[int, ConstrainedEntries] | None = None
+
+    @property
+    def _layout(self) -> Layout:
+        return self._discretisation.layout
+
+    def sum(self, terms: Sequence[Elastic | Viscous], at: Array, frozen: Frozen) -> Array:
+        """Gradient (n_owned, 3) [N] of the sum of ``terms`` at positions or velocities (n_local, 3)."""
+        return gradient(terms, at, frozen, self._layout)
+
+    # -- F -----------------------------------------------------------------------------------------
+
+    def parts(self, at: Evaluation, rate: Array) -> Iterator[tuple[str, Array]]:
+        """Names and values (n_owned, 3) [N] of the parts of F with accelerations ``rate`` (n_owned, 3).
+
+        They are generated one by one, because all of them together take much memory. Internal forces come
+        last, because terms keep data of them, which take memory, too.
+        """
+        step, active, self._squares = at.step, self._active, []
+        yield self._with_square(step, "inertia", self._mass[:, None] * rate)
+        del rate
+        springs = [term for term in active.constraints if term not in active.sliding]
+        for name, terms in (("springs", springs), ("friction", active.sliding)):
+            if terms:
+                yield self._with_square(step, name, self.sum(terms, at.x, step.frozen))
+        yield self._with_square(step, "loads", -step.loads.force_at(at.x))
+        if self._damping.active:
+            yield self._with_square(step, "damping", self._damping_at(at))
+        if active.viscous and not step.lagged:
+            yield self._with_square(step, "wind", self.sum(active.viscous, at.v, step.frozen))
+        if at.internal is None:
+            at.internal = self.sum(active.sheet, at.x, step.frozen)
+        yield self._with_square(step, "internal", at.internal)
+
+    def _damping_at(self, at: Evaluation) -> Array:
+        if at.damping is not None:
+            return at.damping
+        found = self._damping.product(at.v)
+        if not at.step.linear:  # else there is no second evaluation
+            at.damping = found
+        return found
+
+    def _with_square(self, step: TimeStep, name: str, part: Array) -> tuple[str, Array]:
+        """The part of F, after its square is kept for `largest_force`."""
+        self._squares.append(squared_norm_without(part.reshape(-1), step.prescribed.not_counted))
+        return name, part
+
+    def total(self, at: Evaluation, rate: Array, out: Array) -> Array:
+        """F (n_owned, 3) [N], written to ``out``."""
+        out[:] = 0.0
+        for _, part in self.parts(at, rate):
+            out += part
+            del part
+        return out
+
+    def residual(self, v: Array, at: Evaluation, out: Array) -> None:
+        """Write F (n_owned, 3) [N] at velocities v (n_owned, 3), linearised ``at`` a stage, to ``out``, in
+        rows of prescribed unknowns σ m (v − v*).
+        """
+        step, held = at.step, at.step.prescribed
+        self.total(at, step.stage.sigma * (v - step.v_h), out)
+        weight = step.stage.sigma * self._mass[held.indices // 3]
+        held.overwrite(out, weight * (v.take(held.indices) - held.velocity))
+
+    def largest_force(self) -> float:
+        """Norm [N] of the largest part of F last computed, over the free unknowns; collective."""
+        return float(np.sqrt(self._layout.global_sum(*self._squares).max(initial=0.0)))
+
+    # -- objective ---------------------------------------------------------------------------------
+
+    def objective(self, at: Evaluation) -> tuple[float, float]:
+        """Value of the function whose gradient F is, and the scale to which its round-off is relative, both
+        [W]; collective.
+
+        The scale is the sum of the absolute summands and of the geometric mean of each elastic energy and the
+        energy at which strains are of order one: small strains are small differences of large coordinates.
+        """
+        if at.objective is None:
+            at.objective = self._objective(at)
+        return at.objective
+
+    def _objective(self, at: Evaluation) -> tuple[float, float]:
+        step, n = at.step, len(self._mass)
+        rate, v, frozen = 1.0 / step.stage.c, at.v[:n], step.frozen
+        parts, square = [step.stage.sigma * kinetic_energy(self._mass, v - step.v_h)], 0.0
+        for term in self._active.elastic:
+            if not term.n_elements:
+                continue
+            each = term.energies(at.x, frozen[term])
+            parts.append(rate * float(each.sum()))
+            of_size: float | Array = rate * step.size
+            if isinstance(term, LimitsStep):
+                stiffness = term.stiffness(at.x, frozen[term])[: term.n_owned]
+                sizes = term.coordinate_scale(step.size)
+                of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
+            elif term in self.stiffnesses:
+                stiffness = self.stiffnesses[term]
+            else:
+                stiffness = term.force_scale(1.0)[: term.n_owned]
+            # `**` would raise an error where the square is infinite
+            square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
+        parts.append(-rate * float(np.vdot(step.loads.force, at.x[:n] - step.x[:n])))
+        if step.loads.following is not None:
+            parts.append(rate * step.loads.following.energy(at.x))
+        if self._damping.active:
+            parts.append(0.5 * float(np.vdot(v, self._damping_at(at))))
+        if not step.lagged:
+            parts += [float(wind.potentials(at.v, frozen[wind]).sum()) for wind in self._active.viscous]
+        value, size, square = self._layout.global_sum(sum(parts), sum(map(abs, parts)), square)
+        return float(value), float(size) + float(np.sqrt(square))
+
+    @cached_property
+    def stiffnesses(self) -> dict[Term, Array]:
+        """Force over displacement [N/m] of the owned elements of each term for which it is constant."""
+        elastic = self._active.elastic
+        constant = [t for t in elastic if not (t.registration.of_contact or isinstance(t, LimitsStep))]
+        return {term: term.force_scale(1.0)[: term.n_owned] for term in constant}
+
+    # -- Jacobian ----------------------------------------------------------------------------------
+
+    def jacobian(
+        self, at: Evaluation, blend: float, values: Array, predicted: tuple[Array, Array] | None = None
+    ) -> Array | None:
+        """Write σ M + c K + D + ∇∇P to block rows (n_blocks, 3, 3), prescribed unknowns decoupled.
+
+        ``blend`` is the weight of the regularised elastic Hessian: 0 takes the exact one. For ``predicted``
+        see `Elastic.add_hessian`; it may have other ghosts than the stage, but of contact only: those of
+        fixed stencils are the first. Returns the change (n_owned, 3) [N] of F by the motion of prescribed
+        unknowns in steps of one linear solve, or None.
+        """
+        step, rows, reach = at.step, self._discretisation.rows, at.step.stage.c
+        if step.linear:  # the linear solve needs the memory
+            at.internal = None
+        inertia = step.stage.sigma * self._mass
+        if len(self._edge_stiffness):
+            inertia[len(inertia) - len(self._edge_stiffness) :] += reach * self._edge_stiffness
+        constrained = self.constrained(step.prescribed)
+        changing = constrained.changed
+        whole = step.linear and blend == 1.0
+        if not (whole and self._damping.assemble_with_stiffness(reach, inertia, values, changing)):
+            self._damping.assemble(values, inertia)
+            for term in self._active.elastic:
+                rows.add_stiffness(term, at.x, step.frozen[term], blend, reach, values, predicted)
+        if not step.lagged:
+            for wind in self._active.viscous:
+                wind.add_hessian(at.v, step.frozen[wind], rows.pattern.offsets, values)
+        if step.loads.following is not None and blend < 1.0:
+            step.loads.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
+        force = self._force_of_prescribed(step.prescribed, values) if step.linear else None
+        if len(changing):
+            rows.constrain(values, step.prescribed.mask, constrained)
+        return force
+
+    def constrained(self, prescribed: PrescribedUnknowns) -> ConstrainedEntries:
+        """Entries of the present matrix in rows and columns of prescribed unknowns."""
+        if self._constrained is None or self._constrained[0] != prescribed.number:
+            entries = self._discretisation.rows.constrained_entries(prescribed.mask)
+            self._constrained = prescribed.number, entries
+        return self._constrained[1]
+
+    def forget_pattern(self) -> None:
+        """The matrix has other entries."""
+        self._constrained = None
+
+    def _force_of_prescribed(self, prescribed: PrescribedUnknowns, values: Array) -> Array | None:
+        """The product (n_owned, 3) [N] of the Jacobian ``values``, before prescribed unknowns are decoupled,
+        with the velocities of these; 0 in their rows. None if none moves; collective.
+        """
+        increment = np.zeros((len(self._mass), 3))
+        prescribed.overwrite(increment, prescribed.velocity)
+        if not any(self._layout.global_max(bool(increment.any()))):
+            return None
+        product = self._discretisation.rows.product(values, self._layout.extended(increment))
+        return np.where(prescribed.free, product, 0.0)

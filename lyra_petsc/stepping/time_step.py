@@ -1,0 +1,103 @@
+"""A step of the integrator, and its stage at given velocities, as values."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.stepping.applied_loads import StepLoads
+from lyra_petsc.stepping.integrators.integrator import Stage
+from lyra_petsc.stepping.prescribed import PrescribedUnknowns
+from lyra_petsc.terms.term import Term
+
+_numbers = itertools.count()
+
+
+@dataclass(frozen=True, eq=False)
+class TimeStep:
+    """A step as its equations see it: nothing in it changes.
+
+    Attributes
+    ----------
+    start, end : float
+        Times [s].
+    stage : Stage
+        The integrator's.
+    x : (n_local, 3)
+        Positions [m] at the start.
+    x_h, v_h : (n_local, 3), (n_owned, 3)
+        Histories [m] and [m/s] of the stage.
+    prescribed : PrescribedUnknowns
+    loads : StepLoads
+    frozen : mapping of Term
+        Data of each term that are constant in the step.
+    size : float
+        Largest coordinate [m] at its start.
+    moving_energy : float
+        Energy [J] of this rank's terms with moving targets: positions at the start, targets at the stage.
+    linear : bool
+        Whether F is linear in the velocities, from the positions where the step starts (``semi-implicit``).
+    lagged : bool
+        Whether loads that depend on velocities are those at the start.
+    of_edges : bool
+        Whether only the edges' unknowns are solved for, at the end of the step.
+    number : int
+        Another one for each step.
+    """
+
+    start: float
+    end: float
+    stage: Stage
+    x: Array
+    x_h: Array
+    v_h: Array
+    prescribed: PrescribedUnknowns
+    loads: StepLoads
+    frozen: Mapping[Term, Any]
+    size: float = 0.0
+    moving_energy: float = 0.0
+    linear: bool = False
+    lagged: bool = False
+    of_edges: bool = False
+    number: int = field(default_factory=lambda: next(_numbers), init=False)
+
+    @property
+    def dt(self) -> float:
+        """Length [s]."""
+        return self.end - self.start
+
+    @property
+    def at_stage(self) -> float:
+        """Time [s] of the stage."""
+        return self.start + self.stage.offset
+
+    @property
+    def ends_at_stage(self) -> bool:
+        """Whether the stage is the end of the step."""
+        return self.stage.offset == self.dt
+
+
+@dataclass(eq=False)
+class Evaluation:
+    """The stage of a step at given velocities, and what has been computed there.
+
+    Attributes
+    ----------
+    step : TimeStep
+    x, v : (n_local, 3)
+        Positions [m] and velocities [m/s], ghosts up to date.
+    internal, damping : (n_owned, 3) or None
+        Forces [N] of the sheet and of its damping, once they are known.
+    objective : (float, float) or None
+        Value of the function that the step minimises and the scale of its round-off [W], once they are known.
+    """
+
+    step: TimeStep
+    x: Array
+    v: Array
+    internal: Array | None = None
+    damping: Array | None = None
+    objective: tuple[float, float] | None = None
