@@ -46,7 +46,7 @@ class ActiveTerms:
         The terms with an elastic energy, with a potential of the velocities, and the loads.
     following : list of Load
         Loads that follow the shape of the sheet.
-    sheet, constraints : list of Elastic
+    sheet, external : list of Elastic
         Terms that add to the energy of the sheet, and springs by which handles pull.
     moving, targets : list of Elastic
         Terms of ``sheet`` with moving targets or obstacles; of these the ones with targets.
@@ -68,7 +68,7 @@ class ActiveTerms:
         self.loads = [term for term in terms if isinstance(term, Load)]
         self.following = [load for load in self.loads if load.is_follower]
         roles = {term: term.registration.role for term in self.elastic}
-        self.constraints = [term for term in self.elastic if roles[term] is Role.EXTERNAL]
+        self.external = [term for term in self.elastic if roles[term] is Role.EXTERNAL]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.targets = [term for term in self.sheet if isinstance(term, MovingTargets)]
         self.moving = [term for term in self.sheet if term in self.targets or term is obstacles]
@@ -76,7 +76,7 @@ class ActiveTerms:
         limiting = [term for term in self.elastic if isinstance(term, LimitsStep)]
         self.limiting = [term for term in limiting if not term.registration.of_contact]
         self.stateful = [term for term in self.elastic if isinstance(term, Stateful)]
-        self.sliding: list[Any] = [term for term in self.constraints if term.registration.of_contact]
+        self.sliding: list[Any] = [term for term in self.external if term.registration.of_contact]
         self.with_edges = [term for term in self.elastic if isinstance(term, HasDirectors)]
         self.coarse: dict[Elastic, Elastic] = {}
 
@@ -95,7 +95,7 @@ class ActiveTerms:
 
     def with_targets(self, frozen: Frozen, step: UpcomingStep) -> Frozen:
         """The data with moving targets and springs at their positions at ``step.target_time``."""
-        return {**frozen, **{term: term.freeze(step) for term in (*self.moving, *self.constraints)}}
+        return {**frozen, **{term: term.freeze(step) for term in (*self.moving, *self.external)}}
 
     def moving_energy(self, x: Array, frozen: Frozen) -> float:
         """Energy [J] of this rank's terms with moving targets, without obstacles, at these targets."""

@@ -113,7 +113,7 @@ def _obstacle_work(system: StageEquations) -> float:
 def _move_targets_to_end(system: StageEquations) -> float:
     """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
     step, active = system.step, system.active
-    if step.ends_at_stage or not (active.moving or active.constraints):
+    if step.ends_at_stage or not (active.moving or active.external):
         return 0.0
     frozen = active.with_targets(step.frozen, system.targets_at(step.end))
     system.change(frozen=frozen)

@@ -94,7 +94,7 @@ class EndForces:
     def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
         self._system = system
         elastic = system.active.elastic
-        self._targets = [*system.active.moving, *system.active.constraints]
+        self._targets = [*system.active.moving, *system.active.external]
         self._plain = [term for term in elastic if term not in self._targets]
         self._weights = [load for load in system.active.loads if load.registration.energy]
         self._forces = [load for load in system.active.loads if not load.registration.energy]

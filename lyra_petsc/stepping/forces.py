@@ -80,7 +80,7 @@ class StageForces:
         step, active, self._squares = at.step, self._active, []
         yield self._with_square(step, "inertia", self._mass[:, None] * rate)
         del rate
-        springs = [term for term in active.constraints if term not in active.sliding]
+        springs = [term for term in active.external if term not in active.sliding]
         for name, terms in (("springs", springs), ("friction", active.sliding)):
             if terms:
                 yield self._with_square(step, name, self.sum(terms, at.x, step.frozen))

@@ -76,7 +76,7 @@ def _computed(system: StageEquations, at: float) -> Array:
         rates = system.prescriptions.rates(step.prescribed, step.start, step.end, soon)
         step.prescribed.overwrite(v[: len(system.mass)], rates)
     system.points.update_ghosts(v)
-    turns = bool(active.moving or active.constraints)
+    turns = bool(active.moving or active.external)
     if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
         system.change(frozen=active.with_targets(step.frozen, system.targets_at(step.start, x)))
     if system.damping.active and system.points.n_edges_global:

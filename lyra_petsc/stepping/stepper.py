@@ -33,7 +33,7 @@ from lyra_petsc.stepping import contact_steps, edge_solve
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles, update_frames
 from lyra_petsc.stepping.edge_solve import EdgeSolve
-from lyra_petsc.stepping.newton.blend import Blend
+from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.conditioning import expected_iterations
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.extrapolation import Extrapolation
@@ -42,7 +42,7 @@ from lyra_petsc.stepping.newton.initial_guess import first_guess, has_start
 from lyra_petsc.stepping.newton.iterates import Iterates
 from lyra_petsc.stepping.newton.linear_system import LinearSystem
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Trace
-from lyra_petsc.stepping.newton.snes_callbacks import Newton
+from lyra_petsc.stepping.newton.snes_callbacks import NewtonCallbacks
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
 from lyra_petsc.stepping.ts_options import hidden_options
@@ -134,7 +134,7 @@ class Stepper:
         self._suspended: tuple[list[str], dict[str, float]] | None = None
         points = system.points
         self.presets = self._candidates()
-        self._blend = Blend(self._hessian)
+        self._blend = HessianBlend(self._hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
@@ -170,7 +170,7 @@ class Stepper:
         suspended, saved = self._suspended, self._newton.saved_state()
         self.destroy()
         self._iterates = not self._iterates
-        self._blend = Blend(self._hessian)
+        self._blend = HessianBlend(self._hessian)
         if suspended is None:
             self._suspended, self.presets = (self.presets, saved), self._candidates()
         else:
@@ -213,7 +213,7 @@ class Stepper:
             system, scene.solver, self._spacing, self._floor, break_even_iterations=limit
         )
         self._points = Iterates(system)
-        self._newton = newton = Newton(
+        self._newton = newton = NewtonCallbacks(
             snes,
             system,
             self.linear,

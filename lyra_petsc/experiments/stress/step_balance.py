@@ -213,7 +213,7 @@ class BalanceRecorder:
         self._simulation = simulation
         self._system = system = simulation.problem.system
         self._identity = system.integrators.usual.name == "beuler"
-        constraints = system.active.constraints
+        constraints = system.active.external
         self._sheet_terms = [term for term in system.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
         moving = system.active.moving
@@ -314,7 +314,7 @@ class BalanceRecorder:
         if stage.offset < dt:  # moving targets are at the end of the step by now
             moved = (
                 *system.active.moving,
-                *(t for t in system.active.constraints if not t.registration.of_contact),
+                *(t for t in system.active.external if not t.registration.of_contact),
             )
             frozen |= {term: term.freeze(step) for term in moved}
         force, wind = np.zeros_like(x), np.zeros_like(x)
@@ -336,7 +336,7 @@ class BalanceRecorder:
         parts = {
             "inertia": system.mass[:, None] * rate,
             "internal": gradient(sheet, x)[:n],
-            "springs": gradient({term: frozen[term] for term in system.active.constraints}, x)[:n],
+            "springs": gradient({term: frozen[term] for term in system.active.external}, x)[:n],
             "damping": self._damping(sheet, y, v),
             "wind": wind[:n],
             "loads": -force[:n],

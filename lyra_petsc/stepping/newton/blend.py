@@ -27,7 +27,7 @@ SHORTENED = 0.5
 """A step of which the line search takes less than this fraction increases the weight."""
 
 
-class Blend:
+class HessianBlend:
     """The weight of the regularised Hessian: 0 is exact, 1 regularised.
 
     Parameters

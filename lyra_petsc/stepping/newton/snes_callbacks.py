@@ -17,7 +17,7 @@ from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles
 from lyra_petsc.stepping.integrators.static import Static
-from lyra_petsc.stepping.newton.blend import Blend
+from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.globalisation import Globalisation
 from lyra_petsc.stepping.newton.inexact import COLLISION, Forcing
@@ -67,7 +67,7 @@ def _apply_broyden(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
         correction.scale(1.0 / (1.0 - repeated))
 
 
-class Newton:
+class NewtonCallbacks:
     """Callbacks of one SNES.
 
     Parameters
@@ -75,7 +75,7 @@ class Newton:
     snes : PETSc.SNES
     system : StageEquations
     linear : LinearSystem
-    blend : Blend
+    blend : HessianBlend
     convergence : Convergence
     points : Iterates
     iterates : bool
@@ -98,7 +98,7 @@ class Newton:
         snes: PETSc.SNES,
         system: StageEquations,
         linear: LinearSystem,
-        blend: Blend,
+        blend: HessianBlend,
         convergence: Convergence,
         points: Iterates,
         *,

@@ -365,7 +365,7 @@ class Equilibrium:
     def _is_held(self) -> bool:
         """Whether handles hold vertices, and loads have a potential: it is then bounded below; collective."""
         system = self._system
-        springs = any(not term.registration.of_contact for term in system.active.constraints)
+        springs = any(not term.registration.of_contact for term in system.active.external)
         holds = springs or len(system.step.prescribed.indices) > 0
         return not self._follows and any(system.points.global_max(float(holds)))
 
