@@ -96,7 +96,7 @@ class Stops:
     """Springs that act beyond points (m,) on the x axis: their second derivatives jump, as where the nearest
     feature of a pair in contact changes."""
 
-    registration, skin = SimpleNamespace(of_contact=True), 0.01
+    registration, search = SimpleNamespace(of_contact=True), SimpleNamespace(skin=0.01)
 
     def __init__(self, at: Array) -> None:
         self.at = at
