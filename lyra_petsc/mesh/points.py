@@ -103,6 +103,7 @@ class Points:
         """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
         if self.comm.size == 1:
             return
+        assert len(values) == self.n_local  # the forest would write beyond the array
         owned, ghosts = values[: self.n_owned], values[self.n_owned :]
         triple = self._triples[values.dtype]
         self._forest.bcastBegin(triple, owned, ghosts, MPI.REPLACE)

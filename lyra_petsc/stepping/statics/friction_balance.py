@@ -21,6 +21,7 @@ import numpy as np
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.directors import transport_frames
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.state import resized
 
 LAG, ROUGH_LAG, MAX_ROUNDS = 1e-6, 1e-3, 20
 """Fraction by which friction may differ from what the normal forces of the equilibrium allow; that before
@@ -74,7 +75,9 @@ class FrictionBalance:
         """Begin a load step at the present positions."""
         self.lag, self.is_rough, self.lands = 0.0, False, False
         self._rounds, self._landed_heat, self._start = 0, 0.0, None
-        self._begin, self.contacts = self._system.x.copy(), self._system.active.contact_state()
+        system = self._system
+        self._begin = system.x[: system.points.n_owned].copy()
+        self.contacts = system.active.contact_state()
 
     def lags(self, begin: Array) -> bool:
         """Whether points slipped too far in the solve from positions ``begin`` (n_owned, 3) [m]; collective.
@@ -105,16 +108,18 @@ class FrictionBalance:
         settled = self.lag <= ROUGH_LAG or self._rounds > MAX_ROUNDS
         if not (settled and self._acts and system.near):
             return settled
-        system.points.update_ghosts(self._begin)
         self._start, self._rounds = (self._begin, self.contacts), 0
         self._first = system.x[: system.points.n_owned].copy(), system.active.contact_state(), self.lag
         return False
 
     def accept_substep(self) -> None:
-        """Accept the part of the load step that ends at the present positions."""
-        self._landed = self._system.active.accept_substep(
-            self._system.x, self._system.step.frozen, self._start
-        )
+        """Accept the part of the load step that ends at the present positions; collective."""
+        system, start = self._system, self._start
+        if start is not None:  # the search for pairs may have added ghosts since
+            x = resized(start[0], system.points.n_owned, system.points.n_local)
+            system.points.update_ghosts(x)
+            start = x, start[1]
+        self._landed = system.active.accept_substep(system.x, system.step.frozen, start)
 
     def keeps_first_state(self, *, failed: bool) -> bool:
         """Go back to the first state in balance, and return True, if corrections from there fail; collective.
