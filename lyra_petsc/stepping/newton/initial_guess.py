@@ -8,6 +8,8 @@ each other.
 
 from __future__ import annotations
 
+import numpy as np
+
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.integrators.static import Static
@@ -49,17 +51,9 @@ def first_guess(system: StageEquations, start: Array, out: Array) -> bool:
 
 
 def has_start(system: StageEquations, start: Array) -> bool:
-    """Whether one of the first guesses of a solve is within the limits of all terms; collective."""
-    n, integrator = system.points.n_owned, system.integrator
-    if not (system.active.limiting and integrator.iterates):  # one linear solve starts from the state
+    """Whether the first guess of a solve is within the limits of all terms; collective."""
+    if not (system.active.limiting and system.integrator.iterates):  # one linear solve starts from the state
         return True
-    guesses = [start]
-    if isinstance(integrator, Static):
-        guesses += [] if integrator.predicted is None else [integrator.predicted / integrator.pseudo_dt]
-    else:
-        guesses.append(system.v[:n].copy())
-    for guess in guesses:
-        system.prescribe(guess)
-        if limits.are_kept(system, system.evaluate(guess).x):
-            return True
-    return False
+    guess = np.empty_like(start)
+    first_guess(system, start, guess)
+    return limits.are_kept(system, system.evaluate(guess).x)
