@@ -314,7 +314,7 @@ class ContactBarrier(LimitsStep):
         bound = self.active_pairs(x, frozen.stage).lower_bound
         near = np.flatnonzero(approach > (1.0 - KEPT_FRACTION) * bound)
         pairs = *(data[near] for data in self._geometry), KEPT_FRACTION, 1.0
-        return float(contact_pairs.free_fraction(x, frozen.stage, dx, at_rest, *pairs))
+        return float(contact_pairs.largest_step(x, frozen.stage, dx, at_rest, *pairs))
 
     def springs(self, x: Array, approach: float, frozen: ObstaclePositions) -> Springs:
         """One-sided springs for the pairs in contact at x (n_local, 3), or that may be after points have
@@ -383,7 +383,7 @@ class ContactBarrier(LimitsStep):
         if len(curved) and np.isin(self.obstacle, curved).any():
             return False
         motion = frozen.displacements(interval, dx)
-        return bool(contact_pairs.free_fraction(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
+        return bool(contact_pairs.largest_step(x, *motion, *self._geometry, KEPT_FRACTION, 1.0) == 1.0)
 
     def distances(self, x: Array, obstacle_x: Array) -> Array:
         """Distance less offset [m] of all pairs, (E,), with points of obstacles at obstacle_x (m, 3)."""
@@ -395,19 +395,13 @@ class ContactBarrier(LimitsStep):
         """Distance less thickness [m] between the two simplices of each owned pair, (n_owned,)."""
         return (self._scale * self.distances(x, frozen.stage))[: self.n_owned]
 
-    def _free_fractions(self, x: Array, motion: tuple[Array, Array, Array], n: int) -> Array:
-        """The collision-free fractions (n,) of the first n pairs in a motion of `ObstaclePositions`."""
-        out = np.empty(n)
-        contact_pairs.free_fractions(x, *motion, *self._geometry, KEPT_FRACTION, out)
-        return out
-
-    def collision_free_fractions(
-        self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval
-    ) -> Array:
-        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which each owned pair does not
-        collide, (n_owned,), while obstacles move as in an interval of the step.
+    def largest_steps(self, x: Array, dx: Array, frozen: ObstaclePositions, interval: StepInterval) -> Array:
+        """Fraction, up to 1, of the displacement dx (n_local, 3) [m] from x on which each pair alone does not
+        collide, (E,), while obstacles move as in an interval of the step.
         """
-        return self._free_fractions(x, frozen.displacements(interval, dx), self.n_owned)
+        motion, out = frozen.displacements(interval, dx), np.empty(self.n_elements)
+        contact_pairs.largest_steps(x, *motion, *self._geometry, KEPT_FRACTION, out)
+        return out
 
     def may_collide(self, x: Array, dx: Array, frozen: ObstaclePositions, threshold: float) -> bool:
         """Whether any pair of this rank may come into contact in a step with displacement dx (n_local, 3) [m]
@@ -469,8 +463,7 @@ class ContactBarrier(LimitsStep):
         """
         if not self.moving:
             return dx
-        motion = frozen.displacements(TO_STAGE, dx)
-        blocked = self._free_fractions(x, motion, self.n_elements) < 1.0
+        blocked = self.largest_steps(x, dx, frozen, TO_STAGE) < 1.0
         moved = dx.copy()
         for number, (rotation, translation) in enumerate(frozen.stage_motions):
             points = self.points[blocked & (self.obstacle == number)]

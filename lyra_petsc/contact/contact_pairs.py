@@ -1107,7 +1107,7 @@ def largest_approach(dx, dx_obs):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def free_fraction(x, x_obs, dx, dx_obs, kind, points, offset, far, keep, maximum):  # type: ignore[no-untyped-def]  # fmt: skip
+def largest_step(x, x_obs, dx, dx_obs, kind, points, offset, far, keep, maximum):  # type: ignore[no-untyped-def]  # fmt: skip
     """Fraction, up to ``maximum``, of displacements dx, dx_obs on which no pair comes too near.
 
     Each pair keeps at least the part ``keep`` of its distance less the offset, or of ``far`` (E,) [m] if that
@@ -1115,12 +1115,12 @@ def free_fraction(x, x_obs, dx, dx_obs, kind, points, offset, far, keep, maximum
     contact, ACM Trans. Graph. 40 (2021) 170, algorithm 1. It is 0 for a plane that turns by more than 120°.
     """
     approach = largest_approach(dx, dx_obs)
-    return _pairs_free_fraction(x, x_obs, dx, dx_obs, approach, kind, points, offset, far, keep, maximum)
+    return _largest_step(x, x_obs, dx, dx_obs, approach, kind, points, offset, far, keep, maximum)
 
 
 @kernel()
-def _pairs_free_fraction(x, x_obs, dx, dx_obs, approach, kind, points, offset, far, keep, maximum):  # type: ignore[no-untyped-def]  # fmt: skip
-    """`free_fraction`, where no two points approach each other by more than ``approach`` [m]."""
+def _largest_step(x, x_obs, dx, dx_obs, approach, kind, points, offset, far, keep, maximum):  # type: ignore[no-untyped-def]  # fmt: skip
+    """`largest_step`, where no two points approach each other by more than ``approach`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(kind)):
         _load_points(x, x_obs, points, e, p)
@@ -1257,13 +1257,13 @@ def cancel_negative(kind, vertex, normal, values):  # type: ignore[no-untyped-de
 
 
 @kernel()
-def free_fractions(x, x_obs, dx, dx_obs, kind, points, offset, far, keep, out):  # type: ignore[no-untyped-def]
-    """Write the `free_fraction` of each of the first len(out) pairs alone to out."""
+def largest_steps(x, x_obs, dx, dx_obs, kind, points, offset, far, keep, out):  # type: ignore[no-untyped-def]
+    """Write the `largest_step` of each of the first len(out) pairs alone to out."""
     approach = largest_approach(dx, dx_obs)
     for e in range(len(out)):
         one = slice(e, e + 1)
         pair = kind[one], points[one], offset[one], far[one]
-        out[e] = _pairs_free_fraction(x, x_obs, dx, dx_obs, approach, *pair, keep, 1.0)
+        out[e] = _largest_step(x, x_obs, dx, dx_obs, approach, *pair, keep, 1.0)
 
 
 @kernel()

@@ -68,8 +68,8 @@ def blocking_pair(contact: SceneContact, x: Array, frozen: ObstaclePositions) ->
     refused = contact.collisions.refused
     if refused is None:
         return nearest_pair(contact, x, frozen)
-    free = contact.barrier.collision_free_fractions(refused.x, refused.displacement, frozen, refused.part)
-    return _worst(contact, refused.x, frozen, 1.0 - free)
+    steps = contact.barrier.largest_steps(refused.x, refused.displacement, frozen, refused.part)
+    return _worst(contact, refused.x, frozen, 1.0 - steps[: contact.barrier.n_owned])
 
 
 def nearest_obstacle(contact: SceneContact, x: Array, frozen: ObstaclePositions) -> NearPair | None:

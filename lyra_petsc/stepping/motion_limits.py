@@ -35,7 +35,7 @@ def largest_step(system: StageEquations, v: Array, increment: Array) -> float:
     """Largest fraction of an increment (n_owned, 3) [m/s] from v that may be taken."""
     reach = system.step.stage.c
     turn = 0.0 if system.integrator.dynamic else system.directors.largest_turn(increment * reach)
-    return _free_fraction(system, v, increment, MAX_TURN / turn if turn > MAX_TURN else 1.0)
+    return _largest_step(system, v, increment, MAX_TURN / turn if turn > MAX_TURN else 1.0)
 
 
 def are_kept(system: StageEquations, x: Array) -> bool:
@@ -47,10 +47,10 @@ def are_kept(system: StageEquations, x: Array) -> bool:
 
 def moves_freely(system: StageEquations, v: Array, increment: Array) -> bool:
     """Whether no collision limits an increment (n_owned, 3) [m/s] from v."""
-    return _free_fraction(system, v, increment, 1.0) == 1.0
+    return _largest_step(system, v, increment, 1.0) == 1.0
 
 
-def _free_fraction(system: StageEquations, v: Array, increment: Array, maximum: float) -> float:
+def _largest_step(system: StageEquations, v: Array, increment: Array, maximum: float) -> float:
     frozen, contact = system.step.frozen, system.contact
     if system.active.limiting:
         x, displacement = system.displacement(v, increment)

@@ -92,12 +92,10 @@ class Pairs:
         each = blocks_of(self.x, self.obstacle_x, of, active, blend)
         return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
-    def free_fraction(self, dx: Array, obstacle_dx: Array, e: int | None = None, most: float = 1.0) -> float:
+    def largest_step(self, dx: Array, obstacle_dx: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
         pairs = self.kind[at], self.points[at], self.offset[at], np.full(len(self), GAP)[at]
-        return float(
-            contact_pairs.free_fraction(self.x, self.obstacle_x, dx, obstacle_dx, *pairs, KEPT, most)
-        )
+        return float(contact_pairs.largest_step(self.x, self.obstacle_x, dx, obstacle_dx, *pairs, KEPT, most))
 
 
 ACTIVE_COLUMNS = ["at", "weight", "beta", "derivatives"]
@@ -310,7 +308,7 @@ def closest(pairs: Pairs, e: int, dx: Array, obstacle_dx: Array, end: float) -> 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0, 100.0])
 @pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
-def test_free_fractions(name: str, speed: float) -> None:
+def test_largest_steps_without_a_collision(name: str, speed: float) -> None:
     pairs = KINDS[name][0]()
     pairs = pairs.part(pairs.distances() > pairs.offset).part(slice(0, 120))
     rng = np.random.default_rng(11)
@@ -319,7 +317,7 @@ def test_free_fractions(name: str, speed: float) -> None:
         obstacle_dx[1::2] = 0.0  # planes that do not turn
     limited, found = 0, []
     for e in range(len(pairs)):
-        found.append(fraction := pairs.free_fraction(dx, obstacle_dx, e))
+        found.append(fraction := pairs.largest_step(dx, obstacle_dx, e))
         assert 0.0 < fraction <= 1.0
         least, last = closest(pairs, e, dx, obstacle_dx, fraction)
         assert least >= KEPT - 1e-12
@@ -327,8 +325,8 @@ def test_free_fractions(name: str, speed: float) -> None:
             limited += 1
             assert last <= KEPT + (1.0 - KEPT) * CCD_TOLERANCE + 1e-12
     assert limited > 5 or speed < 1.0
-    assert pairs.free_fraction(dx, obstacle_dx) == min(found)
-    assert pairs.free_fraction(dx, obstacle_dx, most=0.5 * min(found)) == 0.5 * min(found)
+    assert pairs.largest_step(dx, obstacle_dx) == min(found)
+    assert pairs.largest_step(dx, obstacle_dx, most=0.5 * min(found)) == 0.5 * min(found)
 
 
 def test_a_common_motion_of_both_is_free() -> None:
@@ -339,7 +337,7 @@ def test_a_common_motion_of_both_is_free() -> None:
         obstacle_dx = np.tile([30.0, -20.0, 50.0], (len(pairs.obstacle_x), 1))
         if len(pairs.obstacle_x) and pairs.kind[0] == VERTEX_PLANE:
             obstacle_dx[1::2] = 0.0
-        assert pairs.free_fraction(dx, obstacle_dx) == 1.0
+        assert pairs.largest_step(dx, obstacle_dx) == 1.0
 
 
 def test_planes_that_turn() -> None:
@@ -351,7 +349,7 @@ def test_planes_that_turn() -> None:
     dx = rng.normal(size=pairs.x.shape)
     limited = 0
     for e in range(len(pairs)):
-        fraction = pairs.free_fraction(dx, obstacle_dx, e)
+        fraction = pairs.largest_step(dx, obstacle_dx, e)
         limited += fraction < 1.0
         for t in np.linspace(0.0, fraction, 50):
             point, normal = pairs.obstacle_x[2 * e], pairs.obstacle_x[2 * e + 1] + t * obstacle_dx[2 * e + 1]
