@@ -205,6 +205,61 @@ def _order(key: Ints) -> Ints:
     return sort_rows(np.arange(len(key)), key)
 
 
+def _unpacked(data: Array) -> list[Array]:
+    """Arrays for pairs with ``data`` (E, 35), as from `friction_pairs.unpack`."""
+    shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
+    arrays = [np.empty((len(data), *shape)) for shape in shapes]
+    friction_pairs.unpack(data, *arrays)
+    return arrays
+
+
+def _restored_pairs(
+    vertices: Ints,
+    values: Array,
+    places_before: Mapping[str, tuple[int, int]],
+    places: Mapping[str, tuple[int, int]],
+) -> Pairs:
+    """The pairs of a checkpoint with ``vertices`` (E, 4) and ``values`` as in `CoulombFriction.state`.
+
+    Their obstacles had the numbers and first points ``places_before``, and now have ``places`` or are gone;
+    `CoulombFriction.initialise_pairs` finds what is not in a checkpoint.
+    """
+    obstacle, kept = values[:, 1].copy(), np.ones(len(values), dtype=np.bool_)
+    values = values.copy()
+    for name, (number, first) in places_before.items():
+        at = np.flatnonzero(obstacle == number)
+        kept[at] = name in places
+        values[at, 1], now = places.get(name, (number, first))
+        points = values[at, 2:6]
+        values[at, 2:6] = np.where(points < 0, points + (first - now), points)
+    vertices, values = vertices[kept], values[kept]
+    identity = values[:, :6].astype(np.int64)
+    slip, edges, sheets = values[:, 6:9].copy(), identity[:, 0] == EDGE_EDGE, identity[:, 1] < 0
+    # the order of vertices in an edge depends on their present numbers
+    for rows, first in ((edges, 0), (edges & sheets, 2)):
+        reversed_ = rows & (vertices[:, first] > vertices[:, first + 1])
+        vertices[reversed_, first : first + 2] = vertices[reversed_, first : first + 2][:, ::-1]
+    vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
+    swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
+    vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
+    key = np.column_stack([vertices, identity])
+    order = _order(key)
+    zeros = np.zeros((len(key), COLUMNS - values.shape[1]))
+    data = np.column_stack([identity, slip, values[:, 9], zeros])
+    return Pairs(key[order], data[order], vertices[order])
+
+
+def _move_with_obstacles(data: Array, motions: list[tuple[Array, Array]]) -> None:
+    """Move the contact points of pairs ``data`` (E, 35), and rotate their slip, with the obstacles."""
+    for obstacle, (rotation, translation) in enumerate(motions):
+        rows = np.flatnonzero(data[:, 1] == obstacle)
+        side = data[rows, BETA : BETA + 4].sum(axis=1)[:, None]
+        point, slip = (data[rows, first : first + 3] for first in (CONTACT, SLIP))
+        moved = point @ rotation.T + translation
+        data[rows, START : START + 3] += side * (moved - point)
+        data[rows, CONTACT : CONTACT + 3], data[rows, SLIP : SLIP + 3] = moved, slip @ rotation.T
+
+
 class CoulombFriction(Stateful):
     """Friction of all pairs in contact during a step.
 
@@ -240,7 +295,7 @@ class CoulombFriction(Stateful):
         """
         self.set_elements(Elements(stencil, n_owned=n_counted))
         n = len(data)
-        unpacked = self._unpacked(data)
+        unpacked = _unpacked(data)
         self._beta, self._tangents, self._gradients, self._constant, self._slip, self._contact_point = (
             unpacked
         )
@@ -258,14 +313,6 @@ class CoulombFriction(Stateful):
             self._limit *= data[:, FACTOR]
             self._stiffness *= data[:, FACTOR]
         self._data_of: ObstacleMotion | None = None  # whose `_data` are stored
-
-    @staticmethod
-    def _unpacked(data: Array) -> list[Array]:
-        """Arrays for pairs with ``data`` (E, 35), as from `friction_pairs.unpack`."""
-        shapes = (4,), (2, 3), (2, 4, 3), (2,), (3,), (3,)
-        arrays = [np.empty((len(data), *shape)) for shape in shapes]
-        friction_pairs.unpack(data, *arrays)
-        return arrays
 
     @property
     def n_friction_pairs(self) -> int:
@@ -348,31 +395,7 @@ class CoulombFriction(Stateful):
         """Restore the pairs of a `state` with a vertex of this rank; ``places`` are the numbers and first
         points that the obstacles had.
         """
-        obstacle, kept = values[:, 1].copy(), np.ones(len(values), dtype=np.bool_)
-        values = values.copy()
-        for name, (number, first) in places.items():  # the scene's obstacles may be others, in another order
-            at = np.flatnonzero(obstacle == number)
-            now_places = self._contact.obstacles.places
-            kept[at] = name in now_places
-            values[at, 1], now = now_places.get(name, (number, first))
-            points = values[at, 2:6]
-            values[at, 2:6] = np.where(points < 0, points + (first - now), points)
-        vertices, values = vertices[kept], values[kept]
-        identity = values[:, :6].astype(np.int64)
-        slip, edges, sheets = values[:, 6:9].copy(), identity[:, 0] == EDGE_EDGE, identity[:, 1] < 0
-        # the order of vertices in an edge depends on their present numbers
-        for rows, first in ((edges, 0), (edges & sheets, 2)):
-            reversed_ = rows & (vertices[:, first] > vertices[:, first + 1])
-            vertices[reversed_, first : first + 2] = vertices[reversed_, first : first + 2][:, ::-1]
-        vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
-        swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
-        vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
-        key = np.column_stack([vertices, identity])
-        order = _order(key)
-        # `initialise_pairs` finds the zeros
-        zeros = np.zeros((len(key), COLUMNS - values.shape[1]))
-        rows = np.column_stack([identity, slip, values[:, 9], zeros])
-        self._pairs = Pairs(key[order], rows[order], vertices[order])
+        self._pairs = _restored_pairs(vertices, values, places, self._contact.obstacles.places)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -536,7 +559,7 @@ class CoulombFriction(Stateful):
         )
         of_slip = np.zeros((len(old.key) + 1, 3))
         of_slip[:-1] = -self._stiffness[owned, None] * old.data[:, SLIP:SLID]
-        arrays = self._unpacked(pairs.data)
+        arrays = _unpacked(pairs.data)
         beta, tangents, gradients = (
             np.concatenate([new, given[owned]])
             for new, given in zip(arrays[:3], (self._beta, self._tangents, self._gradients), strict=True)
@@ -625,24 +648,13 @@ class CoulombFriction(Stateful):
         # the same pairs as now, with slip from the start
         pairs, pair, _, previous = self._pairs_of(x, start_x, (beta, normal, force, pair), old)
         motions = contact.obstacles.rigid_motions(frozen.start if time is None else time, frozen.time)
-        self._move_with_obstacles(pairs.data, motions)
+        _move_with_obstacles(pairs.data, motions)
         continued = np.flatnonzero(previous >= 0)
         self._pairs.data[continued] = pairs.data[continued]
         vertices = contact.stencil[pair[continued], 0]
         self._work[vertices] = work[vertices]
         force = self._pairs.data[:, FORCE]
         return np.array([(self._work - work).sum(), force[previous < 0].sum(), force.sum()])
-
-    @staticmethod
-    def _move_with_obstacles(data: Array, motions: list[tuple[Array, Array]]) -> None:
-        """Move the contact points of pairs ``data`` (E, 35), and rotate their slip, with the obstacles."""
-        for obstacle, (rotation, translation) in enumerate(motions):
-            rows = np.flatnonzero(data[:, 1] == obstacle)
-            side = data[rows, BETA : BETA + 4].sum(axis=1)[:, None]
-            point, slip = (data[rows, first : first + 3] for first in (CONTACT, SLIP))
-            moved = point @ rotation.T + translation
-            data[rows, START : START + 3] += side * (moved - point)
-            data[rows, CONTACT : CONTACT + 3], data[rows, SLIP : SLIP + 3] = moved, slip @ rotation.T
 
     def friction_lag(self, x: Array, frozen: ObstacleMotion) -> dict[str, Array]:
         """How far friction is from the limit of the normal forces at positions x (n_local, 3).
