@@ -101,13 +101,17 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
 
 
 def _obstacle_work(system: StageEquations) -> float:
-    """Work [J] of moving obstacles on this rank's elements in the step, by their forces at the stage."""
+    """Work [J] of contact from outside on this rank's elements in the step: of moving obstacles by their
+    forces at the stage, and of the impulses at its end.
+    """
     contact, step = system.contact, system.step
-    if contact is None or not contact.obstacles_move:
+    if contact is None:
         return 0.0
-    at = step.at_stage if system.integrator.dynamic else step.end
-    work = contact.barrier.work(system.evaluated.x, at, step.start, step.end)
-    return work + (contact.impulses.work if contact.impulses else 0.0)
+    work = contact.impulses.work if contact.impulses else 0.0
+    if contact.obstacles_move:
+        at = step.at_stage if system.integrator.dynamic else step.end
+        work += contact.barrier.work(system.evaluated.x, at, step.start, step.end)
+    return work
 
 
 def _move_targets_to_end(system: StageEquations) -> float:

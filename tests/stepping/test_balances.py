@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import CLOTH, Simulation, grid
+from physics import CLOTH, Simulation, finished, grid
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import EnergyBalance
@@ -146,3 +146,21 @@ def test_reactions_of_a_sheet_at_rest_carry_its_weight(comm: MPI.Comm) -> None:
         held = np.abs(energy_balance.reaction).max(axis=1, initial=0.0) > 0.0
         assert comm.allreduce(int(held.sum())) == 6
         assert energy_balance.budget.kinetic < 1e-15
+
+
+def test_impulses_of_friction_work_from_outside(comm: MPI.Comm) -> None:
+    """Friction slows a sheet on a plane at rest: backward Euler's identity holds with its impulses."""
+    scene = {
+        "mesh": grid(0.1, 0.1, 3, 3, "alternating") | {"transform": {"translate": [0.0, 0.0, 0.004]}},
+        "material": {"young": 1e6, "poisson": 0.3, "thickness": 1e-3, "density": 0.3},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"gap": 0.005, "friction": 0.3},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}},
+        "initial": {"velocity": [1.0, 0.0, 0.0]},
+        "time": {"end": 0.05, "step": 0.005, "integrator": "beuler"},
+    }
+    with finished(comm, scene) as simulation:
+        assert simulation.guard is not None
+        found = simulation.guard.content()
+    parts = found["identity"]["velocity_changes"] - found["identity"]["bracket"]
+    assert parts == pytest.approx(found["numerical_dissipation"], rel=1e-3)
