@@ -74,8 +74,12 @@ class NotebookProgress(ProgressCallbacks):
         if shown:
             from IPython.display import display
             from rich.progress import BarColumn, Progress, TextColumn
+            from rich.table import Column
 
-            self._bar = Progress(BarColumn(), TextColumn("{task.description}", markup=False))
+            whole = Column(overflow="fold")  # folders may have long names
+            self._bar = Progress(
+                BarColumn(), TextColumn("{task.description}", markup=False, table_column=whole)
+            )
             self._task = self._bar.add_task("set-up and first step", total=1.0)
             self._handle = display(self._bar, display_id=True)
 

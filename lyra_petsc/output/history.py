@@ -15,7 +15,7 @@ import numpy as np
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.file_operations import atomic_write, open_output, writing
 from lyra_petsc.parallel import on_root
-from lyra_petsc.terms.registry import ENERGIES
+from lyra_petsc.terms.energies import ENERGIES
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -29,14 +29,14 @@ from lyra_petsc.output.stored import (
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.tensors import COMPONENTS, is_tensor
 from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
-from lyra_petsc.terms import registry
+from lyra_petsc.terms import energies
 
 if TYPE_CHECKING:
     from lyra_petsc.scene.schema import Scene
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 
-ENERGIES = ("kinetic_energy", *registry.ENERGIES)
+ENERGIES = ("kinetic_energy", *energies.ENERGIES)
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 INTEGER_COLUMNS = frozenset({"step", *ITERATIONS})
 TEXT_COLUMNS = frozenset({"obstacle"})

@@ -19,7 +19,7 @@ from lyra_petsc.output.history import (
     vector_columns,
 )
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
-from lyra_petsc.terms.registry import ENERGIES
+from lyra_petsc.terms.energies import ENERGIES
 
 Row: TypeAlias = Mapping[str, float | str]
 

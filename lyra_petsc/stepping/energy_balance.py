@@ -17,8 +17,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.directors import move_frames_to_end
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import kinetic_energy
+from lyra_petsc.terms.energies import ENERGIES
 from lyra_petsc.terms.protocols import Dissipates, MovingTargets, PullsHandles
-from lyra_petsc.terms.registry import ENERGIES
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 

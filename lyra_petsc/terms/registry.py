@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import Scene, coefficients
+from lyra_petsc.terms.energies import BENDING, MEMBRANE, POTENTIAL
 
 if TYPE_CHECKING:
     from lyra_petsc.mesh.elements import Elements
     from lyra_petsc.terms.term import Term
-
-MEMBRANE, BENDING, POTENTIAL = ENERGIES = "membrane_energy", "bending_energy", "potential_energy"
-"""Columns of history.csv that every run has, to which several terms add their energies."""
 
 Need = Callable[[Scene, Sequence[ShellMaterial]], bool]
 

@@ -80,7 +80,7 @@ WORDS: list[tuple[list[str], str]] = [
         ],
         "scene.yaml: motions.fast: goes at 1e+09 m/s",
     ),
-    (["report", LONG], "File name too long"),
+    (["report", LONG], "file name too long"),
     (["check", "scene.yaml", f"--{LONG}"], "no such option"),
     (["export", "run"], "Missing option '--to'"),
     (["export", "run", "--to", "objj"], "--to: unknown format 'objj', did you mean 'obj'"),

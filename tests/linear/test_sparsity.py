@@ -117,6 +117,7 @@ def of_membrane() -> set[str]:
 
 
 MEMBRANE_SCENE = {
+    "energies",
     "handles",
     "handles.motion",
     "handles.prescribed_handles",

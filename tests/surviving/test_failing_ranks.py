@@ -51,8 +51,8 @@ PLACES = {
     "meshing": ("stepping.problem", "build_scene_mesh", 0),
     "distributing": ("stepping.problem", "distribute", 0),
     "assembly": ("linear.discretisation", "BlockPattern", 0),
-    "residual": ("stepping.stage_equations", "StageEquations.residual", 25),
-    "jacobian": ("stepping.stage_equations", "StageEquations.jacobian", 9),
+    "residual": ("stepping.forces", "StageForces.residual", 25),
+    "jacobian": ("stepping.forces", "StageForces.jacobian", 9),
     "writing a state": ("output.states", "write_rows", 3),
     "a row of the history": ("output.recorder", "Recorder._write_row", 4),
 }
