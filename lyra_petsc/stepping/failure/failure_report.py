@@ -14,7 +14,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure.failure_diagnosis import SNES, Diagnosis, diagnose
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.problem import Problem
-from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.stepping.stepper import BEYOND_LIMIT, Attempt, Stepper
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.nearest_pair import NearPair
@@ -252,6 +252,8 @@ def explain_failure(
             "smaller loads or initial velocities, or a larger contact.gap",
             f"{shorter}; time.integrator: beuler is the most robust at impacts",
         ]
+    elif attempts[-1].words == BEYOND_LIMIT:
+        advice += ["a shorter motion of the handles, or a larger material.stretch_limit", shorter]
     elif kind == "overflow":
         parts = f" (overflow in: {', '.join(diagnosis.overflowing)})" if diagnosis.overflowing else ""
         advice += [f"smaller numbers where one is absurd, or has the wrong unit{parts}"]
