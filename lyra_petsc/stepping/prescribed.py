@@ -83,8 +83,6 @@ class Prescriptions:
 
     def of_step(self, t0: float, t1: float, x: Array) -> PrescribedUnknowns:
         """What handles prescribe in the step t0..t1 [s] from positions x (n_local, 3); collective."""
-        if not self._held:
-            return self.none
         active = self._held.active(t0, t1)
         # ranks own different vertices of a handle, but all agree on which handles hold
         if self._active is None or self._active[0] != active:
