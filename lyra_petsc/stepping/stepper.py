@@ -457,12 +457,12 @@ class Stepper:
         self._linear_failed = False
         if not self._iterates:
             self.linear.reuse.end_solve(self.ksp.getIterationNumber())
-        ended, names = self.snes.getConvergedReason(), PETSc.SNES.ConvergedReason
-        if self._iterates and (ended > 0 or ended == names.DIVERGED_LINE_SEARCH):
+        reason, known = self.snes.getConvergedReason(), PETSc.SNES.ConvergedReason
+        if self._iterates and (reason > 0 or reason == known.DIVERGED_LINE_SEARCH):
             if not self._newton.convergence.accepts_last_iterate():
-                self.snes.setConvergedReason(names.DIVERGED_LINE_SEARCH)
-            elif ended < 0:
-                self.snes.setConvergedReason(names.CONVERGED_FNORM_ABS)
+                self.snes.setConvergedReason(known.DIVERGED_LINE_SEARCH)
+            elif reason < 0:
+                self.snes.setConvergedReason(known.CONVERGED_FNORM_ABS)
                 self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
