@@ -26,9 +26,9 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 Ints = NDArray[np.int64] | NDArray[np.int32]
 
 
-def frozen_by(term: Elastic | Viscous, system: StageEquations, x: Array | None = None) -> Any:
+def frozen_by(term: Elastic | Viscous, equations: StageEquations, x: Array | None = None) -> Any:
     """Frozen data of a term for a step from 0 s to 0.01 s, at positions x instead of the state's."""
-    return term.freeze(UpcomingStep(0.0, 0.01, 0.01, system.x if x is None else x, system.reference.at))
+    return term.freeze(UpcomingStep(0.0, 0.01, 0.01, equations.x if x is None else x, equations.reference.at))
 
 
 def gradient(term: Elastic | Viscous, at: Array, frozen: Any) -> Array:

@@ -157,7 +157,7 @@ def finished(comm: MPI.Comm, scene: Scene | dict[str, Any], **petsc: Any) -> Ite
 
 def shape(simulation: SteppedScene) -> Array:
     """Positions (V, 3) [m] in mesh order, on every rank."""
-    return gathered(simulation.problem.points, simulation.problem.system.x)
+    return gathered(simulation.problem.points, simulation.problem.equations.x)
 
 
 class Simulation:
@@ -184,14 +184,14 @@ class Simulation:
         self.scene = scene_of(content)
         self.comm = comm
         self.problem: Problem = build_problem(comm, self.scene, Phases())
-        self.system = self.problem.system
+        self.equations = self.problem.equations
         whole = self.problem.whole
         self.stepper = Stepper(
             self.scene,
-            self.system,
+            self.equations,
             self.problem.surface,
             whole.spacing,
-            residual_roundoff(self.system, whole.largest_coordinate),
+            residual_roundoff(self.equations, whole.largest_coordinate),
         )
         self.stepper.start(0.0, 0)
         self.time = 0.0
@@ -216,21 +216,21 @@ class Simulation:
     @property
     def x(self) -> Array:
         """Positions (V, 3) [m] in mesh order, on every rank."""
-        return self.gather(self.system.x)
+        return self.gather(self.equations.x)
 
     @property
     def v(self) -> Array:
         """Velocities (V, 3) [m/s] in mesh order, on every rank."""
-        return self.gather(self.system.v)
+        return self.gather(self.equations.v)
 
     @property
     def mass(self) -> Array:
         """Masses (V,) [kg] in mesh order, on every rank."""
-        return self.gather(self.system.mass)
+        return self.gather(self.equations.mass)
 
     def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
         """Replace positions or velocities, (V, 3) in mesh order."""
-        layout, state = self.problem.points, self.system.state
+        layout, state = self.problem.points, self.equations.state
         rows = slice(0, layout.n_vertices)
         if x is not None:
             state.x[rows] = x[layout.mesh_vertices]
@@ -243,14 +243,16 @@ class Simulation:
         term = self.problem.terms[name]
         assert isinstance(term, Elastic)
         return float(
-            self.comm.allreduce(float(term.energies(self.system.x, self.system.step.frozen[term]).sum()))
+            self.comm.allreduce(
+                float(term.energies(self.equations.x, self.equations.step.frozen[term]).sum())
+            )
         )
 
     # -- steps -----------------------------------------------------------------------------------------
 
     def step(self, dt: float) -> Attempt:
         """Compute one step, which must converge."""
-        self.system.set_references(self.time)
+        self.equations.set_references(self.time)
         end = self.time + dt
         attempt = self.stepper.attempt(self.time, end)
         assert attempt.converged, f"step to {end} s: {attempt}"

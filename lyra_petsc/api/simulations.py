@@ -165,12 +165,12 @@ class Simulation:
     @property
     def positions(self) -> Array:
         """Current positions (n, 3) [m] of this rank's vertices, a copy."""
-        return self._running.problem.system.x[: len(self.vertices)].copy()
+        return self._running.problem.equations.x[: len(self.vertices)].copy()
 
     @property
     def velocities(self) -> Array:
         """Current velocities (n, 3) [m/s] of this rank's vertices, a copy."""
-        return np.array(self._running.problem.system.output_velocity()[: len(self.vertices)])
+        return np.array(self._running.problem.equations.output_velocity()[: len(self.vertices)])
 
     def field(self, name: str) -> Array:
         """A field of those that a scene's ``output.fields`` may name, on this rank's vertices or triangles.

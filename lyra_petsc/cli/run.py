@@ -124,7 +124,7 @@ class TerminalProgress(ProgressCallbacks):
             start=simulation.time,
             plain=petsc_prints(),
             clock=lambda: time.monotonic() - COMPILATION.seconds,
-            unit="s" if simulation.problem.system.integrator.dynamic else "",
+            unit="s" if simulation.problem.equations.integrator.dynamic else "",
         )
         if self._usual is not None and folder != self._usual:
             self.note(f"{self._usual} exists: the results go to {folder} (--force would replace it)")

@@ -119,32 +119,32 @@ class Trial:
     @property
     def x(self) -> Array:
         """Positions (V, 3) [m] in mesh order."""
-        return self.gather(self.simulation.problem.system.x)
+        return self.gather(self.simulation.problem.equations.x)
 
     @property
     def v(self) -> Array:
         """Velocities (V, 3) [m/s] in mesh order."""
-        return self.gather(self.simulation.problem.system.v)
+        return self.gather(self.simulation.problem.equations.v)
 
     @property
     def mass(self) -> Array:
         """Masses (V,) [kg] in mesh order."""
-        return self.gather(self.simulation.problem.system.mass)
+        return self.gather(self.simulation.problem.equations.mass)
 
     def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
         """Replace positions [m] or velocities [m/s], (V, 3) in mesh order; collective."""
         problem = self.simulation.problem
-        for target, values in ((problem.system.x, x), (problem.system.v, v)):
+        for target, values in ((problem.equations.x, x), (problem.equations.v, v)):
             if values is not None:
                 target[: problem.points.n_vertices] = values[problem.points.mesh_vertices]
                 problem.points.update_ghosts(target)
-        for term in problem.system.active.elastic if x is not None else ():
+        for term in problem.equations.active.elastic if x is not None else ():
             if isinstance(term, MidEdge):
                 own = term.edge_indices < 3 * problem.points.n_owned
-                directors = term.reset_frames(problem.system.x)
-                problem.system.x.reshape(-1)[term.edge_indices[own]] = directors[own]
-                problem.points.update_ghosts(problem.system.x)
-                problem.system.refreeze({term: term.frames})
+                directors = term.reset_frames(problem.equations.x)
+                problem.equations.x.reshape(-1)[term.edge_indices[own]] = directors[own]
+                problem.points.update_ghosts(problem.equations.x)
+                problem.equations.refreeze({term: term.frames})
         self.simulation.energy_balance.measure()  # the next step compares its energies with these
         if self.simulation.guard is not None:
             self.simulation.guard.forget_end()
@@ -269,7 +269,7 @@ class Bench:
             x: Array
 
             def done(self, simulation: SteppedScene, folder: Path) -> None:
-                self.x = simulation.problem.points.gather(simulation.problem.system.x)
+                self.x = simulation.problem.points.gather(simulation.problem.equations.x)
 
         def stop() -> int:
             self.watch()

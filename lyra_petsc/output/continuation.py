@@ -37,10 +37,10 @@ def used_groups(scene: Scene) -> set[str]:
 
 def term_arrays(simulation: SteppedScene) -> TermArrays:
     """The arrays of the scene's terms in checkpoints; collective."""
-    system, terms = simulation.problem.system, simulation.problem.terms
-    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(system).items()}
+    equations, terms = simulation.problem.equations, simulation.problem.terms
+    widths = {name: rows.shape[1] for name, rows in term_states.element_arrays(equations).items()}
     elements = {name: (terms[name].stencil.shape[1], n) for name, n in widths.items()}
-    vertices, edges = term_states.vertex_arrays(system), term_states.edge_arrays(system)
+    vertices, edges = term_states.vertex_arrays(equations), term_states.edge_arrays(equations)
     return TermArrays(vertices.keys(), edges.keys(), elements)
 
 
@@ -71,13 +71,13 @@ def restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrde
 
 def _restore(simulation: SteppedScene, checkpoint: Checkpoint, vertices: FileOrder) -> None:
     scalars, terms = checkpoint.scalars, simulation.problem.terms
-    system, layout = simulation.problem.system, simulation.problem.points
+    equations, layout = simulation.problem.equations, simulation.problem.points
     arrays = {
         name: layout.join(values, checkpoint.edges.get(name)) for name, values in checkpoint.arrays.items()
     }
     for number, start in enumerate(scalars["late_starts"]):
-        system.reference.restore(float(start), arrays[f"start_{number}"])
-    system.state.set(arrays["position"], arrays["velocity"])
+        equations.reference.restore(float(start), arrays[f"start_{number}"])
+    equations.state.set(arrays["position"], arrays["velocity"])
     own = layout.start + np.arange(layout.n_vertices)
 
     def changing_elements(n: int, rows: Array) -> tuple[Ints, Array]:

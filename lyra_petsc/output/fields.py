@@ -27,30 +27,30 @@ Ints = NDArray[np.int32]
 
 
 def _velocity(problem: Problem) -> Array:
-    return problem.system.output_velocity()[: problem.points.n_vertices]
+    return problem.equations.output_velocity()[: problem.points.n_vertices]
 
 
 def _displacement(problem: Problem) -> Array:
     """Displacement from the positions at t = 0."""
     assert problem.start is not None  # see `check_field`
-    return problem.system.x[: problem.points.n_vertices] - problem.start
+    return problem.equations.x[: problem.points.n_vertices] - problem.start
 
 
 def _green_strain(problem: Problem) -> Array:
     """Green strain in material axes; see `tensors`."""
-    strain, _ = problem.membrane.strain_and_stress(problem.system.x)
+    strain, _ = problem.membrane.strain_and_stress(problem.equations.x)
     return six_components(strain[: problem.membrane.n_owned])
 
 
 def _stress(problem: Problem) -> Array:
     """Second Piola-Kirchhoff stress in material axes; see `tensors`."""
-    _, stress = problem.membrane.strain_and_stress(problem.system.x)
+    _, stress = problem.membrane.strain_and_stress(problem.equations.x)
     return six_components(stress[: problem.membrane.n_owned])
 
 
 def _membrane_energy(problem: Problem) -> Array:
     membrane = problem.membrane
-    return membrane.energies(problem.system.x) / membrane.elements.data["area"][: membrane.n_owned]
+    return membrane.energies(problem.equations.x) / membrane.elements.data["area"][: membrane.n_owned]
 
 
 def _density_on_vertices(problem: Problem, rows: Ints, values: Array) -> Array:
@@ -70,14 +70,14 @@ def _bending_density(problem: Problem, of_hinges: OnHinges, of_triangles: OnTria
 
     A hinge's value is divided between the two ends of its edge, a triangle's among its three corners.
     """
-    x, out = problem.system.x, np.zeros(problem.points.n_vertices)
+    x, out = problem.equations.x, np.zeros(problem.points.n_vertices)
     if "bending" in problem.terms:
         hinges = cast("Bending", problem.terms["bending"])
         halves = np.repeat(0.5 * of_hinges(hinges, x), 2)
         out += _density_on_vertices(problem, hinges.stencil[:, :2].ravel(), halves)
     if "midedge" in problem.terms:
         midedge = cast("MidEdge", problem.terms["midedge"])
-        thirds = np.repeat(of_triangles(midedge, x, problem.system.step.frozen[midedge]) / 3.0, 3)
+        thirds = np.repeat(of_triangles(midedge, x, problem.equations.step.frozen[midedge]) / 3.0, 3)
         out += _density_on_vertices(problem, midedge.stencil.ravel(), thirds)
     return out
 
@@ -104,7 +104,7 @@ def _curvature(problem: Problem) -> Array:
 
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
-    found = midedge.curvatures(problem.system.x, problem.system.step.frozen[midedge])[: midedge.n_owned]
+    found = midedge.curvatures(problem.equations.x, problem.equations.step.frozen[midedge])[: midedge.n_owned]
     out = np.zeros((problem.membrane.n_owned, 3))  # stays zero for triangles without bending stiffness
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)
@@ -115,10 +115,10 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 def _contact_pressure(problem: Problem) -> Array:
     """Contact pressure from the sum of the normal forces on both sides; collective."""
-    contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
-    forces = np.zeros_like(system.x)
-    forces[:, 0] = contact.normal_forces(system.x, system.step.frozen[contact])
-    system.points.add_to_owners(forces)
+    contact, equations = cast("ContactBarrier", problem.terms["contact"]), problem.equations
+    forces = np.zeros_like(equations.x)
+    forces[:, 0] = contact.normal_forces(equations.x, equations.step.frozen[contact])
+    equations.points.add_to_owners(forces)
     return _density_on_vertices(
         problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0])
     )

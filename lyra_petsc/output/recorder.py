@@ -176,7 +176,7 @@ class Recorder:
         self._states.write(
             simulation.step_number,
             simulation.time,
-            problem.system.x[: problem.points.n_vertices],
+            problem.equations.x[: problem.points.n_vertices],
             {field.name: (field.on, field.compute(problem)) for field in self._fields},
         )
         self._last_state = simulation.step_number
@@ -185,18 +185,18 @@ class Recorder:
     def write_checkpoint(self, began: float | None = None) -> None:
         """Write a checkpoint of the present state; its duration counts from ``began`` on, if given."""
         simulation = self._simulation
-        system, layout = simulation.problem.system, simulation.problem.points
+        equations, layout = simulation.problem.equations, simulation.problem.points
         n, (saved, scalars) = layout.n_owned, simulation.saved_state()
-        rows = {"position": system.x[:n], "velocity": system.v[:n], **saved}
-        for number, start in enumerate(sorted(system.reference.late)):
-            rows[f"start_{number}"] = system.reference.late[start]
+        rows = {"position": equations.x[:n], "velocity": equations.v[:n], **saved}
+        for number, start in enumerate(sorted(equations.reference.late)):
+            rows[f"start_{number}"] = equations.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()}
-        arrays |= term_states.vertex_arrays(system)
+        arrays |= term_states.vertex_arrays(equations)
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
-        edges |= term_states.edge_arrays(system)
+        edges |= term_states.edge_arrays(equations)
         scalars["last_state"] = self._last_state
         began = clock.monotonic() if began is None else began
-        elements = term_states.element_arrays(system)
+        elements = term_states.element_arrays(equations)
         self._wait_for_disk()  # the previous checkpoint is safe before this one takes its place
         self._checkpoints.write(arrays, scalars, edges, elements)
         if self._comm.rank == 0:
@@ -209,18 +209,21 @@ class Recorder:
         """Write the files on a failed step: its cause, the state before it and the failing iterate."""
         simulation, failure = self._simulation, self._simulation.failure
         assert failure is not None
-        system, n = simulation.problem.system, simulation.problem.points.n_vertices
+        equations, n = simulation.problem.equations, simulation.problem.points.n_vertices
         stuck = failure.failed_solve.of_vertices(n)
-        before = {"velocity": system.v[:n]}  # the equations of the failed step do not hold it
+        before = {"velocity": equations.v[:n]}  # the equations of the failed step do not hold it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
         # positions that are not finite could not be drawn
-        position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])
+        position = np.where(np.isfinite(stuck.position), stuck.position, equations.x[:n])
         write_failure(
             self._folder,
             self._vertices,
             simulation.problem.whole.n_triangles,
             simulation.step_number,
-            (FailureState(failure.time, system.x[:n], before), FailureState(stuck.time, position, failing)),
+            (
+                FailureState(failure.time, equations.x[:n], before),
+                FailureState(stuck.time, position, failing),
+            ),
             failure.text,
         )
 

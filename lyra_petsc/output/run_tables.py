@@ -39,7 +39,7 @@ class RunTables:
 
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
-        scene, held = simulation.scene, simulation.problem.system.held
+        scene, held = simulation.scene, simulation.problem.equations.held
         term_columns = tuple(simulation.energy_balance.column_names)
         self.columns: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *term_columns)}
         if scene.probes:
@@ -124,7 +124,7 @@ class RunTables:
         problem = self._simulation.problem
         local = np.zeros((len(problem.probes), 4))
         for row, vertices in enumerate(problem.probes.values()):
-            local[row, :3] = problem.system.x[vertices].sum(axis=0)
+            local[row, :3] = problem.equations.x[vertices].sum(axis=0)
             local[row, 3] = len(vertices)
         total = np.empty_like(local)
         problem.points.comm.Allreduce(local, total, MPI.SUM)

@@ -28,7 +28,7 @@ class Accuracy:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     control : ToleranceControl
     tolerance : float
         Error at the end of the run over ``size``.
@@ -43,18 +43,18 @@ class Accuracy:
     """
 
     def __init__(
-        self, system: StageEquations, control: ToleranceControl, tolerance: float, size: float
+        self, equations: StageEquations, control: ToleranceControl, tolerance: float, size: float
     ) -> None:
-        self._system, self._control, self._tolerance, self._size = system, control, tolerance, size
-        self.local_error = LocalError(system)
+        self._equations, self._control, self._tolerance, self._size = equations, control, tolerance, size
+        self.local_error = LocalError(equations)
         self.estimated = self._error = 0.0
 
     def accepts(self, v_before: Array, dt: float) -> bool:
         """Whether the error of a step of dt [s] from velocities v_before (n_owned, 3) is within its share."""
-        system = self._system
+        equations = self._equations
         self._error = self.local_error.estimate(v_before, dt) / self._size
-        ratio, touches = self._error / self._share(dt), system.has_active_pairs
-        order = system.integrator.order
+        ratio, touches = self._error / self._share(dt), equations.has_active_pairs
+        order = equations.integrator.order
         return self._control.accept(dt, ratio, order, self.minimum_dt(), touches=touches)
 
     def _share(self, dt: float) -> float:
@@ -64,7 +64,7 @@ class Accuracy:
         """Record the step that was accepted after ``step`` others at ``time`` [s]."""
         self.local_error.record_step(v_before, dt)
         self.estimated += self._error
-        usual, minimum = self._system.integrators.usual, self.minimum_dt()
+        usual, minimum = self._equations.integrators.usual, self.minimum_dt()
         if usual.order == 1 and step >= FIRST_ORDER_STEPS:
             notes.once(
                 "order",
@@ -81,9 +81,9 @@ class Accuracy:
 
     def minimum_dt(self) -> float:
         """Smallest Δt [s] while something touches; 0 if nothing does, or ``-ts_adapt_dt_min`` is given."""
-        system = self._system
-        if not system.has_active_pairs or is_set("ts_adapt_dt_min"):
+        equations = self._equations
+        if not equations.has_active_pairs or is_set("ts_adapt_dt_min"):
             return 0.0
-        fastest = float(system.points.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
-        through = (math.inf if system.contact is None else system.contact.skin) / max(fastest, 1e-300)
+        fastest = float(equations.points.comm.allreduce(np.abs(equations.v).max(initial=0.0), MPI.MAX))
+        through = (math.inf if equations.contact is None else equations.contact.skin) / max(fastest, 1e-300)
         return min(IMPACT_SKIN_FRACTION * through, IMPACT_RUN_FRACTION * self._control.end)

@@ -34,7 +34,7 @@ class CompressionWatch:
         membrane, comm = self._problem.membrane, self._problem.points.comm
         n = membrane.n_owned
         stretches = principal_stretches(
-            self._problem.system.x, membrane.stencil, membrane.elements.data["inverse"], n
+            self._problem.equations.x, membrane.stencil, membrane.elements.data["inverse"], n
         )
         local = np.array([np.inf, -np.inf])
         if n:

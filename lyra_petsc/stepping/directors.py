@@ -76,69 +76,71 @@ class Directors:
         return float(self._comm.allreduce(turn, MPI.MAX))
 
 
-def move_frames_to_end(system: StageEquations) -> None:
+def move_frames_to_end(equations: StageEquations) -> None:
     """Update the frames at the end of a step that is one linear solve."""
-    if system.active.with_edges and system.step.lagged and system.integrator.dynamic:
-        system.refreeze_end(system.directors.frames_at_end(system.x, system.step.frozen))
+    if equations.active.with_edges and equations.step.lagged and equations.integrator.dynamic:
+        equations.refreeze_end(equations.directors.frames_at_end(equations.x, equations.step.frozen))
 
 
-def update_frames(system: StageEquations, x: Array) -> bool:
+def update_frames(equations: StageEquations, x: Array) -> bool:
     """Update the frames of edges that have turned far from theirs to positions x (n_local, 3).
 
     Returns whether any changed, and with them the forces on vertices; collective.
     """
     found: dict[Term, Any] = {}
-    for term in () if system.step.of_edges else system.active.with_edges:
-        updated = term.updated_frames(x, system.step.frozen[term], system.step.prescribed.mask)
+    for term in () if equations.step.of_edges else equations.active.with_edges:
+        updated = term.updated_frames(x, equations.step.frozen[term], equations.step.prescribed.mask)
         found |= {} if updated is None else {term: updated}
-    if not system.points.comm.allreduce(len(found), MPI.MAX):
+    if not equations.points.comm.allreduce(len(found), MPI.MAX):
         return False
-    system.refreeze(found)
+    equations.refreeze(found)
     return True
 
 
-def transport_frames(system: StageEquations, frozen: Frozen | None = None) -> None:
+def transport_frames(equations: StageEquations, frozen: Frozen | None = None) -> None:
     """Transport the frames, those in use or in ``frozen``, to the present positions."""
-    frozen = system.step.frozen if frozen is None else frozen
-    for term in system.active.with_edges:
-        term.accept(system.x, frozen[term])
-    if system.active.with_edges:
-        system.change()  # where directors are loaded, forces on vertices depend on the frames
+    frozen = equations.step.frozen if frozen is None else frozen
+    for term in equations.active.with_edges:
+        term.accept(equations.x, frozen[term])
+    if equations.active.with_edges:
+        equations.change()  # where directors are loaded, forces on vertices depend on the frames
 
 
-def turn_with_triangles(system: StageEquations, v: Array, increment: Array) -> bool:
+def turn_with_triangles(equations: StageEquations, v: Array, increment: Array) -> bool:
     """Turn directors with their triangles where an increment (n_owned, 3) [m/s] from v turns them far.
 
     Changes ``increment``; returns whether it did; collective. The linear increment leads vertices off their
     circles, and directors much too far.
     """
-    terms, changed, reach = system.active.with_edges, 0, system.step.stage.c
-    if not terms or reach * system.directors.largest_turn(increment) <= LARGEST_ROTATION:
+    terms, changed, reach = equations.active.with_edges, 0, equations.step.stage.c
+    if not terms or reach * equations.directors.largest_turn(increment) <= LARGEST_ROTATION:
         return False
-    x, displacement = system.displacement(v, increment)
+    x, displacement = equations.displacement(v, increment)
     for term in terms:
-        changed += _set(system, increment, *term.edge_increments(x, displacement, system.step.frozen[term]))
-    return bool(system.points.comm.allreduce(changed, MPI.MAX))
+        changed += _set(
+            equations, increment, *term.edge_increments(x, displacement, equations.step.frozen[term])
+        )
+    return bool(equations.points.comm.allreduce(changed, MPI.MAX))
 
 
-def match(system: StageEquations, v: Array, increment: Array, curved: Array) -> None:
+def match(equations: StageEquations, v: Array, increment: Array, curved: Array) -> None:
     """Set the edges' unknowns in ``curved`` (n_owned, 3) [m/s], an increment from v along arcs.
 
     Each director gets the same angle to its triangles as by the linear ``increment``; collective.
     """
-    along = system.displacement(v, curved)[1]
-    x, displacement = system.displacement(v, increment)
-    for term in system.active.with_edges:
-        found = term.edge_increments(x, displacement, system.step.frozen[term], along)
-        _set(system, curved, *found)
+    along = equations.displacement(v, curved)[1]
+    x, displacement = equations.displacement(v, increment)
+    for term in equations.active.with_edges:
+        found = term.edge_increments(x, displacement, equations.step.frozen[term], along)
+        _set(equations, curved, *found)
 
 
-def _set(system: StageEquations, increment: Array, indices: Ints, values: Array) -> bool:
+def _set(equations: StageEquations, increment: Array, indices: Ints, values: Array) -> bool:
     """Put displacements (m,) [m] of the free unknowns ``indices`` (m,) into ``increment`` (n_owned, 3) [m/s].
 
     Returns whether there were any.
     """
     own = indices < increment.size
-    own[own] = system.step.prescribed.free.ravel()[indices[own]]
-    increment.reshape(-1)[indices[own]] = values[own] / system.step.stage.c
+    own[own] = equations.step.prescribed.free.ravel()[indices[own]]
+    increment.reshape(-1)[indices[own]] = values[own] / equations.step.stage.c
     return bool(own.any())

@@ -16,17 +16,21 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation, TimeStep
 
 
-def is_needed(system: StageEquations) -> bool:
+def is_needed(equations: StageEquations) -> bool:
     """Whether the edges' unknowns need a solve of their own at the end of the step."""
-    return bool(system.points.n_edges_global) and system.integrator.dynamic and not system.step.ends_at_stage
+    return (
+        bool(equations.points.n_edges_global)
+        and equations.integrator.dynamic
+        and not equations.step.ends_at_stage
+    )
 
 
-def initial_moments(system: StageEquations) -> float:
+def initial_moments(equations: StageEquations) -> float:
     """Norm [N] of the moments on free edges at the start of a run, handles set."""
-    time, layout = system.step.start, system.points
-    system.change(prescribed=system.prescriptions.of_step(time, time, system.x))
-    force = system.gradient_of(system.active.sheet, system.x)
-    moments = np.where(system.step.prescribed.free, force, 0.0)[layout.n_vertices :]
+    time, layout = equations.step.start, equations.points
+    equations.change(prescribed=equations.prescriptions.of_step(time, time, equations.x))
+    force = equations.gradient_of(equations.active.sheet, equations.x)
+    moments = np.where(equations.step.prescribed.free, force, 0.0)[layout.n_vertices :]
     return float(np.sqrt(layout.global_sum(float(np.vdot(moments, moments)))[0]))
 
 
@@ -45,32 +49,32 @@ class EdgeSolve:
     velocity: Array
 
     @classmethod
-    def begin(cls, system: StageEquations, x_before: Array) -> EdgeSolve:
+    def begin(cls, equations: StageEquations, x_before: Array) -> EdgeSolve:
         """Set up the equations at the end of the step just accepted, from x_before (n_owned, 3).
 
         Before the first step they are those at these positions, after `initial_moments`.
         """
-        step, n = system.step, len(system.mass)
-        interrupted, dt = cls(step, system.stage_velocity), step.dt or 1.0
-        system.predicted_stress.forget()
-        held = system.prescriptions.with_vertices(step.prescribed, system.x[:n])
-        system.change(
+        step, n = equations.step, len(equations.mass)
+        interrupted, dt = cls(step, equations.stage_velocity), step.dt or 1.0
+        equations.predicted_stress.forget()
+        held = equations.prescriptions.with_vertices(step.prescribed, equations.x[:n])
+        equations.change(
             stage=Stage(1.0 / dt, dt, dt),
             v_h=np.zeros((n, 3)),
-            x_h=system.points.extended(x_before),
-            frozen=system.active.with_targets(step.frozen, system.targets_at(step.end)),
+            x_h=equations.points.extended(x_before),
+            frozen=equations.active.with_targets(step.frozen, equations.targets_at(step.end)),
             prescribed=held.reaching(x_before, dt),
             linear=False,
             of_edges=True,
         )
         return interrupted
 
-    def end(self, system: StageEquations, solution: Evaluation | None) -> None:
+    def end(self, equations: StageEquations, solution: Evaluation | None) -> None:
         """Set the edges' unknowns from the stage that solves their equations, unless None, and return to the
         step.
         """
-        system.return_to(self.step)
-        system.predicted_stress.forget()
+        equations.return_to(self.step)
+        equations.predicted_stress.forget()
         if solution is not None:
-            system.state.set_edges(solution.x)
-        system.evaluate(self.velocity)
+            equations.state.set_edges(solution.x)
+        equations.evaluate(self.velocity)

@@ -100,28 +100,28 @@ def _work_of(force: Array, x_before: Array, x: Array) -> float:
     return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
 
 
-def _obstacle_work(system: StageEquations) -> float:
+def _obstacle_work(equations: StageEquations) -> float:
     """Work [J] of contact from outside on this rank's elements in the step: of moving obstacles by their
     forces at the stage, and of the impulses at its end.
     """
-    contact, step = system.contact, system.step
+    contact, step = equations.contact, equations.step
     if contact is None:
         return 0.0
     work = contact.impulses.work if contact.impulses else 0.0
     if contact.obstacles_move:
-        at = step.at_stage if system.integrator.dynamic else step.end
-        work += contact.barrier.work(system.evaluated.x, at, step.start, step.end)
+        at = step.at_stage if equations.integrator.dynamic else step.end
+        work += contact.barrier.work(equations.evaluated.x, at, step.start, step.end)
     return work
 
 
-def _move_targets_to_end(system: StageEquations) -> float:
+def _move_targets_to_end(equations: StageEquations) -> float:
     """Put moving targets at the end of the step; the change [J] of the energy of this rank's terms."""
-    step, active = system.step, system.active
+    step, active = equations.step, equations.active
     if step.ends_at_stage or not (active.moving or active.external):
         return 0.0
-    frozen = active.with_targets(step.frozen, system.targets_at(step.end))
-    system.change(frozen=frozen)
-    return active.moving_energy(system.x, frozen) - active.moving_energy(system.x, step.frozen)
+    frozen = active.with_targets(step.frozen, equations.targets_at(step.end))
+    equations.change(frozen=frozen)
+    return active.moving_energy(equations.x, frozen) - active.moving_energy(equations.x, step.frozen)
 
 
 class EnergyBalance:
@@ -138,22 +138,22 @@ class EnergyBalance:
 
     account: StepAccount
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system = system
-        named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations = equations
+        named = dict.fromkeys(term.registration.energy for term in equations.active.elastic)
         self._columns = [name for name in named if name not in (*ENERGIES, "")]
-        self._at = system.step.prescribed.indices
+        self._at = equations.step.prescribed.indices
         self._reactions = self.damping = np.zeros(len(self._at))
         self._ends: tuple[Array, list[tuple[Array, Array]]] | None = None
-        if not system.integrator.dynamic:
-            self._ends = self._external_forces(system.forces_now())[0], self._moving_targets()
+        if not equations.integrator.dynamic:
+            self._ends = self._external_forces(equations.forces_now())[0], self._moving_targets()
         self.budget = Budget()
         self.measure()
 
     @property
     def reaction(self) -> Array:
         """Force (n_owned, 3) [N] of exact handles on the sheet in the last step; 0 in free coordinates."""
-        out = np.zeros((self._system.points.n_owned, 3))
+        out = np.zeros((self._equations.points.n_owned, 3))
         np.put(out, self._at, self._reactions)
         return out
 
@@ -165,24 +165,24 @@ class EnergyBalance:
         """Energies of the present state with the ``works`` so far, the energy of the terms with moving
         targets, and the sums of ``local`` over ranks.
         """
-        system = self._system
-        n, names = system.points.n_owned, [*ENERGIES, *self._columns]
+        equations = self._equations
+        n, names = equations.points.n_owned, [*ENERGIES, *self._columns]
         energies, moving = dict.fromkeys(names, 0.0), 0.0
-        for term in system.active.elastic:
+        for term in equations.active.elastic:
             if name := term.registration.energy:
-                frozen = system.step.frozen[term]
-                energy = float(term.energies(system.x, frozen).sum())
-                energy -= term.heat(system.x, frozen) if isinstance(term, Dissipates) else 0.0
+                frozen = equations.step.frozen[term]
+                energy = float(term.energies(equations.x, frozen).sum())
+                energy -= term.heat(equations.x, frozen) if isinstance(term, Dissipates) else 0.0
                 energies[name] += energy
                 moving += energy if isinstance(term, MovingTargets) else 0.0
-        for load in system.active.loads:
+        for load in equations.active.loads:
             if name := load.registration.energy:
-                energies[name] += load.potential(system.x)
-        kinetic = kinetic_energy(system.mass, system.v[:n])
-        sums = system.points.global_sum(*energies.values(), kinetic, moving, *local).tolist()
+                energies[name] += load.potential(equations.x)
+        kinetic = kinetic_energy(equations.mass, equations.v[:n])
+        sums = equations.points.global_sum(*energies.values(), kinetic, moving, *local).tolist()
         count = len(names)
         membrane, bending, potential, *more = sums[:count]
-        system.directors.forget()  # the next step has other frames
+        equations.directors.forget()  # the next step has other frames
         budget = replace(
             works,
             kinetic=sums[count],
@@ -203,11 +203,11 @@ class EnergyBalance:
 
     def account_of(self, x_before: Array) -> StepAccount:
         """The account of the step just taken from x_before (n_owned, 3)."""
-        system = self._system
-        move_frames_to_end(system)
-        external, self.damping, damped = self._external_forces(system.forces_at_stage())
-        by_obstacles = _obstacle_work(system)
-        by_targets = system.step.moving_energy + by_obstacles
+        equations = self._equations
+        move_frames_to_end(equations)
+        external, self.damping, damped = self._external_forces(equations.forces_at_stage())
+        by_obstacles = _obstacle_work(equations)
+        by_targets = equations.step.moving_energy + by_obstacles
         if self._ends is not None:  # the stage of a load step is at its end: take the mean of both ends
             pull, targets = self._ends
             self._ends = external, self._moving_targets()
@@ -216,12 +216,14 @@ class EnergyBalance:
                 0.5 * float(np.vdot(pull + pull0, at - at0))
                 for (at0, pull0), (at, pull) in zip(targets, self._ends[1], strict=True)
             )
-        by_targets += _move_targets_to_end(system)
-        work = _work_of(external, x_before, system.x) + by_targets
+        by_targets += _move_targets_to_end(equations)
+        work = _work_of(external, x_before, equations.x) + by_targets
         del external  # to save memory
-        fabric = sum(term.heat(system.x, system.step.frozen[term]) for term in system.active.dissipating)
-        impacts = system.contact_impulses.heat if system.contact_impulses else 0.0
-        inertia = kinetic_energy(system.mass, system.stage_velocity - system.step.v_h)
+        fabric = sum(
+            term.heat(equations.x, equations.step.frozen[term]) for term in equations.active.dissipating
+        )
+        impacts = equations.contact_impulses.heat if equations.contact_impulses else 0.0
+        inertia = kinetic_energy(equations.mass, equations.stage_velocity - equations.step.v_h)
         before, moving_before = self.budget, self._moving_energy
         local = work, damped, fabric, impacts, by_obstacles, inertia
         energies, moving, sums = self._measured(before, *local)
@@ -241,33 +243,33 @@ class EnergyBalance:
 
     def _moving_targets(self) -> list[tuple[Array, Array]]:
         """Positions of the targets that move with handles, and the forces on them, by term."""
-        active, x = self._system.active, self._system.x
-        return [term.targets(x, self._system.step.frozen[term]) for term in active.targets]
+        active, x = self._equations.active, self._equations.x
+        return [term.targets(x, self._equations.step.frozen[term]) for term in active.targets]
 
     def _external_forces(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
         """From the parts of the residual F: forces (n_owned, 3) [N] of handles, springs, friction and loads
         without a potential; forces (m,) of damping at the prescribed unknowns; heat [J] of damping.
         """
-        system = self._system
-        self._at = at = system.step.prescribed.indices
+        equations = self._equations
+        self._at = at = equations.step.prescribed.indices
         self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
-        if system.contact_impulses:
-            self._reactions += system.contact_impulses.handle_force
-        weight = np.zeros((system.points.n_local, 3))
-        for load in system.active.loads:
+        if equations.contact_impulses:
+            self._reactions += equations.contact_impulses.handle_force
+        weight = np.zeros((equations.points.n_local, 3))
+        for load in equations.active.loads:
             if load.registration.energy:  # loads with a potential do no external work
-                load.add_force(system.x, 0.0, 0.0, weight)
-        external = weight[: system.points.n_owned]
-        external *= -system.load_case.factor
+                load.add_force(equations.x, 0.0, 0.0, weight)
+        external = weight[: equations.points.n_owned]
+        external *= -equations.load_case.factor
         for name, part in parts:
             self._reactions += part.take(at)
             if name in ("loads", "springs", "friction", "wind"):
                 external -= part
             elif name == "damping":
                 damping = part.take(at)
-                heat = system.step.dt * float(np.vdot(system.stage_velocity, part))
+                heat = equations.step.dt * float(np.vdot(equations.stage_velocity, part))
             del part  # to save memory before the next part is computed
-        system.step.prescribed.overwrite(external, external.take(at) + self._reactions)
+        equations.step.prescribed.overwrite(external, external.take(at) + self._reactions)
         return external, damping, heat
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:
@@ -284,33 +286,35 @@ class EnergyBalance:
     @property
     def column_names(self) -> list[str]:
         """Names of the columns of history.csv that terms add, in the order of the terms."""
-        of_terms = [name for term in self._system.active.elastic for name in term.registration.columns]
+        of_terms = [name for term in self._equations.active.elastic for name in term.registration.columns]
         return list(dict.fromkeys([*self._columns, *of_terms]))
 
     def columns(self) -> dict[str, float]:
         """Columns of history.csv that terms add, by name (the last term wins); collective."""
-        system = self._system
+        equations = self._equations
         found: dict[str, float] = dict(self.budget.more)
-        for term in system.active.elastic:
+        for term in equations.active.elastic:
             reductions = term.registration.columns
             if not reductions:
                 continue
-            mine = term.history(system.x, system.step.frozen[term])
+            mine = term.history(equations.x, equations.step.frozen[term])
             for name, how in reductions.items():
-                found[name] = float(system.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
+                found[name] = float(equations.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
         return found
 
     def handle_forces(self, count: int) -> list[Array]:
         """Total force (3,) [N] of each of a scene's ``count`` handles in the last step; collective."""
-        system = self._system
+        equations = self._equations
         local = np.zeros((count, 3))
-        for number, forces, _ in system.held.shares(system.step.start, system.step.end, self.reaction):
+        for number, forces, _ in equations.held.shares(
+            equations.step.start, equations.step.end, self.reaction
+        ):
             local[number] = forces.sum(axis=0)
-        for term in system.active.elastic:
+        for term in equations.active.elastic:
             if isinstance(term, PullsHandles):
-                local += term.handle_forces(system.x, system.step.frozen[term], count)
+                local += term.handle_forces(equations.x, equations.step.frozen[term], count)
         total = np.empty_like(local)
-        system.points.comm.Allreduce(local, total)
+        equations.points.comm.Allreduce(local, total)
         return list(total)
 
     def obstacle_forces(self, count: int) -> Array:
@@ -318,30 +322,32 @@ class EnergyBalance:
         in the last step, and sums over contacts of the magnitudes of normal force and friction [N], (count,
         8); collective.
         """
-        system, total = self._system, np.zeros((count, 8))
-        if system.contact is not None:
-            total += system.contact.obstacle_loads(system.x, system.step.frozen)[:count]
-        system.points.comm.Allreduce(MPI.IN_PLACE, total)
+        equations, total = self._equations, np.zeros((count, 8))
+        if equations.contact is not None:
+            total += equations.contact.obstacle_loads(equations.x, equations.step.frozen)[:count]
+        equations.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 
     def handle_moments(self) -> dict[int, Array]:
         """Moment [N·m] about its mean of each handle that holds slopes, in the last step; collective."""
-        system, x = self._system, self._system.evaluated.x
-        edges, numbers = system.held.edges, system.held.with_slopes
+        equations, x = self._equations, self._equations.evaluated.x
+        edges, numbers = equations.held.edges, equations.held.with_slopes
         if edges is None:
             return {}
-        frames = system.step.frozen[edges.term]
+        frames = equations.step.frozen[edges.term]
         local = np.zeros((len(numbers), 10))  # moment about the origin, force, positions, count
         for row, number in zip(local, numbers, strict=True):
-            mine = system.held.vertices(number)
+            mine = equations.held.vertices(number)
             row[6:9], row[9] = x[mine].sum(axis=0), len(mine)
-        for number, forces, turning in system.held.shares(system.step.start, system.step.end, self.reaction):
+        for number, forces, turning in equations.held.shares(
+            equations.step.start, equations.step.end, self.reaction
+        ):
             if number in numbers:
                 row = local[numbers.index(number)]
-                row[:3] = np.cross(x[system.held.vertices(number)], forces).sum(axis=0)
+                row[:3] = np.cross(x[equations.held.vertices(number)], forces).sum(axis=0)
                 row[:3] += edges.moment(number, turning, x, frames)
                 row[3:6] = forces.sum(axis=0)
         total = np.empty_like(local)
-        system.points.comm.Allreduce(local, total)
+        equations.points.comm.Allreduce(local, total)
         moments = total[:, :3] - np.cross(total[:, 6:9] / total[:, 9:], total[:, 3:6])
         return dict(zip(numbers, moments, strict=True))

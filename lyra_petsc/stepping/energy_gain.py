@@ -86,18 +86,18 @@ class EndForces:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     drift : (3,)
         The initial velocity [m/s].
     """
 
-    def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
-        self._system = system
-        elastic = system.active.elastic
-        self._targets = [*system.active.moving, *system.active.external]
+    def __init__(self, equations: StageEquations, drift: Sequence[float]) -> None:
+        self._equations = equations
+        elastic = equations.active.elastic
+        self._targets = [*equations.active.moving, *equations.active.external]
         self._plain = [term for term in elastic if term not in self._targets]
-        self._weights = [load for load in system.active.loads if load.registration.energy]
-        self._forces = [load for load in system.active.loads if not load.registration.energy]
+        self._weights = [load for load in equations.active.loads if load.registration.energy]
+        self._forces = [load for load in equations.active.loads if not load.registration.energy]
         self._drift = np.array(drift)
         self._stiffness: float | None = None
         # forces at the start of the step, if known as those at the end of the last, and at its end: gradients
@@ -115,25 +115,32 @@ class EndForces:
 
     def gain(self, x0: Array, v0: Array, ledger: EnergyBalance) -> Gain:
         """Gain of the step just taken from x0, v0 (n_local, 3), whose account the ledger has."""
-        system, layout = self._system, self._system.points
-        if system.discretisation.stencils_change:  # ghosts may have changed in the step
+        equations, layout = self._equations, self._equations.points
+        if equations.discretisation.stencils_change:  # ghosts may have changed in the step
             x0, v0 = (layout.extended(values) for values in (x0, v0))
-        x1, v1, n, self._end = system.x, system.v, layout.n_owned, {}
+        x1, v1, n, self._end = equations.x, equations.v, layout.n_owned, {}
         moved = x1[:n] - x0[:n]
-        moved[: layout.n_vertices] -= system.step.dt * self._drift
+        moved[: layout.n_vertices] -= equations.step.dt * self._drift
         account, damping, uniform_heat = ledger.account, ledger.damping, 0.0
         if uniform := self._moves_otherwise:
             # at the middle, the displacements of a rotation cause no strain
-            force = system.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / system.step.dt)
-            damping = force.take(system.step.prescribed.indices)
+            force = equations.damping.product_at(0.5 * (x0 + x1), (x1 - x0) / equations.step.dt)
+            damping = force.take(equations.step.prescribed.indices)
             uniform_heat = float(np.vdot(force, (x1 - x0)[: len(force)]))
         work = self._load_work(x0, v0, x1, v1, moved) + self._handle_work(x0, x1, moved, damping)
         by_targets, rise, springs0, springs1 = self._target_works(x0, x1)
         # rounded positions at both ends of a step differ in energy, and in velocity
         largest = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        stiff = (self._stiffness_sum + float(system.mass.sum()) / system.step.dt**2) * largest**2
-        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, system.step.start)
-        local = *energies, self._potential(x1, system.step.end), work + by_targets, rise, springs0, springs1
+        stiff = (self._stiffness_sum + float(equations.mass.sum()) / equations.step.dt**2) * largest**2
+        energies = *self._kinetic(v0), *self._kinetic(v1), self._potential(x0, equations.step.start)
+        local = (
+            *energies,
+            self._potential(x1, equations.step.end),
+            work + by_targets,
+            rise,
+            springs0,
+            springs1,
+        )
         sums = layout.global_sum(*local, stiff, uniform_heat).tolist()
         free0, all0, free1, all1, potential0, potential1, work, rise, springs0, springs1, stiff, warm = sums
         before, after = account.before, account.after
@@ -158,9 +165,12 @@ class EndForces:
 
     def _kinetic(self, v: Array) -> tuple[float, float]:
         """Kinetic energy [J] of this rank's free coordinates, and of all, at velocities v (n_local, 3)."""
-        system = self._system
-        at, square = system.step.prescribed.indices, np.square(v[: len(system.mass)] - self._drift)
-        driven, whole = np.vdot(system.mass.take(at // 3), square.take(at)), np.sum(system.mass @ square)
+        equations = self._equations
+        at, square = equations.step.prescribed.indices, np.square(v[: len(equations.mass)] - self._drift)
+        driven, whole = (
+            np.vdot(equations.mass.take(at // 3), square.take(at)),
+            np.sum(equations.mass @ square),
+        )
         return 0.5 * float(whole - driven), 0.5 * float(whole)
 
     def _potential(self, x: Array, time: float) -> float:
@@ -171,28 +181,31 @@ class EndForces:
     @property
     def _moves_otherwise(self) -> bool:
         """Whether velocities other than those of uniform motion between the ends damp the material."""
-        integrator = self._system.integrator
-        return self._system.damping.active and integrator.order > 1 and not integrator.moves_uniformly
+        integrator = self._equations.integrator
+        return self._equations.damping.active and integrator.order > 1 and not integrator.moves_uniformly
 
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
         """Per-step data of terms, with their targets at time ``at`` [s] of the step."""
-        system = self._system
-        step = UpcomingStep(system.step.start, system.step.end, at, x, system.reference.at)
+        equations = self._equations
+        step = UpcomingStep(equations.step.start, equations.step.end, at, x, equations.reference.at)
         return {term: term.freeze(step) for term in terms}
 
     def _target_works(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
         """Work [J] of the motion of targets and obstacles relative to the observer, change of the energies of
         this rank's terms with targets, and energy of springs at both ends.
         """
-        system, rise, springs = self._system, 0.0, [0.0, 0.0]
-        contact, work = system.contact, system.contact_impulses.work if system.contact_impulses else 0.0
+        equations, rise, springs = self._equations, 0.0, [0.0, 0.0]
+        contact, work = (
+            equations.contact,
+            equations.contact_impulses.work if equations.contact_impulses else 0.0,
+        )
         if contact is not None and contact.obstacles_move:
-            for x, time in ((x0, system.step.start), (x1, system.step.end)):
-                work += 0.5 * contact.barrier.work(x, time, system.step.start, system.step.end)
+            for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
+                work += 0.5 * contact.barrier.work(x, time, equations.step.start, equations.step.end)
         barrier = None if contact is None else contact.barrier
         turning = [term for term in self._targets if term.n_elements and term is not barrier]
-        first = self._frozen(turning, system.step.start, x0)
-        last = self._frozen(turning, system.step.end, x1)
+        first = self._frozen(turning, equations.step.start, x0)
+        last = self._frozen(turning, equations.step.end, x1)
         for term in turning:
             frozen = first[term], last[term]
             before, after = (float(term.energies(x, f).sum()) for x, f in zip((x0, x1), frozen, strict=True))
@@ -205,78 +218,82 @@ class EndForces:
             if not term.registration.energy:
                 springs = [springs[0] + before, springs[1] + after]
         if self._drift.any():
-            work += system.step.dt * float(self._force_of_targets(x0, x1) @ self._drift)
+            work += equations.step.dt * float(self._force_of_targets(x0, x1) @ self._drift)
         return work, rise, springs[0], springs[1]
 
     def _force_of_targets(self, x0: Array, x1: Array) -> Array:
         """Force (3,) [N] of the sheet on targets and obstacles in the step from x0 to x1 (n_local, 3)."""
-        system, force, contact = self._system, np.zeros_like(x1), self._system.contact
+        equations, force, contact = self._equations, np.zeros_like(x1), self._equations.contact
         both: list[Elastic] = [term for term in self._targets if not term.registration.of_contact]
         if contact is not None:
             both.append(contact.barrier)
-        for x, time in ((x0, system.step.start), (x1, system.step.end)):
+        for x, time in ((x0, equations.step.start), (x1, equations.step.end)):
             for term, frozen in self._frozen(both, time, x).items():
                 term.add_gradient(x, frozen, force)
         force *= 0.5
         if contact is not None and contact.friction is not None:
             # by the force at the stage, which the impulses complete
             friction = contact.friction
-            friction.add_gradient(system.evaluated.x, system.step.frozen[friction], force)
-        total: Array = force[: system.points.n_vertices].sum(axis=0)
-        return total + (system.contact_impulses.loads[:, :3].sum(axis=0) if system.contact_impulses else 0.0)
+            friction.add_gradient(equations.evaluated.x, equations.step.frozen[friction], force)
+        total: Array = force[: equations.points.n_vertices].sum(axis=0)
+        return total + (
+            equations.contact_impulses.loads[:, :3].sum(axis=0) if equations.contact_impulses else 0.0
+        )
 
     def _load_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
         """Work [J] of wind and of loads without a potential on this rank's free coordinates."""
-        system = self._system
-        if not (self._forces or system.active.viscous):
+        equations = self._equations
+        if not (self._forces or equations.active.viscous):
             return 0.0
         force = np.zeros_like(x1)
         for load in self._forces:
             for x in (x0, x1) if load.is_follower else (x1, x1):
-                load.add_force(x, system.step.start, system.step.end, force)
+                load.add_force(x, equations.step.start, equations.step.end, force)
         n = len(moved)
         force = force[:n]
-        if system.active.viscous:
+        if equations.active.viscous:
             start = self._start.get("wind")
             force -= self._wind(x0, v0, n) if start is None else start
             self._end["wind"] = end = self._wind(x1, v1, n)
             force -= end
-        free = np.where(system.step.prescribed.free, moved, 0.0)
+        free = np.where(equations.step.prescribed.free, moved, 0.0)
         return 0.5 * float(np.vdot(force, free))
 
     def _wind(self, x: Array, v: Array, n: int) -> Array:
         """Gradient (n, 3) [N] of the wind's potential at x and v (n_local, 3)."""
-        system, out = self._system, np.zeros_like(x)
-        for term in system.active.viscous:
-            step = UpcomingStep(system.step.start, system.step.end, system.step.start, x, system.reference.at)
+        equations, out = self._equations, np.zeros_like(x)
+        for term in equations.active.viscous:
+            step = UpcomingStep(
+                equations.step.start, equations.step.end, equations.step.start, x, equations.reference.at
+            )
             term.add_gradient(v, term.freeze(step), out)
         return out[:n]
 
     def _handle_work(self, x0: Array, x1: Array, moved: Array, damping: Array) -> float:
         """Work [J] of exact handles on this rank, by the reactions to the sheet's forces and weight."""
-        system, at = self._system, self._system.step.prescribed.indices
+        equations, at = self._equations, self._equations.step.prescribed.indices
         displacement = moved.take(at)
         if not displacement.any():
             return 0.0
-        start, end = self._start.get("pull"), system.gradient_of(self._plain, x1)
+        start, end = self._start.get("pull"), equations.gradient_of(self._plain, x1)
         if start is None:
-            start = system.gradient_of(self._plain, x0)
+            start = equations.gradient_of(self._plain, x0)
         self._end["pull"] = end
         force = 0.5 * (start + end).take(at)
         targets, weight = np.zeros_like(x1), np.zeros_like(x1)
-        for time, x in ((system.step.start, x0), (system.step.end, x1)):
+        for time, x in ((equations.step.start, x0), (equations.step.end, x1)):
             for term, frozen in self._frozen(self._targets, time, x).items():
                 term.add_gradient(x, frozen, targets)
         for load in self._weights:
-            load.add_force(x1, system.step.start, system.step.end, weight)
+            load.add_force(x1, equations.step.start, equations.step.end, weight)
         force += 0.5 * targets.ravel()[at] - weight.ravel()[at] + damping
-        if system.contact_impulses:
-            force += system.contact_impulses.handle_force
+        if equations.contact_impulses:
+            force += equations.contact_impulses.handle_force
         return float(np.vdot(force, displacement))
 
     @property
     def _stiffness_sum(self) -> float:
         """Sum [N/m] of the stiffnesses of this rank's elements."""
         if self._stiffness is None:
-            self._stiffness = sum(float(each.sum()) for each in self._system.forces.stiffnesses.values())
+            self._stiffness = sum(float(each.sum()) for each in self._equations.forces.stiffnesses.values())
         return self._stiffness

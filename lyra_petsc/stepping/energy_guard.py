@@ -73,14 +73,14 @@ class EnergyGuard:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     drift : (3,)
         The scene's initial velocity [m/s].
     """
 
-    def __init__(self, system: StageEquations, drift: Sequence[float]) -> None:
-        self._system = system
-        self._forces = EndForces(system, drift)
+    def __init__(self, equations: StageEquations, drift: Sequence[float]) -> None:
+        self._equations = equations
+        self._forces = EndForces(equations, drift)
         self.gains = GuardState()
 
     def accept(self, x0: Array, v0: Array, ledger: EnergyBalance) -> bool:
@@ -96,17 +96,17 @@ class EnergyGuard:
     def judge(self, step: Gain) -> bool:
         """Whether a step with this gain is accepted; if so, it is recorded."""
         new = self._updated(step)
-        over = self._system.integrator.gain_window
+        over = self._equations.integrator.gain_window
         # a step without a gain of its own would not improve the mean if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self._judged = of_step, of_steps, new.scale
-        impact = self._system.has_active_pairs and self._system.integrator.order > 1
+        impact = self._equations.has_active_pairs and self._equations.integrator.order > 1
         max_gain, max_sum = (IMPACT_GAIN, IMPACT_SUM) if impact else (LARGEST_GAIN, LARGEST_SUM)
         accepted = of_step <= max(max_gain * new.scale, step.noise)
         # repeating a step without a gain would not reduce the sum
         accepted &= of_steps <= max(max_sum * new.scale, new.noise) or new.recent[-1] <= step.noise
-        accepted = bool(self._system.points.comm.bcast(accepted, root=0))
+        accepted = bool(self._equations.points.comm.bcast(accepted, root=0))
         if accepted:
             self.gains = new
             self._forces.keep_end()
@@ -117,7 +117,7 @@ class EnergyGuard:
     @property
     def _is_backward_euler(self) -> bool:
         """Whether the integrator is backward Euler, which has the identity."""
-        return self._system.integrator.name == "beuler"
+        return self._equations.integrator.name == "beuler"
 
     def _updated(self, step: Gain) -> GuardState:
         """State of the guard after accepting a step."""
@@ -141,7 +141,7 @@ class EnergyGuard:
             heat=heat,
             inertia=old.inertia + step.inertia,
             bracket=old.bracket + step.bracket,
-            recent=_append_gain(old.recent, judged, self._system.integrator.gain_window)[-RECENT:],
+            recent=_append_gain(old.recent, judged, self._equations.integrator.gain_window)[-RECENT:],
             repeated=old.repeated,
             noise=old.noise + step.noise,
         )
@@ -160,7 +160,7 @@ class EnergyGuard:
     @property
     def remedy(self) -> str:
         """Advice for a message: another integrator, or a change of steps, damping or mesh."""
-        name = self._system.integrator.name
+        name = self._equations.integrator.name
         other = ALTERNATIVES.get(name)
         if other:
             return f"time.integrator: {other}"

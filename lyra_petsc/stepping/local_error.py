@@ -21,19 +21,19 @@ class LocalError:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     """
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system = system
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations = equations
         self._slope: Array | None = None
         self._dt = 0.0
-        system.start_acceleration.followers.append(self)
+        equations.start_acceleration.followers.append(self)
 
     @property
     def needs_acceleration(self) -> bool:
         """Whether accelerations at the start of the coming step are needed."""
-        return self._system.integrator.order > 1 and self._slope is None
+        return self._equations.integrator.order > 1 and self._slope is None
 
     def set_acceleration(self, acceleration: Array) -> None:
         """Set the accelerations (n_owned, 3) [m/s²] at the start of the step."""
@@ -47,25 +47,27 @@ class LocalError:
         """Largest local error [m] over the free coordinates of the step just taken, which began with
         velocities v_before (n_owned, 3) [m/s].
         """
-        system = self._system
-        n = system.points.n_owned
-        slope = (system.v[:n] - v_before) / dt
-        if system.integrator.order == 1:
+        equations = self._equations
+        n = equations.points.n_owned
+        slope = (equations.v[:n] - v_before) / dt
+        if equations.integrator.order == 1:
             error = 0.5 * dt * dt * slope
         else:
             assert self._slope is not None
             third = 2.0 * (slope - self._slope) / (dt + self._dt)
-            error = system.integrator.error_constant * dt**3 * third
+            error = equations.integrator.error_constant * dt**3 * third
         # edge unknowns follow the vertices and have no error of their own
-        vertices = slice(0, system.points.n_vertices)
-        largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.step.prescribed.free[vertices]))
-        return float(system.points.comm.allreduce(largest, MPI.MAX))
+        vertices = slice(0, equations.points.n_vertices)
+        largest = float(
+            np.abs(error[vertices]).max(initial=0.0, where=equations.step.prescribed.free[vertices])
+        )
+        return float(equations.points.comm.allreduce(largest, MPI.MAX))
 
     def record_step(self, v_before: Array, dt: float) -> None:
         """Record the slope of the accepted step."""
-        if self._system.integrators.usual.order > 1:
-            n = self._system.points.n_owned
-            self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
+        if self._equations.integrators.usual.order > 1:
+            n = self._equations.points.n_owned
+            self._slope, self._dt = (self._equations.v[:n] - v_before) / dt, dt
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint."""

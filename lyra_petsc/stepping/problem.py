@@ -92,7 +92,7 @@ class Problem:
     discretisation : Discretisation
     terms : dict of name → Term
         The active terms.
-    system : StageEquations
+    equations : StageEquations
     surface : Surface
         The mesh before ``initial`` of the scene displaced it.
     probes : dict of name → (n,) int
@@ -110,7 +110,7 @@ class Problem:
     whole: WholeProblem
     discretisation: Discretisation
     terms: dict[str, Term]
-    system: StageEquations
+    equations: StageEquations
     surface: Surface
     probes: dict[str, Ints]
     mesh: Mesh | None
@@ -428,7 +428,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
     )
     mass = np.zeros(layout.n_owned)
     mass[: layout.n_vertices] = part.vertex_data["mass"]
-    system = StageEquations(
+    equations = StageEquations(
         discretisation,
         mass,
         list(terms.values()),
@@ -438,7 +438,7 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
         starts=[Window.of(handle).start for handle in scene.handles],
         events=event_times(scene),
     )
-    for term in system.active.elastic:
+    for term in equations.active.elastic:
         if term.registration.coarse:
             entry, name = registration_of(term.registration.coarse), f"coarse {term.name}"
             # regularised Hessians do not depend on these data, nor on the rest angle
@@ -447,41 +447,41 @@ def _build_local(scene: Scene, whole: WholeProblem, part: LocalMesh, mesh: Mesh 
             elements = replace(elements, data=data, index=np.empty(0, dtype=np.int32))
             coarse = cast("Elastic", make_term(entry, elements, scene, on_vertices))
             coarse.registration = replace(entry, name=name)  # another sheet may have this term
-            system.active.coarse[term] = coarse
+            equations.active.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
-    system.x[rows] = data["position"]
-    layout.update_ghosts(system.x)
+    equations.x[rows] = data["position"]
+    layout.update_ghosts(equations.x)
     surface = Surface(
-        system.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
+        equations.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
     )
     # reference positions of handles are those before noise
-    system.set_references(0.0)
-    system.x[rows] = data.get("start", data["position"])
-    system.v[rows] = data.get("velocity", 0.0)
-    system.state.update_ghosts()
-    system.evaluate_at_start()
-    for term in system.active.stateful:
-        term.initialise(system.x)
-    system.hold_targets(0.0)
-    refuse_overrun(system, scene, "at the start")
-    refuse_contact(system, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)
+    equations.set_references(0.0)
+    equations.x[rows] = data.get("start", data["position"])
+    equations.v[rows] = data.get("velocity", 0.0)
+    equations.state.update_ghosts()
+    equations.evaluate_at_start()
+    for term in equations.active.stateful:
+        term.initialise(equations.x)
+    equations.hold_targets(0.0)
+    refuse_overrun(equations, scene, "at the start")
+    refuse_contact(equations, scene, "at the start", TOO_NEAR * whole.barrier.gap if whole.barrier else 0.0)
     probes = {name: part.vertex_sets["probe", name] for name in scene.probes}
     return Problem(
         scene,
         whole,
         discretisation,
         terms,
-        system,
+        equations,
         surface,
         probes,
         mesh,
         part.partitioner,
         data.get("tag"),
-        system.x[rows].copy() if "displacement" in scene.output.fields else None,
+        equations.x[rows].copy() if "displacement" in scene.output.fields else None,
     )
 
 
-def refuse_overrun(system: StageEquations, scene: Scene, when: str) -> None:
+def refuse_overrun(equations: StageEquations, scene: Scene, when: str) -> None:
     """Refuse a state, described by ``when``, that is beyond the limit of a term; collective.
 
     Raises
@@ -489,14 +489,16 @@ def refuse_overrun(system: StageEquations, scene: Scene, when: str) -> None:
     InputError
         Names the worst element.
     """
-    frozen = system.step.frozen
-    worst = max((term.overrun(system.x, frozen[term]) for term in system.active.limiting), default=(0.0, ""))
-    _, text = max(system.points.comm.allgather(worst))
+    frozen = equations.step.frozen
+    worst = max(
+        (term.overrun(equations.x, frozen[term]) for term in equations.active.limiting), default=(0.0, "")
+    )
+    _, text = max(equations.points.comm.allgather(worst))
     if text:
         raise InputError(f"{when} {text}; raise it, or change the start", file=scene.source, key="material")
 
 
-def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: float = 0.0) -> None:
+def refuse_contact(equations: StageEquations, scene: Scene, when: str, minimum: float = 0.0) -> None:
     """Refuse a state, described by ``when``, with a contact pair not separated by more than ``minimum`` [m];
     collective.
 
@@ -505,11 +507,11 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, minimum: flo
     InputError
         Names the nearest pair.
     """
-    if (contact := system.contact) is None:
+    if (contact := equations.contact) is None:
         return
     from lyra_petsc.contact.nearest_pair import nearest_pair
 
-    near = nearest_pair(contact, system.x, system.step.frozen[contact.barrier])
+    near = nearest_pair(contact, equations.x, equations.step.frozen[contact.barrier])
     if near is None or near.gap > minimum:
         return
     distance, remedy = "not apart", "move them apart"

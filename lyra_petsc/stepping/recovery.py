@@ -137,27 +137,27 @@ def _iterations_key() -> str:
 
 
 def _contact_integrator_waits(run: SteppedScene, step: RejectedStep) -> bool:
-    system = run.problem.system
-    return system.integrator is system.integrators.usual is not system.integrators.in_contact
+    equations = run.problem.equations
+    return equations.integrator is equations.integrators.usual is not equations.integrators.in_contact
 
 
 def _take_contact_integrator(run: SteppedScene, step: RejectedStep) -> None:
-    run.problem.system.integrators.take(run.problem.system.integrators.in_contact)
+    run.problem.equations.integrators.take(run.problem.equations.integrators.in_contact)
 
 
 def _is_substitute(run: SteppedScene) -> bool:
     """Whether backward Euler takes the place of the scene's integrators."""
-    system = run.problem.system
-    return system.integrator not in (system.integrators.usual, system.integrators.in_contact)
+    equations = run.problem.equations
+    return equations.integrator not in (equations.integrators.usual, equations.integrators.in_contact)
 
 
 def _backward_euler_may_help(run: SteppedScene, step: RejectedStep) -> bool:
     """The midpoint rule, which conserves angular momentum, is not replaced because of a gain."""
-    system = run.problem.system
-    kept = step.trouble is Trouble.GAIN and system.integrator.moves_uniformly
+    equations = run.problem.equations
+    kept = step.trouble is Trouble.GAIN and equations.integrator.moves_uniformly
     return (
-        system.integrators.usual.dynamic
-        and system.integrators.usual.name != "beuler"
+        equations.integrators.usual.dynamic
+        and equations.integrators.usual.name != "beuler"
         and not (kept or _is_substitute(run))
     )
 
@@ -168,7 +168,7 @@ def _is_unresolved(run: SteppedScene, step: RejectedStep) -> bool:
 
 def _follows_impact(run: SteppedScene, step: RejectedStep) -> bool:
     """Whether something touches and the step is short: of adaptive steps, near their minimum in contact."""
-    if not (_backward_euler_may_help(run, step) and run.problem.system.has_active_pairs):
+    if not (_backward_euler_may_help(run, step) and run.problem.equations.has_active_pairs):
         return False
     if run.accuracy is not None:
         return step.dt <= 2.0 * run.accuracy.minimum_dt()
@@ -180,9 +180,9 @@ def _follows_jump(run: SteppedScene, step: RejectedStep) -> bool:
 
 
 def _take_backward_euler(run: SteppedScene, step: RejectedStep) -> None:
-    system = run.problem.system
-    system.integrators.take(
-        LaggedBackwardEuler() if system.integrators.usual.lagged_loads else BackwardEuler()
+    equations = run.problem.equations
+    equations.integrators.take(
+        LaggedBackwardEuler() if equations.integrators.usual.lagged_loads else BackwardEuler()
     )
     if step.trouble is Trouble.UNRESOLVED:
         return
@@ -190,10 +190,10 @@ def _take_backward_euler(run: SteppedScene, step: RejectedStep) -> None:
     if step.trouble is Trouble.GAIN:
         assert run.guard is not None
         why = run.guard.message
-    touches = system.has_active_pairs and not _follows_jump(run, step)
+    touches = equations.has_active_pairs and not _follows_jump(run, step)
     run.run_notes.once(
         "impact" if touches else "energy",
-        f"{_at(run)}: {system.integrators.usual.name} {why}{' in contact' if touches else ''}; "
+        f"{_at(run)}: {equations.integrators.usual.name} {why}{' in contact' if touches else ''}; "
         "such steps are repeated by backward Euler",
     )
 

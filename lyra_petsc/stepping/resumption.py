@@ -18,8 +18,8 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
 
     With them `resume` continues as if the run had never stopped.
     """
-    system, time = run.problem.system, run.time
-    arrays, integrator = system.integrators.saved_state()
+    equations, time = run.problem.equations, run.time
+    arrays, integrator = equations.integrators.saved_state()
     balance, budget = run.energy_balance.saved_state()
     of_stepper, stepper = run.stepper.saved_state(time)
     arrays = arrays | balance | of_stepper
@@ -36,8 +36,8 @@ def saved_state(run: SteppedScene) -> tuple[dict[str, Array], dict[str, Any]]:
         "integrator": integrator,
         **stepper,
         "energy": None if run.guard is None else run.guard.saved_state(),
-        "late_starts": sorted(system.reference.late),
-        "obstacles": term_states.obstacle_places(system),
+        "late_starts": sorted(equations.reference.late),
+        "obstacles": term_states.obstacle_places(equations),
     }
     if run.equilibrium is not None:
         more, scalars["equilibrium"] = run.equilibrium.saved_state(time)
@@ -55,30 +55,30 @@ def resume(
     edges: Mapping[str, Array],
     elements: Mapping[str, tuple[Ints, Array]],
 ) -> None:
-    """Continue from a `saved_state`; x and v of the owned rows are in ``run.problem.system`` already.
+    """Continue from a `saved_state`; x and v of the owned rows are in ``run.problem.equations`` already.
 
     ``edges`` and ``elements`` are those of `term_states`; collective.
     """
-    system = run.problem.system
-    system.state.update_ghosts()
-    term_states.restore_fixed(system, arrays, edges, elements)
+    equations = run.problem.equations
+    equations.state.update_ghosts()
+    term_states.restore_fixed(equations, arrays, edges, elements)
     run.time, run.step_number = scalars["time"], scalars["step"]
     # loads and handles that only the changed scene starts earlier start now; the others have started
-    system.set_references(run.time)
-    system.hold_targets(run.time)
-    refuse_overrun(system, run.scene, f"at {run.time_text()}")
-    refuse_contact(system, run.scene, f"at {run.time_text()}")
+    equations.set_references(run.time)
+    equations.hold_targets(run.time)
+    refuse_overrun(equations, run.scene, f"at {run.time_text()}")
+    refuse_contact(equations, run.scene, f"at {run.time_text()}")
     run.energy_balance.restore(arrays, scalars["budget"])
     run.control.restore(scalars)
     if run.equilibrium is not None:
         run.equilibrium.restore(arrays, scalars["equilibrium"], run.time)
-    system.integrators.restore(arrays, scalars["integrator"])
+    equations.integrators.restore(arrays, scalars["integrator"])
     if run.guard is not None:
         run.guard.restore(scalars["energy"], same=scalars["scheme"] == run.scene.time.scheme)
     if run.accuracy is not None:
         run.accuracy.estimated = scalars["estimated_error"]
         run.accuracy.local_error.restore(arrays, scalars["integrator"])
-    term_states.restore_changing(system, elements, scalars["obstacles"])
+    term_states.restore_changing(equations, elements, scalars["obstacles"])
     run.stepper.restore(arrays, scalars, run.time, run.step_number)
     run.totals |= scalars["totals"]
     run.stability = run.stability and scalars["stability"]

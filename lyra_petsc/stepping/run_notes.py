@@ -88,7 +88,7 @@ def note_step(run: SteppedScene, attempt: Attempt) -> None:
     if note:
         notes.once("compression", note)
     if attempt.at_roundoff and not notes.has("roundoff"):
-        loads = float(np.sum(run.problem.system.step.loads.force**2))
+        loads = float(np.sum(run.problem.equations.step.loads.force**2))
         driving = math.sqrt(run.comm.allreduce(loads))
         if attempt.residual > run.scene.solver.force_tolerance * driving > 0.0:
             times = attempt.residual / driving

@@ -108,12 +108,12 @@ class Neighbour:
     def end_edges(self, v: Array) -> None:
         """End the solve for its edges' unknowns at velocities v (n_owned, 3) [m/s]; collective."""
         assert self.edges is not None
-        self.edges.end(self.system, self.system.evaluate(v))
+        self.edges.end(self.equations, self.equations.evaluate(v))
 
     @property
-    def system(self) -> StageEquations:
+    def equations(self) -> StageEquations:
         """The equations of its problem."""
-        return self.problem.system
+        return self.problem.equations
 
 
 Neighbours = list[Neighbour]
@@ -173,9 +173,9 @@ class Sensitivities:
     ) -> None:
         self.simulation, self.numbers = simulation, list(numbers)
         self._tolerance = tolerance
-        self._system = simulation.problem.system
-        self._static = isinstance(self._system.integrator, Static)
-        self._semi = self._system.integrator.lagged_loads and not self._static
+        self._equations = simulation.problem.equations
+        self._static = isinstance(self._equations.integrator, Static)
+        self._semi = self._equations.integrator.lagged_loads and not self._static
         relative = DELTA_STATIC if self._static else DELTA
         self._deltas = [relative * number.size for number in self.numbers]
         self.tangents: list[Tangent] = []
@@ -188,7 +188,7 @@ class Sensitivities:
             ]
             self._neighbours.append(neighbours)
             self._begin(neighbours, delta, reactions=reactions)
-        if self._system.points.n_edges_global and not self._static:
+        if self._equations.points.n_edges_global and not self._static:
             self._solve_initial_edges()
 
     def destroy(self) -> None:
@@ -200,7 +200,7 @@ class Sensitivities:
 
     def _owner(self) -> NDArray[np.int64] | None:
         """Rank of each vertex (V,), on rank 0: partitioners need not give the same result twice."""
-        points = self._system.points
+        points = self._equations.points
         pieces = points.comm.gather(points.mesh_vertices, root=0)
         if pieces is None:
             return None
@@ -213,50 +213,50 @@ class Sensitivities:
 
     def _begin(self, neighbours: Neighbours, delta: float, *, reactions: bool) -> None:
         """Compute the derivatives at the start of the simulation."""
-        n, points = self._system.points.n_owned, self._system.points
+        n, points = self._equations.points.n_owned, self._equations.points
         tangent = Tangent(np.zeros((n, 3)), np.zeros((n, 3)))
         for neighbour in neighbours:
-            tangent.x += (neighbour.weight / delta) * neighbour.system.x[:n]
-            tangent.v += (neighbour.weight / delta) * neighbour.system.v[:n]
+            tangent.x += (neighbour.weight / delta) * neighbour.equations.x[:n]
+            tangent.v += (neighbour.weight / delta) * neighbour.equations.v[:n]
         tangent.x[points.n_vertices :] = 0.0
-        _drop_roundoff(tangent.x, self._system.x[:n], delta)
-        _drop_roundoff(tangent.v, self._system.v[:n], delta)
+        _drop_roundoff(tangent.x, self._equations.x[:n], delta)
+        _drop_roundoff(tangent.v, self._equations.v[:n], delta)
         for neighbour in neighbours:
-            system = neighbour.system
+            equations = neighbour.equations
             if self._static:
-                system.take_loads(factor=0.0)
-                system.begin_step(0.0, 0.0)
-                if self._system.load_case.unbalanced is not None:
-                    system.take_loads(unbalanced=-system.out_of_balance())
+                equations.take_loads(factor=0.0)
+                equations.begin_step(0.0, 0.0)
+                if self._equations.load_case.unbalanced is not None:
+                    equations.take_loads(unbalanced=-equations.out_of_balance())
             if reactions:
-                neighbour.energy_balance = EnergyBalance(system)
+                neighbour.energy_balance = EnergyBalance(equations)
         self.tangents.append(tangent)
 
     def _solve_initial_edges(self) -> None:
         """Compute the derivatives of the edges' unknowns at the start, where moments are balanced."""
-        system, n = self._system, self._system.points.n_owned
-        start, vertices = system.x[:n].copy(), self._system.points.n_vertices
-        frames = [term.frames for term in _edged(system)]
-        edge_solve.initial_moments(system)
-        edges = EdgeSolve.begin(system, start)
+        equations, n = self._equations, self._equations.points.n_owned
+        start, vertices = equations.x[:n].copy(), self._equations.points.n_vertices
+        frames = [term.frames for term in _edged(equations)]
+        edge_solve.initial_moments(equations)
+        edges = EdgeSolve.begin(equations, start)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
                 change = each.offset * delta
-                each.system.state.set(start + change * tangent.x, system.v[:n] + change * tangent.v)
-                for term, own in zip(_edged(each.system), frames, strict=True):
+                each.equations.state.set(start + change * tangent.x, equations.v[:n] + change * tangent.v)
+                for term, own in zip(_edged(each.equations), frames, strict=True):
                     term.frames = own
-                edge_solve.initial_moments(each.system)
-                each.edges = EdgeSolve.begin(each.system, start + change * tangent.x)
-                self._use_frames(each.system, frames)
+                edge_solve.initial_moments(each.equations)
+                each.edges = EdgeSolve.begin(each.equations, start + change * tangent.x)
+                self._use_frames(each.equations, frames)
         still = np.zeros_like(start)
         with self._solver(still, set_up=True, keep=False) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, still):
                     each.end_edges(v)
-                    self._change_frames(each.system)
-                rates = _difference(neighbours, delta, lambda each: each.system.x[:n])
+                    self._change_frames(each.equations)
+                rates = _difference(neighbours, delta, lambda each: each.equations.x[:n])
                 tangent.x[vertices:] = rates[vertices:]
-        edges.end(system, system.evaluate(still))
+        edges.end(equations, equations.evaluate(still))
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -268,12 +268,17 @@ class Sensitivities:
         SolverError
             If the step fails, or its tangent equations are singular.
         """
-        simulation, system = self.simulation, self._system
-        n = system.points.n_owned
-        history, numbers = system.integrator.saved_state()
-        frames = [term.frames for term in _edged(system)]
+        simulation, equations = self.simulation, self._equations
+        n = equations.points.n_owned
+        history, numbers = equations.integrator.saved_state()
+        frames = [term.frames for term in _edged(equations)]
         before = _StepStart(
-            simulation.time, system.x[:n].copy(), system.v[:n].copy(), dict(history), dict(numbers), frames
+            simulation.time,
+            equations.x[:n].copy(),
+            equations.v[:n].copy(),
+            dict(history),
+            dict(numbers),
+            frames,
         )
         report = simulation.step()
         if self._static:
@@ -283,77 +288,77 @@ class Sensitivities:
         return report
 
     def _differentiate_step(self, before: _StepStart, *, fresh: bool) -> None:
-        system = self._system
-        velocity, end = system.stage_velocity.copy(), self.simulation.time
-        usual, taken = system.integrator, self.simulation.last_integrator
+        equations = self._equations
+        velocity, end = equations.stage_velocity.copy(), self.simulation.time
+        usual, taken = equations.integrator, self.simulation.last_integrator
         semi = self._semi and taken is usual
         with self._solver(velocity, set_up=not semi, keep=not fresh) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 for each in neighbours:
                     if taken is not usual:
-                        each.system.integrators.take(type(taken)())
+                        each.equations.integrators.take(type(taken)())
                     self._begin_step(each, before, tangent, delta, end, semi=semi)
                 for each, v in self._solve_stages(solve, neighbours, delta, velocity):
-                    each.system.accept(each.system.evaluate(v))
-        if edge_solve.is_needed(system):
+                    each.equations.accept(each.equations.evaluate(v))
+        if edge_solve.is_needed(equations):
             self._differentiate_edges(before)
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
                 if each.energy_balance is not None:
                     each.energy_balance.record(before.x + each.offset * delta * tangent.x)
                 if taken is not usual:
-                    each.system.follow_step(before.v + each.offset * delta * tangent.v)
+                    each.equations.follow_step(before.v + each.offset * delta * tangent.v)
             self._update_tangent(tangent, neighbours, delta)
             for each in neighbours:
-                each.system.set_references(end)
+                each.equations.set_references(end)
 
     def _begin_step(
         self, each: Neighbour, before: _StepStart, tangent: Tangent, delta: float, end: float, *, semi: bool
     ) -> None:
         """Begin the step that the simulation has taken, ``semi``-implicit or not, with a neighbour."""
-        system, change = each.system, each.offset * delta
-        system.state.set(before.x + change * tangent.x, before.v + change * tangent.v)
+        equations, change = each.equations, each.offset * delta
+        equations.state.set(before.x + change * tangent.x, before.v + change * tangent.v)
         history = {
             name: values + change * tangent.history.get(name, 0.0) for name, values in before.history.items()
         }
-        system.integrator.restore(history, before.numbers)
-        for term, frames in zip(_edged(system), before.frames, strict=True):
+        equations.integrator.restore(history, before.numbers)
+        for term, frames in zip(_edged(equations), before.frames, strict=True):
             term.frames = frames
-            term.initialise(system.x)
-        system.begin_step(before.time, end)
-        self._use_frames(system, before.frames)
+            term.initialise(equations.x)
+        equations.begin_step(before.time, end)
+        self._use_frames(equations, before.frames)
         each.jacobian = None
         if semi:
             start = np.zeros_like(before.x)
-            system.prescribe(start)
-            each.jacobian = system.discretisation.rows.zeros()
-            at = system.linearised(start)
-            each.prescribed_force = system.forces.jacobian(at, 1.0, each.jacobian)
+            equations.prescribe(start)
+            each.jacobian = equations.discretisation.rows.zeros()
+            at = equations.linearised(start)
+            each.prescribed_force = equations.forces.jacobian(at, 1.0, each.jacobian)
 
-    def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
+    def _use_frames(self, equations: StageEquations, started: Sequence[Frames]) -> None:
         """Set the frames of a neighbour's directors.
 
         They are its own, or those of the simulation if it has updated its frames since the ``started`` ones.
         """
-        pairs = zip(_edged(system), _edged(self._system), started, strict=True)
-        frozen = self._system.directors.frozen_in_step or self._system.step.frozen
+        pairs = zip(_edged(equations), _edged(self._equations), started, strict=True)
+        frozen = self._equations.directors.frozen_in_step or self._equations.step.frozen
         used = [(mine, frozen[theirs], start) for mine, theirs, start in pairs]
         found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
-            system.refreeze(found)
+            equations.refreeze(found)
 
     def _solve_stages(
         self, solve: Callable[[Array], Array], neighbours: Neighbours, delta: float, velocity: Array
     ) -> list[tuple[Neighbour, Array]]:
         """Solve for the velocities (n_owned, 3) of the stages of a number's neighbours."""
-        change = _difference(neighbours, delta, lambda each: each.system.step.prescribed.velocity)
+        change = _difference(neighbours, delta, lambda each: each.equations.step.prescribed.velocity)
         prescribed = np.zeros_like(velocity)
-        self._system.step.prescribed.overwrite(prescribed, change)
+        self._equations.step.prescribed.overwrite(prescribed, change)
         derivative = partial(self._stage_derivative, neighbours, delta, velocity)
         dv = self._solve_affine(solve, derivative, prescribed, delta)
         stages = []
         for each in neighbours:
-            each.system.prescribe(v := velocity + each.offset * delta * dv)
+            each.equations.prescribe(v := velocity + each.offset * delta * dv)
             stages.append((each, v))
         return stages
 
@@ -361,126 +366,129 @@ class Sensitivities:
         """Derivative (n_owned, 3) of G if the derivative of the stage's velocities is ``dv``."""
 
         def residual(each: Neighbour) -> Array:
-            system, v = each.system, velocity + each.offset * delta * dv
-            system.prescribe(v)
+            equations, v = each.equations, velocity + each.offset * delta * dv
+            equations.prescribe(v)
             if each.jacobian is None:
-                return system.residual_at(v)
+                return equations.residual_at(v)
             start = np.zeros_like(v)
-            system.prescribe(start)
-            out = system.residual_at(start)
+            equations.prescribe(start)
+            out = equations.residual_at(start)
             if each.prescribed_force is not None:
                 out += each.prescribed_force
-            return out + _product(system, each.jacobian, v - start)
+            return out + _product(equations, each.jacobian, v - start)
 
         return self._free(_difference(neighbours, delta, residual))
 
     def _free(self, values: Array) -> Array:
-        return np.where(self._system.step.prescribed.free, values, 0.0)
+        return np.where(self._equations.step.prescribed.free, values, 0.0)
 
     def _update_tangent(self, tangent: Tangent, neighbours: Neighbours, delta: float) -> None:
         """Compute the derivatives of the state from the states of the neighbours."""
-        n = self._system.points.n_owned
+        n = self._equations.points.n_owned
         for each in neighbours:
-            self._change_frames(each.system)
-        tangent.x = _difference(neighbours, delta, lambda each: each.system.x[:n])
-        tangent.v = _difference(neighbours, delta, lambda each: each.system.v[:n])
-        names = neighbours[0].system.integrator.saved_state()[0].keys()
+            self._change_frames(each.equations)
+        tangent.x = _difference(neighbours, delta, lambda each: each.equations.x[:n])
+        tangent.v = _difference(neighbours, delta, lambda each: each.equations.v[:n])
+        names = neighbours[0].equations.integrator.saved_state()[0].keys()
         tangent.history = {
             name: _difference(neighbours, delta, partial(_history_array, name)) for name in names
         }
 
-    def _change_frames(self, system: StageEquations) -> None:
+    def _change_frames(self, equations: StageEquations) -> None:
         """Express a neighbour's present and past directors in the present frames of the simulation."""
-        change = np.zeros((system.points.n_owned, 3))
+        change = np.zeros((equations.points.n_owned, 3))
         changed = False
-        for term, reference in zip(_edged(system), _edged(self._system), strict=True):
+        for term, reference in zip(_edged(equations), _edged(self._equations), strict=True):
             indices, ends, length, _ = term.of_edges
-            old: Frames = system.step.frozen[term]
+            old: Frames = equations.step.frozen[term]
             new = reference.frames
             if old is new:
                 continue
-            across = system.x[ends[:, 1]] - system.x[ends[:, 0]]
+            across = equations.x[ends[:, 1]] - equations.x[ends[:, 0]]
             tangent = across / np.linalg.norm(across, axis=1, keepdims=True)
             first, second = transported(old, tangent), transported(new, tangent)
             sine = np.sum(np.cross(tangent, first) * second, axis=1)
             angle = np.arctan2(sine, np.sum(first * second, axis=1))
-            own = indices < 3 * system.points.n_owned
+            own = indices < 3 * equations.points.n_owned
             change.reshape(-1)[indices[own]] = -(length * angle)[own]
             changed = True
         if changed:
-            system.x[: system.points.n_owned] += change
-            system.state.update_ghosts()
-            system.integrator.shift_past_positions(change)
+            equations.x[: equations.points.n_owned] += change
+            equations.state.update_ghosts()
+            equations.integrator.shift_past_positions(change)
 
     # -- edges whose unknowns are in equilibrium at the end of the step -------------------------------
 
     def _differentiate_edges(self, before: _StepStart) -> None:
         """Solve for the edges' unknowns at the end of the step of all neighbours."""
-        system, n = self._system, self._system.points.n_owned
-        edges = EdgeSolve.begin(system, before.x)
-        rates = (system.x[:n] - before.x) / system.step.stage.c
+        equations, n = self._equations, self._equations.points.n_owned
+        edges = EdgeSolve.begin(equations, before.x)
+        rates = (equations.x[:n] - before.x) / equations.step.stage.c
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
             for each in neighbours:
-                each.edges = EdgeSolve.begin(each.system, before.x + each.offset * delta * tangent.x)
-                self._use_frames(each.system, before.frames)
+                each.edges = EdgeSolve.begin(each.equations, before.x + each.offset * delta * tangent.x)
+                self._use_frames(each.equations, before.frames)
         with self._solver(rates, set_up=True, keep=False) as solve:
             for neighbours, delta in zip(self._neighbours, self._deltas, strict=True):
                 for each, v in self._solve_stages(solve, neighbours, delta, rates):
                     each.end_edges(v)
-        edges.end(system, system.evaluate(rates))
+        edges.end(equations, equations.evaluate(rates))
 
     # -- equilibria --------------------------------------------------------------------------------
 
     def _differentiate_equilibrium(self, before: _StepStart) -> None:
-        system, n = self._system, self._system.points.n_owned
-        integrator = system.integrator
+        equations, n = self._equations, self._equations.points.n_owned
+        integrator = equations.integrator
         assert isinstance(integrator, Static)
         now = _Equilibrium(
-            before.time, self.simulation.time, system.x[:n].copy(), [term.frames for term in _edged(system)]
+            before.time,
+            self.simulation.time,
+            equations.x[:n].copy(),
+            [term.frames for term in _edged(equations)],
         )
         pseudo = integrator.pseudo_dt
         integrator.pseudo_dt = math.sqrt(MAX_GROWTH) * self._fall_time()
-        system.begin_step(now.before, now.factor)
-        reach = system.step.stage.c
+        equations.begin_step(now.before, now.factor)
+        reach = equations.step.stage.c
         with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:
             for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
                 # sets the goals of handles
                 self._force_derivative(now, neighbours, delta, np.zeros_like(now.x))
                 prescribed = np.zeros_like(now.x)
-                change = _difference(neighbours, delta, lambda each: each.system.step.prescribed.goal)
-                system.step.prescribed.overwrite(prescribed, change)
+                change = _difference(neighbours, delta, lambda each: each.equations.step.prescribed.goal)
+                equations.step.prescribed.overwrite(prescribed, change)
                 _drop_roundoff(prescribed, now.x, delta)
                 forces = partial(self._force_derivative, now, neighbours, delta)
                 tangent.x = self._solve_affine(lambda r: reach * solve(r), forces, prescribed, delta)
                 self._force_derivative(now, neighbours, delta, tangent.x)
                 for each in neighbours:
                     if each.energy_balance is not None:
-                        each.system.evaluate_at_start()
+                        each.equations.evaluate_at_start()
                         each.energy_balance.record(now.x)
-                    each.system.set_references(now.factor)
+                    each.equations.set_references(now.factor)
         integrator.pseudo_dt = pseudo
-        system.begin_step(now.before, now.factor)
-        system.evaluate_at_start()
+        equations.begin_step(now.before, now.factor)
+        equations.evaluate_at_start()
 
     def _force_derivative(self, now: _Equilibrium, neighbours: Neighbours, delta: float, dx: Array) -> Array:
         """Derivative (n_owned, 3) [N] of the out-of-balance force if that of the positions is ``dx``."""
 
         def residual(each: Neighbour) -> Array:
-            system = each.system
-            system.state.set(now.x + each.offset * delta * dx, np.zeros_like(now.x))
-            for term, frames in zip(_edged(system), now.frames, strict=True):
+            equations = each.equations
+            equations.state.set(now.x + each.offset * delta * dx, np.zeros_like(now.x))
+            for term, frames in zip(_edged(equations), now.frames, strict=True):
                 term.frames = frames
-            system.take_loads(factor=self._system.load_case.factor)
-            system.begin_step(now.before, now.factor)
-            return -system.out_of_balance()
+            equations.take_loads(factor=self._equations.load_case.factor)
+            equations.begin_step(now.before, now.factor)
+            return -equations.out_of_balance()
 
         return self._free(_difference(neighbours, delta, residual))
 
     def _fall_time(self) -> float:
         """Time [s] in which the loads move a sheet of this mass by its size."""
-        system = self._system
-        loads, mass = np.linalg.norm(system.step.loads.force), system.mass.sum()
-        force, total = system.points.global_sum(float(loads) ** 2, float(mass))
+        equations = self._equations
+        loads, mass = np.linalg.norm(equations.step.loads.force), equations.mass.sum()
+        force, total = equations.points.global_sum(float(loads) ** 2, float(mass))
         return math.sqrt(self.simulation.problem.whole.size * total / math.sqrt(force)) if force else 1.0
 
     # -- linear equations --------------------------------------------------------------------------
@@ -488,11 +496,11 @@ class Sensitivities:
     @contextmanager
     def _solver(self, velocity: Array, *, set_up: bool, keep: bool) -> Iterator[Callable[[Array], Array]]:
         """A context that gives approximate solutions by the Jacobian at the velocities of the stage."""
-        stepper, system = self.simulation.stepper, self._system
+        stepper, equations = self.simulation.stepper, self._equations
         ksp, linear = stepper.ksp, stepper.linear
         if set_up:
-            system.predicted_stress.forget()
-            linear.assemble(system.linearised(velocity), 0.0, keep=keep, convex=True)
+            equations.predicted_stress.forget()
+            linear.assemble(equations.linearised(velocity), 0.0, keep=keep, convex=True)
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()
         ksp.setTolerances(rtol=max(0.3 * self._tolerance, 1e-13), atol=0.0, max_it=5000)
@@ -514,7 +522,7 @@ class Sensitivities:
             ksp.setInitialGuessNonzero(guess)
 
     def _dot(self, a: Array, b: Array) -> float:
-        return float(self._system.points.global_sum(float(np.vdot(a, b)))[0])
+        return float(self._equations.points.global_sum(float(np.vdot(a, b)))[0])
 
     def _solve_affine(
         self, solve: Callable[[Array], Array], function: Callable[[Array], Array], start: Array, delta: float
@@ -565,13 +573,13 @@ class Sensitivities:
         quantity : callable
             Takes a problem at its state, and its energy balance if reactions are needed; collective.
         """
-        n, columns = self._system.points.n_owned, []
+        n, columns = self._equations.points.n_owned, []
         for tangent, neighbours, delta in zip(self.tangents, self._neighbours, self._deltas, strict=True):
 
             def value(each: Neighbour, tangent: Tangent = tangent, delta: float = delta) -> Array:
-                change, system = each.offset * delta, each.system
-                system.state.set(
-                    self._system.x[:n] + change * tangent.x, self._system.v[:n] + change * tangent.v
+                change, equations = each.offset * delta, each.equations
+                equations.state.set(
+                    self._equations.x[:n] + change * tangent.x, self._equations.v[:n] + change * tangent.v
                 )
                 return np.asarray(quantity(each.problem, each.energy_balance))
 
@@ -589,7 +597,7 @@ def _difference(neighbours: Neighbours, delta: float, of: Callable[[Neighbour], 
 
 def _history_array(name: str, each: Neighbour) -> Array:
     """The array ``name`` of the integrator's history."""
-    return each.system.integrator.saved_state()[0][name]
+    return each.equations.integrator.saved_state()[0][name]
 
 
 def _drop_roundoff(values: Array, base: Array, delta: float) -> None:
@@ -597,13 +605,13 @@ def _drop_roundoff(values: Array, base: Array, delta: float) -> None:
     values[np.abs(values) * delta <= 1e-14 * (1.0 + np.abs(base))] = 0.0
 
 
-def _edged(system: StageEquations) -> list[MidEdge]:
-    return [term for term in system.active.with_edges if isinstance(term, MidEdge)]
+def _edged(equations: StageEquations) -> list[MidEdge]:
+    return [term for term in equations.active.with_edges if isinstance(term, MidEdge)]
 
 
-def _product(system: StageEquations, values: Array, v: Array) -> Array:
+def _product(equations: StageEquations, values: Array, v: Array) -> Array:
     """Block rows times v (n_owned, 3); collective."""
-    rows, points = system.discretisation.rows, system.points
+    rows, points = equations.discretisation.rows, equations.points
     local = np.zeros((points.n_local, 3))
     local[: len(v)] = v
     points.update_ghosts(local)

@@ -128,24 +128,24 @@ class SteppedScene:
         self.problem: Problem = build_problem(self.comm, scene, self.phases, self._mesh)
         self.run_notes = RunNotes()
         self.notes.extend(self.problem.whole.notes)
-        whole, system = self.problem.whole, self.problem.system
+        whole, equations = self.problem.whole, self.problem.equations
         check_size(self.problem.points.n_unknowns)
         with self.phases("solve"):
-            floor = residual_roundoff(system, whole.largest_coordinate)
+            floor = residual_roundoff(equations, whole.largest_coordinate)
             if not math.isfinite(floor):
                 raise InputError(
                     "stiffness times size overflows; give smaller numbers or another unit of length",
                     file=scene.source,
                     key="material",
                 )
-            self.stepper = Stepper(scene, system, self.problem.surface, whole.spacing, floor)
+            self.stepper = Stepper(scene, equations, self.problem.surface, whole.spacing, floor)
         self.notes.extend(on_root(self.comm, lambda: unknown(self.stepper.our_options)))
         self.roundoff = floor
         self.max_steps = self.stepper.ts.getMaxSteps()
         self.control = planned_control(scene, self.stepper.ts, [*event_times(scene), *self._stops])
         self.accuracy: Accuracy | None = None
         if isinstance(self.control, ToleranceControl):
-            self.accuracy = Accuracy(system, self.control, scene.time.tolerance or 0.0, whole.size)
+            self.accuracy = Accuracy(equations, self.control, scene.time.tolerance or 0.0, whole.size)
         self.time, self.step_number = 0.0, 0
         self.compression = CompressionWatch(self.problem)
         self.stability: dict[str, Any] = {}
@@ -156,17 +156,17 @@ class SteppedScene:
         self.stepper.start(0.0, 0)
         if self.problem.points.n_edges_global and not self.stepper.balance_edge_moments(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
-        for term in system.active.stateful:
+        for term in equations.active.stateful:
             if isinstance(term, Dissipates):  # whose rest state has edges in equilibrium
-                term.initialise(system.x)
-        self.notes.extend(nothing_acts(scene, system, event_times(scene), self.control.end, floor))
+                term.initialise(equations.x)
+        self.notes.extend(nothing_acts(scene, equations, event_times(scene), self.control.end, floor))
         self.equilibrium: Equilibrium | None = None
         if scene.time.static:
             sizes = whole.spacing, whole.size, floor, self.control.end
-            self.equilibrium = Equilibrium(system, self.stepper, scene.solver, *sizes)
-        self.energy_balance = EnergyBalance(system)
+            self.equilibrium = Equilibrium(equations, self.stepper, scene.solver, *sizes)
+        self.energy_balance = EnergyBalance(equations)
         drift = scene.initial.velocity if scene.initial else (0.0, 0.0, 0.0)
-        self.guard = EnergyGuard(system, drift) if system.integrator.dynamic else None
+        self.guard = EnergyGuard(equations, drift) if equations.integrator.dynamic else None
 
     @property
     def notes(self) -> list[str]:
@@ -176,7 +176,7 @@ class SteppedScene:
     @property
     def note_of_repeats(self) -> str:
         """How many attempts so far were repeated with a smaller step, and why; empty if none was."""
-        moves = self.problem.system.integrator.dynamic
+        moves = self.problem.equations.integrator.dynamic
         note = self.run_notes.on_repeats(*(("Δt", " s") if moves else ("increment", "")))
         if not note or self.scene.time.adaptive or not moves:
             return note
@@ -207,19 +207,21 @@ class SteppedScene:
             If no way to repeat it is left; the state is then that before the step.
         """
         started = clock.perf_counter() - COMPILATION.seconds
-        system = self.problem.system
-        x_before, v_before = system.x, system.v
+        equations = self.problem.equations
+        x_before, v_before = equations.x, equations.v
         v_owned = v_before[: self.problem.points.n_owned]
         newton = linear = rejected = gains = 0
         jumps, failed = False, []
-        system.integrators.take(system.integrators.in_contact if system.touches else system.integrators.usual)
+        equations.integrators.take(
+            equations.integrators.in_contact if equations.touches else equations.integrators.usual
+        )
         while True:
             end = self.control.next_end(self.time)
             dt, histories = end - self.time, self._histories()
             with self.phases("solve"):
                 self.stepper.follow_integrator()
                 attempt = (self.equilibrium or self.stepper).attempt(self.time, end)
-            jumps |= system.start_acceleration.starts_anew and system.damping.active
+            jumps |= equations.start_acceleration.starts_anew and equations.damping.active
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             trouble = self._trouble(attempt, x_before, v_before, dt)
@@ -232,14 +234,14 @@ class SteppedScene:
             recover(self, RejectedStep(trouble, attempt, dt, gains, jumps, failed))
             gains += trouble is Trouble.GAIN
             rejected += 1
-        self.last_integrator = system.integrator
-        usual, in_contact = system.integrators.usual, system.integrators.in_contact
-        if system.integrator is in_contact is not usual and usual.iterates:
+        self.last_integrator = equations.integrator
+        usual, in_contact = equations.integrators.usual, equations.integrators.in_contact
+        if equations.integrator is in_contact is not usual and usual.iterates:
             text = f"{in_contact.name} takes the steps in which something touches or nears a limit"
             self.run_notes.once("in contact", text)
         if self.accuracy is not None:
             self.accuracy.record_step(v_owned, dt, self.step_number, self.time, self.run_notes)
-        system.follow_step(v_owned)
+        equations.follow_step(v_owned)
         if self.equilibrium is not None and self.control.is_end(end):
             with self.phases("solve"):
                 settled = self.equilibrium.settle(self.time, end)
@@ -254,9 +256,9 @@ class SteppedScene:
             with self.phases("balance"):
                 self.energy_balance.record(x_before[: len(v_owned)])
         note_step(self, attempt)
-        for term in system.active.stateful:
-            term.accept(system.x, system.step.frozen[term])
-        system.set_references(self.time)
+        for term in equations.active.stateful:
+            term.accept(equations.x, equations.step.frozen[term])
+        equations.set_references(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
         took = newton, linear, rejected, attempt.residual, seconds
@@ -269,8 +271,8 @@ class SteppedScene:
         """Why the attempt at a step of dt [s] from x_before and v_before (n_local, 3) is not accepted."""
         if not attempt.converged:
             return Trouble.CROSSING if attempt.message.startswith(WOULD_CROSS) else Trouble.UNSOLVED
-        system, n = self.problem.system, self.problem.points.n_owned
-        if not contact_steps.is_resolved(system):
+        equations, n = self.problem.equations, self.problem.points.n_owned
+        if not contact_steps.is_resolved(equations):
             return Trouble.UNRESOLVED
         if self.accuracy is not None and not self.accuracy.accepts(v_before[:n], dt):
             return Trouble.INACCURATE
@@ -285,13 +287,16 @@ class SteppedScene:
     def _histories(self) -> tuple[Any, Any]:
         """Histories of the integrators and of the local error, for `_return_to`."""
         accuracy = self.accuracy
-        return self.problem.system.integrators.saved_state(), accuracy and accuracy.local_error.saved_state()
+        return (
+            self.problem.equations.integrators.saved_state(),
+            accuracy and accuracy.local_error.saved_state(),
+        )
 
     def _return_to(self, x: Array, v: Array, integrators: Any, error: Any) -> None:
         """Return to positions and velocities (n_local, 3) and histories before the step."""
-        system, n = self.problem.system, self.problem.points.n_owned
-        system.state.set(x[:n], v[:n])
-        system.integrators.restore(*integrators)
+        equations, n = self.problem.equations, self.problem.points.n_owned
+        equations.state.set(x[:n], v[:n])
+        equations.integrators.restore(*integrators)
         if self.accuracy is not None:
             self.accuracy.local_error.restore(*error)
         self.stepper.start(self.time, self.step_number)
@@ -303,7 +308,7 @@ class SteppedScene:
 
     def time_text(self) -> str:
         """Text of the present time, or load factor."""
-        moves = self.problem.system.integrator.dynamic
+        moves = self.problem.equations.integrator.dynamic
         return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
     def saved_state(self) -> tuple[dict[str, Array], dict[str, Any]]:

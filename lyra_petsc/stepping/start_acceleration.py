@@ -46,71 +46,71 @@ class StartAcceleration:
         self._events = events
         self.followers: list[NeedsAcceleration] = []
 
-    def begin_step(self, system: StageEquations, at: float) -> None:
+    def begin_step(self, equations: StageEquations, at: float) -> None:
         """Compute accelerations at the start of the step where they are needed; collective.
 
         ``at`` [s] is the time of the step's stage. Whether forces jump at the start of the step is decided by
         its time alone, so that a resumed run decides alike.
         """
-        everyone = (system.integrator, *self.followers)
-        jumping = {system.integrators.usual, system.integrators.in_contact, *everyone}
+        everyone = (equations.integrator, *self.followers)
+        jumping = {equations.integrators.usual, equations.integrators.in_contact, *everyone}
         # the start of a step may differ from the time of an event by round-off
-        if any(abs(system.step.start - event) <= 1e-6 * system.step.dt for event in self._events):
+        if any(abs(equations.step.start - event) <= 1e-6 * equations.step.dt for event in self._events):
             for each in jumping:
                 each.restart()
-        self.starts_anew = system.integrator.needs_acceleration
+        self.starts_anew = equations.integrator.needs_acceleration
         asking = [each for each in everyone if each.needs_acceleration]
         if not asking:
             return
-        acceleration = _computed(system, at)
+        acceleration = _computed(equations, at)
         for each in asking:
             each.set_acceleration(acceleration)
 
 
-def _computed(system: StageEquations, at: float) -> Array:
+def _computed(equations: StageEquations, at: float) -> Array:
     """Accelerations (n_owned, 3) [m/s²] of the free unknowns at the start of the step; collective."""
-    x, v, step, active = system.frozen_positions(at), system.v.copy(), system.step, system.active
-    if system.held and step.end > step.start:
+    x, v, step, active = equations.frozen_positions(at), equations.v.copy(), equations.step, equations.active
+    if equations.held and step.end > step.start:
         # of handles just after the start, where they may jump
         soon = step.start + JUST_AFTER * step.dt
-        rates = system.prescriptions.rates(step.prescribed, step.start, step.end, soon)
-        step.prescribed.overwrite(v[: len(system.mass)], rates)
-    system.points.update_ghosts(v)
+        rates = equations.prescriptions.rates(step.prescribed, step.start, step.end, soon)
+        step.prescribed.overwrite(v[: len(equations.mass)], rates)
+    equations.points.update_ghosts(v)
     turns = bool(active.moving or active.external)
     if turns:  # at the stage targets are farther, and an obstacle may be where the sheet still is now
-        system.change(frozen=active.with_targets(step.frozen, system.targets_at(step.start, x)))
-    if system.damping.active and system.points.n_edges_global:
-        _balance_moments(system, v)
-    force, mass = system.out_of_balance(v), system.mass[:, None]
+        equations.change(frozen=active.with_targets(step.frozen, equations.targets_at(step.start, x)))
+    if equations.damping.active and equations.points.n_edges_global:
+        _balance_moments(equations, v)
+    force, mass = equations.out_of_balance(v), equations.mass[:, None]
     if turns:
-        system.change(frozen=step.frozen)
+        equations.change(frozen=step.frozen)
     acceleration = np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
-    if system.contact is None:
+    if equations.contact is None:
         return acceleration
-    return system.contact.hold(system.step_end(v), acceleration, system.step.frozen)
+    return equations.contact.hold(equations.step_end(v), acceleration, equations.step.frozen)
 
 
-def _balance_moments(system: StageEquations, v: Array) -> None:
+def _balance_moments(equations: StageEquations, v: Array) -> None:
     """Set the rates of free directors, in v (n_local, 3) and in the state; collective.
 
     Directors have no mass: damping balances their moments. Other rates would give the vertices the
     accelerations of a sheet with stiffer directors. The method is that of conjugate gradients.
     """
-    layout = system.points
-    edges, free = slice(layout.n_vertices, layout.n_owned), system.step.prescribed.free
+    layout = equations.points
+    edges, free = slice(layout.n_vertices, layout.n_owned), equations.step.prescribed.free
     diagonal, increment = np.zeros_like(v), np.zeros_like(v)
-    for term in system.active.with_edges:
+    for term in equations.active.with_edges:
         if term.registration.damped:
             damping = term.elements.data["damping"]
             diagonal.reshape(-1)[term.edge_indices] += term.edge_stiffness(damping)
     scale = np.divide(1.0, diagonal[edges], out=np.zeros_like(v[edges]), where=diagonal[edges] > 0.0)
-    residual = system.out_of_balance(v)[edges]
+    residual = equations.out_of_balance(v)[edges]
     direction = scale * residual
     square = first = layout.global_sum(float(np.vdot(residual, direction)))[0]
     for _ in range(MAX_ITERATIONS):
         increment[edges] = direction
         layout.update_ghosts(increment)
-        product = np.where(free, system.damping.product(increment), 0.0)[edges]
+        product = np.where(free, equations.damping.product(increment), 0.0)[edges]
         power = layout.global_sum(float(np.vdot(direction, product)))[0]
         if not power > 0.0:
             break
@@ -121,5 +121,5 @@ def _balance_moments(system: StageEquations, v: Array) -> None:
             break
         direction = scale * residual + square / before * direction
     layout.update_ghosts(v)
-    system.v[edges] = v[edges]
-    system.state.update_ghosts()
+    equations.v[edges] = v[edges]
+    equations.state.update_ghosts()

@@ -23,13 +23,13 @@ BALANCED = 1e-9
 
 
 def nothing_acts(
-    scene: Scene, system: StageEquations, times: Iterable[float], end: float, floor: float
+    scene: Scene, equations: StageEquations, times: Iterable[float], end: float, floor: float
 ) -> list[str]:
     """A note if the sheet starts at rest and nothing will ever move it, else none; collective.
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
         At the start.
     times : iterable of float
         Times [s] at which loads begin or end.
@@ -42,13 +42,13 @@ def nothing_acts(
     moves = any(frame != Keyframe(time=frame.time) for frames in motions for frame in frames)
     if moves or (scene.wind is not None and any(scene.wind.velocity)):
         return []
-    comm, stops = system.points.comm, sorted({0.0, end, *(t for t in times if 0.0 < t < end)})
-    acting = float(np.abs(system.v).max(initial=0.0))
+    comm, stops = equations.points.comm, sorted({0.0, end, *(t for t in times if 0.0 < t < end)})
+    acting = float(np.abs(equations.v).max(initial=0.0))
     for t0, t1 in itertools.pairwise(stops):
-        for load in system.active.loads:
-            load.add_force(system.x, t0, t1, force := np.zeros_like(system.x))
+        for load in equations.active.loads:
+            load.add_force(equations.x, t0, t1, force := np.zeros_like(equations.x))
             acting += float(np.abs(force).max(initial=0.0))
-    gradient = system.gradient_of(system.active.elastic, system.x)
+    gradient = equations.gradient_of(equations.active.elastic, equations.x)
     acting, square = comm.allreduce(np.array([acting, float(np.vdot(gradient, gradient))]))
     if acting > 0.0 or square > floor**2:
         return []

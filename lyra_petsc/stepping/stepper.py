@@ -98,7 +98,7 @@ class Stepper:
     Parameters
     ----------
     scene : Scene
-    system : StageEquations
+    equations : StageEquations
     surface : Surface
     spacing : float
         Mean edge length [m], for the step tolerance.
@@ -125,14 +125,14 @@ class Stepper:
     """
 
     def __init__(
-        self, scene: Scene, system: StageEquations, surface: Surface, spacing: float, floor: float
+        self, scene: Scene, equations: StageEquations, surface: Surface, spacing: float, floor: float
     ) -> None:
-        self._scene, self._system, self._surface = scene, system, surface
+        self._scene, self._equations, self._surface = scene, equations, surface
         self._spacing, self._floor = spacing, floor
-        self._iterates = system.integrator.iterates
+        self._iterates = equations.integrator.iterates
         # presets and state of Newton's method, while another integrator replaces the scene's
         self._suspended: tuple[list[str], dict[str, float]] | None = None
-        points = system.points
+        points = equations.points
         self.presets = self._candidates()
         self._blend = HessianBlend(self._hessian)
         self.our_options: list[str] = []
@@ -146,7 +146,7 @@ class Stepper:
 
     def _candidates(self) -> list[str]:
         """Linear solvers to try in order; collective."""
-        system, scene, points = self._system, self._scene, self._system.points
+        equations, scene, points = self._equations, self._scene, self._equations.points
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
         return presets.candidates(
@@ -154,8 +154,8 @@ class Stepper:
             points.comm.size,
             static=static,
             newton=self._iterates,
-            iterations=0.0 if static else expected_iterations(system, step),
-            contact=system.contact is not None,
+            iterations=0.0 if static else expected_iterations(equations, step),
+            contact=equations.contact is not None,
         )
 
     @property
@@ -164,7 +164,7 @@ class Stepper:
 
     def follow_integrator(self) -> None:
         """Change between Newton's method and one linear solve as the integrator demands; collective."""
-        if self._system.integrator.iterates == self._iterates:
+        if self._equations.integrator.iterates == self._iterates:
             return
         time, step = self.ts.getTime(), self.ts.getStepNumber()
         suspended, saved = self._suspended, self._newton.saved_state()
@@ -181,12 +181,12 @@ class Stepper:
         self.start(time, step)
 
     def _create_objects(self) -> None:
-        system, scene = self._system, self._scene
-        points = system.points
+        equations, scene = self._equations, self._scene
+        points = equations.points
         self.preset = self.presets[0]
         self._fill(presets.options_of(self.preset, points.comm.size))
         self.linear = LinearSystem(
-            system, self._surface, self.preset, scene.solver.hessian, iterates=self._iterates
+            equations, self._surface, self.preset, scene.solver.hessian, iterates=self._iterates
         )
         self.velocity = PETSc.Vec().create(points.comm)
         self.velocity.setSizes((3 * points.n_owned, 3 * points.n_global), bsize=3)
@@ -194,8 +194,8 @@ class Stepper:
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
-        ts.setType(system.integrator.ts_type)
-        if system.integrator.ts_type == "theta":
+        ts.setType(equations.integrator.ts_type)
+        if equations.integrator.ts_type == "theta":
             ts.setTheta(0.5)
         ts.setIFunction(self._ifunction, self.residual)
         self._set_jacobian()
@@ -210,12 +210,12 @@ class Stepper:
         snes.setInitialGuess(self._guess)
         limit = presets.break_even_iterations(points.n_global, self.presets)
         convergence = Convergence(
-            system, scene.solver, self._spacing, self._floor, break_even_iterations=limit
+            equations, scene.solver, self._spacing, self._floor, break_even_iterations=limit
         )
-        self._points = Iterates(system)
+        self._points = Iterates(equations)
         self._newton = newton = NewtonCallbacks(
             snes,
-            system,
+            equations,
             self.linear,
             self._blend,
             convergence,
@@ -224,16 +224,16 @@ class Stepper:
             follow=self._follow_stencils,
         )
         ksp.setType(PETSc.KSP.Type.CG)
-        self._trace = Trace(snes, system, lambda: newton.linear_iterations)
-        if system.discretisation.stencils_change or (system.active.with_edges and self._iterates):
+        self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
+        if equations.discretisation.stencils_change or (equations.active.with_edges and self._iterates):
             snes.setUpdate(self._update)
-        if PETSc.Options().getBool("contact_monitor", False) and system.contact is not None:
+        if PETSc.Options().getBool("contact_monitor", False) and equations.contact is not None:
             from lyra_petsc.contact.contact_monitor import ContactMonitor  # needed with the option only
 
             snes.setMonitor(
                 ContactMonitor(
-                    system.contact,
-                    lambda v: (system.evaluate(v).x, system.step.frozen),
+                    equations.contact,
+                    lambda v: (equations.evaluate(v).x, equations.step.frozen),
                     lambda: newton.step_fraction,
                 )
             )
@@ -248,7 +248,7 @@ class Stepper:
             snes.setLineSearchPreCheck(newton.correct_direction)
             # an indefinite Hessian costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=LOOSEST if system.integrator.dynamic else STATIC, max_it=5000)
+            ksp.setTolerances(rtol=LOOSEST if equations.integrator.dynamic else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=ONCE, max_it=5000)
@@ -276,7 +276,7 @@ class Stepper:
 
     def _update(self, snes: PETSc.SNES, iteration: int) -> None:
         """Update stencils and frames before a Newton iteration; collective."""
-        if iteration > 0 and update_frames(self._system, self._points.at(snes.getSolution()).x):
+        if iteration > 0 and update_frames(self._equations, self._points.at(snes.getSolution()).x):
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin_solve()
         self._follow_stencils()
@@ -321,45 +321,47 @@ class Stepper:
         """Set time [s] and step number, and take the velocities from the equations' state."""
         self.ts.setTime(time)
         self.ts.setStepNumber(step)
-        self.velocity.setArray(self._system.v[: self._shape[0]].ravel())
+        self.velocity.setArray(self._equations.v[: self._shape[0]].ravel())
 
     def attempt(self, t0: float, t1: float) -> Attempt:
         """Try the step from t0 to t1 [s]; the state changes only on success; collective."""
-        system = self._system
+        equations = self._equations
         self._record(t0)
         with PETSc.Log.Event(FROZEN):
-            system.begin_step(t0, t1)
+            equations.begin_step(t0, t1)
         number = self.ts.getStepNumber()
-        before = system.x[: self._shape[0]].copy() if edge_solve.is_needed(system) else None
-        rate_before = system.v[: self._shape[0]].copy() if before is not None else None
+        before = equations.x[: self._shape[0]].copy() if edge_solve.is_needed(equations) else None
+        rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
         failed: FailedSolve | None = None
-        start, blocked = limits.find_start(system), ""
-        if start is None or not has_start(system, start):
+        start, blocked = limits.find_start(equations), ""
+        if start is None or not has_start(equations, start):
             blocked = WOULD_CROSS if start is None else BEYOND_LIMIT
         if blocked:
             self._trace.begin_solve()
-            failed = self._trace.failed_solve(system.stationary_velocity())
+            failed = self._trace.failed_solve(equations.stationary_velocity())
             return Attempt(False, 0, 0, math.inf, message=blocked, failed_solve=failed)
         n = self._shape[0]
         solution, message = self._solve(t0, start)
         newton = linear = 0
         for _ in range(MAX_SOLVES - 1):
-            if solution is None or not (self._iterates and contact_steps.follow_contacts(system, solution)):
+            if solution is None or not (
+                self._iterates and contact_steps.follow_contacts(equations, solution)
+            ):
                 break
             newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
             solution, message = self._solve(t0, start, solution.v[:n])
-        if solution is not None and not limits.end_is_free(system, solution.v[:n]):
+        if solution is not None and not limits.end_is_free(equations, solution.v[:n]):
             solution, message = None, WOULD_CROSS
         newton, linear = newton + self.snes.getIterationNumber(), linear + self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.remaining, outcome.at_roundoff
         if solution is not None:
-            if not self._iterates and system.active.with_edges:
+            if not self._iterates and equations.active.with_edges:
                 solution = self._turn_directors(solution)
-            system.accept(solution)
+            equations.accept(solution)
             if before is not None:
                 assert rate_before is not None
-                edges = EdgeSolve.begin(system, before)
+                edges = EdgeSolve.begin(equations, before)
                 rates, message = self._solve(t0)
                 newton, linear = (
                     newton + self.snes.getIterationNumber(),
@@ -367,14 +369,14 @@ class Stepper:
                 )
                 if rates is None:
                     failed, solution = self._trace.failed_solve(), None
-                edges.end(system, rates)
+                edges.end(equations, rates)
                 if rates is None:
-                    system.state.set(before, rate_before)
+                    equations.state.set(before, rate_before)
         else:
             failed = self._trace.failed_solve()
         self.ts.setTimeStep(t1 - t0)
         if solution is not None:
-            self.velocity.setArray(system.v[: self._shape[0]].ravel())
+            self.velocity.setArray(equations.v[: self._shape[0]].ravel())
             self.ts.setTime(t1)
             self.ts.setStepNumber(number + 1)
             norm, remaining, at_roundoff = ended
@@ -393,25 +395,25 @@ class Stepper:
 
     def _turn_directors(self, solution: Evaluation) -> Evaluation:
         """The solution, whose directors turn with their triangles if they turn far; collective."""
-        system, staying = self._system, self._system.stationary_velocity()
+        equations, staying = self._equations, self._equations.stationary_velocity()
         increment = solution.v[: len(staying)] - staying
-        if turn_with_triangles(system, staying, increment):
-            solution = system.evaluate(staying + increment)
-        update_frames(system, solution.x)
+        if turn_with_triangles(equations, staying, increment):
+            solution = equations.evaluate(staying + increment)
+        update_frames(equations, solution.x)
         return solution
 
     def balance_edge_moments(self, floor: float) -> bool:
         """Solve for edge unknowns until moments on edges balance at the start shape, to ``floor`` [N];
         return whether they do; collective.
         """
-        system, n = self._system, self._shape[0]
+        equations, n = self._equations, self._shape[0]
         before = np.inf
-        while floor < (moments := edge_solve.initial_moments(system)) < before:
+        while floor < (moments := edge_solve.initial_moments(equations)) < before:
             before = moments if not self._iterates else 0.0
-            edges = EdgeSolve.begin(system, system.x[:n].copy())
-            rates, _ = self._solve(system.step.start)
-            edges.end(system, rates)
-            self.start(system.step.start, 0)
+            edges = EdgeSolve.begin(equations, equations.x[:n].copy())
+            rates, _ = self._solve(equations.step.start)
+            edges.end(equations, rates)
+            self.start(equations.step.start, 0)
             if rates is None:
                 return False
         return True
@@ -424,12 +426,12 @@ class Stepper:
         ``start``, by default where the step starts, are velocities (n_owned, 3) [m/s] that no collision
         hinders; ``found`` those of a solve of the stage with other contacts, where this one starts.
         """
-        system, stage = self._system, self._system.step.stage
+        equations, stage = self._equations, self._equations.step.stage
         if start is None:
-            system.prescribe(start := system.stationary_velocity())
+            equations.prescribe(start := equations.stationary_velocity())
         self._starts = start, found
         self._follow_stencils()
-        self.velocity.setArray(system.step.v_h.ravel())
+        self.velocity.setArray(equations.step.v_h.ravel())
         # a TS step whose stage is at the integrator's time and whose shift is the integrator's σ
         theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
@@ -437,14 +439,14 @@ class Stepper:
         self.ts.setTimeStep(length)
         self._newton.begin_solve()
         if not self._iterates and not is_set("ksp_rtol"):
-            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if system.near else ONCE)
+            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.near else ONCE)
         self._trace.begin_solve()
         try:
             self.ts.step()
         except Exception as error:
             if not isinstance(error, PETSc.Error) and not _runs_foreign_python():
                 raise
-            together = all_ranks_arrive(system.points.comm)
+            together = all_ranks_arrive(equations.points.comm)
             if together and self._next_may_help(error):
                 self._linear_failed = True
                 return None, f"the preconditioner could not be set up: {reasons.error_message(error)}"
@@ -473,9 +475,9 @@ class Stepper:
             return None, reasons.failure_reason(self.snes, self.ksp)
         reached = self.snes.getSolution()
         velocity = reached.getArray(readonly=True).reshape(self._shape)
-        if system.points.comm.allreduce(int(not np.isfinite(velocity).all())):
+        if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
             return None, "the velocities are not finite"
-        return self._points.at(reached) if self._iterates or system.step.of_edges else system.evaluate(
+        return self._points.at(reached) if self._iterates or equations.step.of_edges else equations.evaluate(
             velocity
         ), ""
 
@@ -485,7 +487,7 @@ class Stepper:
         """
         blamed = of_user(quoted(error), self._filled)
         may_help = len(self.presets) > 1 and reasons.in_set_up(error) and not blamed
-        return bool(self._system.points.comm.allreduce(int(may_help), op=MPI.MIN))
+        return bool(self._equations.points.comm.allreduce(int(may_help), op=MPI.MIN))
 
     def saved_state(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at ``time`` [s]; collective."""
@@ -503,7 +505,7 @@ class Stepper:
         """
         extrapolates = not self._iterates or self._suspended is not None
         if extrapolates:
-            self._extrapolation.record(time, self._system.v[: self._shape[0]])
+            self._extrapolation.record(time, self._equations.v[: self._shape[0]])
         return extrapolates
 
     def restore(
@@ -514,7 +516,7 @@ class Stepper:
             self.next_preset()
         self._newton.restore(numbers)
         if not self._iterates:
-            v = self._system.v[: self._shape[0]]
+            v = self._equations.v[: self._shape[0]]
             self._extrapolation.restore(arrays, numbers.get("extrapolation", {}), time, v)
         self.start(time, step)
 
@@ -531,7 +533,7 @@ class Stepper:
         velocity = self._newton.globalisation.lowest_iterate()
         if velocity is None:
             return None
-        positions: Array = self._system.evaluate(velocity).x[: len(velocity)].copy()
+        positions: Array = self._equations.evaluate(velocity).x[: len(velocity)].copy()
         return positions
 
     @property
@@ -564,7 +566,7 @@ class Stepper:
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
         v = u.getArray(readonly=True).reshape(self._shape)
-        self._system.forces.residual(v, self._points.at(u), f.getArray().reshape(self._shape))
+        self._equations.forces.residual(v, self._points.at(u), f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
@@ -572,15 +574,15 @@ class Stepper:
         if found is not None:
             guess[:] = found
             return
-        if first_guess(self._system, start, guess):
-            self._newton.curve_guess(self._system.stationary_velocity(), start, guess)
+        if first_guess(self._equations, start, guess):
+            self._newton.curve_guess(self._equations.stationary_velocity(), start, guess)
         if not self._iterates:
             # the linear solve starts from the extrapolation; its tolerance stays relative to the full step
-            system = self._system
+            equations = self._equations
             ahead = self._extrapolation.extrapolate(
-                system.step.end, system.step.start, system.v[: len(guess)]
+                equations.step.end, equations.step.start, equations.v[: len(guess)]
             )
-            system.prescribe(ahead)
+            equations.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 
     def _ijacobian(

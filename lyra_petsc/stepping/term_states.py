@@ -16,33 +16,33 @@ from lyra_petsc.terms.protocols import Place, Stateful, TermState
 from lyra_petsc.terms.term import Elastic
 
 
-def _entries(system: StageEquations, place: Place) -> Iterator[tuple[Stateful, str, TermState]]:
+def _entries(equations: StageEquations, place: Place) -> Iterator[tuple[Stateful, str, TermState]]:
     """The entries of all terms at a place, with term and name."""
-    for term in system.active.stateful:
+    for term in equations.active.stateful:
         for name, entry in term.state().items():
             if entry.place is place:
                 yield term, name, entry
 
 
-def vertex_arrays(system: StageEquations) -> dict[str, Array]:
+def vertex_arrays(equations: StageEquations) -> dict[str, Array]:
     """The terms' arrays (n_vertices, 3) of the owned vertices, by key."""
-    return {f"{term.name}.{name}": entry.values for term, name, entry in _entries(system, Place.VERTEX)}
+    return {f"{term.name}.{name}": entry.values for term, name, entry in _entries(equations, Place.VERTEX)}
 
 
-def edge_arrays(system: StageEquations) -> dict[str, Array]:
+def edge_arrays(equations: StageEquations) -> dict[str, Array]:
     """The terms' arrays (n_edges,) of the owned edges with an unknown, by key."""
-    layout, found = system.points, {}
-    for term, name, entry in _entries(system, Place.EDGE):
+    layout, found = equations.points, {}
+    for term, name, entry in _entries(equations, Place.EDGE):
         rows = np.zeros(3 * layout.n_local)
         rows[_edge_indices(term)] = entry.values
         found[f"{term.name}.{name}"] = rows[layout.edge_indices]
     return found
 
 
-def element_arrays(system: StageEquations) -> dict[str, Array]:
+def element_arrays(equations: StageEquations) -> dict[str, Array]:
     """Rows (E, n + m) of owned elements, by term: n mesh numbers of vertices, then m values."""
-    layout, found = system.points, {}
-    for term, _, entry in _entries(system, Place.ELEMENT):
+    layout, found = equations.points, {}
+    for term, _, entry in _entries(equations, Place.ELEMENT):
         vertices, values = entry.vertices, entry.values
         if vertices is None:
             vertices, values = layout.global_number[term.stencil[: term.n_owned]], values[: term.n_owned]
@@ -52,7 +52,7 @@ def element_arrays(system: StageEquations) -> dict[str, Array]:
 
 
 def restore_fixed(
-    system: StageEquations,
+    equations: StageEquations,
     arrays: Mapping[str, Array],
     edges: Mapping[str, Array],
     elements: Mapping[str, tuple[Ints, Array]],
@@ -62,30 +62,30 @@ def restore_fixed(
     A term that a checkpoint knows nothing of keeps its state. ``elements`` has for each term the global
     numbers (E, n) of vertices and the values (E, m) of elements, each on any rank.
     """
-    for term in system.active.stateful:
+    for term in equations.active.stateful:
         found = {}
         for name, entry in term.state().items():
             key = f"{term.name}.{name}"
             if entry.place is Place.VERTEX and key in arrays:
                 found[name] = arrays[key]
             elif entry.place is Place.EDGE and key in edges:
-                found[name] = _of_local_edges(system, term, edges[key])
+                found[name] = _of_local_edges(equations, term, edges[key])
             elif entry.place is Place.ELEMENT and entry.vertices is None and term.name in elements:
-                rows = _send_to_owners(system, *elements[term.name])
-                found[name] = _in_order(system.points.global_number[term.stencil], *rows, entry.values)
+                rows = _send_to_owners(equations, *elements[term.name])
+                found[name] = _in_order(equations.points.global_number[term.stencil], *rows, entry.values)
         if found:
-            term.restore(found, system.x)
+            term.restore(found, equations.x)
 
 
-def obstacle_places(system: StageEquations) -> dict[str, tuple[int, int]]:
+def obstacle_places(equations: StageEquations) -> dict[str, tuple[int, int]]:
     """Number of each obstacle in `element_arrays`, and of its first point, by name."""
-    if system.contact is None:
+    if equations.contact is None:
         return {}
-    return system.contact.barrier.obstacles.places
+    return equations.contact.barrier.obstacles.places
 
 
 def restore_changing(
-    system: StageEquations,
+    equations: StageEquations,
     elements: Mapping[str, tuple[Ints, Array]],
     places: Mapping[str, tuple[int, int]],
 ) -> None:
@@ -93,15 +93,15 @@ def restore_changing(
 
     ``places`` are the `obstacle_places` of the checkpoint.
     """
-    friction = None if system.contact is None else system.contact.friction
+    friction = None if equations.contact is None else equations.contact.friction
     if friction is not None and friction.name in elements:
-        friction.restore_pairs(*_send_to_owners(system, *elements[friction.name]), places)
-        friction.initialise_pairs(system.x, system.step.frozen[friction])
+        friction.restore_pairs(*_send_to_owners(equations, *elements[friction.name]), places)
+        friction.initialise_pairs(equations.x, equations.step.frozen[friction])
 
 
-def _send_to_owners(system: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:
+def _send_to_owners(equations: StageEquations, vertices: Ints, values: Array) -> tuple[Ints, Array]:
     """Exchange elements so that each rank gets those with a vertex that it owns."""
-    layout, comm = system.points, system.points.comm
+    layout, comm = equations.points, equations.points.comm
     owner = np.searchsorted(layout.bounds, vertices, side="right") - 1
     sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
     received = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
@@ -114,9 +114,9 @@ def _edge_indices(term: Elastic) -> Ints:
     return np.empty(0, dtype=np.int64) if term.edges is None else np.unique(term.edges).astype(np.int64)
 
 
-def _of_local_edges(system: StageEquations, term: Elastic, owned: Array) -> Array:
+def _of_local_edges(equations: StageEquations, term: Elastic, owned: Array) -> Array:
     """Values of a term's edges, ghosts included, from those of the owned edges."""
-    layout = system.points
+    layout = equations.points
     rows = np.zeros((layout.n_local, 3))
     rows.ravel()[layout.edge_indices] = owned
     layout.update_ghosts(rows)

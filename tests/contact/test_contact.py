@@ -49,8 +49,8 @@ class Watched:
         term = self.simulation.problem.terms["contact"]
         assert isinstance(term, ContactBarrier)
         self.term = term
-        self.system = self.simulation.problem.system
-        layout = self.system.points
+        self.equations = self.simulation.problem.equations
+        layout = self.equations.points
         pieces = comm.allgather(layout.global_number[term.search.surface])
         originals = np.concatenate(comm.allgather(layout.mesh_vertices))
         every = np.unique(np.sort(originals[np.concatenate(pieces)], axis=1), axis=0)
@@ -70,18 +70,18 @@ class Watched:
     @property
     def x(self) -> Array:
         """Positions (V, 3) in mesh order."""
-        return gathered(self.system.points, self.system.x)
+        return gathered(self.equations.points, self.equations.x)
 
     @property
     def v(self) -> Array:
-        return gathered(self.system.points, self.system.v)
+        return gathered(self.equations.points, self.equations.v)
 
     def throw(self, v: Callable[[Array], Array]) -> None:
         """Set velocities as a function of the positions."""
-        n = self.system.points.n_owned
-        x = self.system.x[:n].copy()
-        vertices = np.arange(n)[:, None] < self.system.points.n_vertices
-        self.system.state.set(x, np.where(vertices, v(x), 0.0))
+        n = self.equations.points.n_owned
+        x = self.equations.x[:n].copy()
+        vertices = np.arange(n)[:, None] < self.equations.points.n_vertices
+        self.equations.state.set(x, np.where(vertices, v(x), 0.0))
         self.simulation.energy_balance.measure()
         self.simulation.stepper.start(0.0, 0)
 
@@ -116,18 +116,18 @@ class Watched:
 
     def forces(self, x: Array | None = None) -> tuple[Array, float]:
         """Sum of the contact forces on the sheets [N], and the largest of them, at the last stage."""
-        system = self.system
-        x = system.evaluated.x if x is None else x
-        force = np.zeros((system.points.n_local, 3))
-        self.term.add_gradient(x, system.step.frozen[self.term], force)
-        own = -force[: system.points.n_owned]
+        equations = self.equations
+        x = equations.evaluated.x if x is None else x
+        force = np.zeros((equations.points.n_local, 3))
+        self.term.add_gradient(x, equations.step.frozen[self.term], force)
+        own = -force[: equations.points.n_owned]
         largest = self.comm.allreduce(float(np.abs(own).max(initial=0.0)), MPI.MAX)
-        return np.asarray(system.points.global_sum(*own.sum(axis=0))), largest
+        return np.asarray(equations.points.global_sum(*own.sum(axis=0))), largest
 
     @property
     def momentum(self) -> Array:
-        n = self.system.points.n_owned
-        return np.asarray(self.system.points.global_sum(*(self.system.mass @ self.system.v[:n])))
+        n = self.equations.points.n_owned
+        return np.asarray(self.equations.points.global_sum(*(self.equations.mass @ self.equations.v[:n])))
 
 
 def toward_each_other(speed: float) -> Callable[[Array], Array]:
@@ -153,7 +153,7 @@ def test_sheets_thrown_at_each_other(comm: MPI.Comm, integrator: str) -> None:
     with Watched(comm, two_sheets(time=time), **tight_linear(integrator)) as run:
         run.throw(toward_each_other(2.0))
         before, most = run.momentum, 0.0
-        scale = 2.0 * comm.allreduce(float(run.system.mass.sum()))
+        scale = 2.0 * comm.allreduce(float(run.equations.mass.sum()))
 
         def watch(simulation: SteppedScene) -> None:
             nonlocal most
@@ -240,16 +240,16 @@ def test_forces_balance_at_boundaries_between_ranks(comm: MPI.Comm) -> None:
 
     def at_first(on: MPI.Comm) -> tuple[int, Array]:
         with Watched(on, scene) as run:
-            run.system.set_references(0.0)
-            run.system.begin_step(0.0, 0.01)
-            x = run.system.x
+            run.equations.set_references(0.0)
+            run.equations.begin_step(0.0, 0.01)
+            x = run.equations.x
             total, largest = run.forces(x)
             assert largest > 0.1
             assert np.abs(total).max() <= 1e-12 * largest
-            force = np.zeros((run.system.points.n_local, 3))
-            run.term.add_gradient(x, run.system.step.frozen[run.term], force)
-            own = force[: run.system.points.n_owned]
-            return on.allreduce(run.term.n_owned), gathered(run.system.points, own)
+            force = np.zeros((run.equations.points.n_local, 3))
+            run.term.add_gradient(x, run.equations.step.frozen[run.term], force)
+            own = force[: run.equations.points.n_owned]
+            return on.allreduce(run.term.n_owned), gathered(run.equations.points, own)
 
     alone = comm.Split(comm.rank)
     count, force = at_first(alone)
@@ -327,8 +327,8 @@ def test_a_plane_carries_the_weight_at_rest(comm: MPI.Comm) -> None:
     """In a static analysis."""
     with Watched(comm, dropped("plane", time={"analysis": "static", "step": 1.0})) as run:
         run.run()
-        total, _ = run.forces(run.system.x)
-        weight = 9.81 * comm.allreduce(float(run.system.mass.sum()))
+        total, _ = run.forces(run.equations.x)
+        weight = 9.81 * comm.allreduce(float(run.equations.mass.sum()))
         np.testing.assert_allclose(total, [0.0, 0.0, weight], atol=1e-6 * weight)
         left = run.x[:, 2]
         assert 0.0 < left.min() <= left.max() < CONTACT["gap"]

@@ -105,7 +105,7 @@ def test_coarse_meshes_do_not_depend_on_the_partition(
                 down.append(Interpolation(share, *levels))
                 down[-1].set(np.ones((levels[0].points.n_owned, 3)))
             x = down[0].mat.createVecLeft()
-            x.setArray(problem.system.x[: problem.points.n_owned].ravel())
+            x.setArray(problem.equations.x[: problem.points.n_owned].ravel())
             for each in down:
                 coarse = each.mat.createVecRight()
                 each.mat.multTranspose(x, coarse)

@@ -47,19 +47,19 @@ def bent_state(simulation: Simulation) -> tuple[Array, Array]:
     simulation.set_state(
         x=(x + rng.uniform(-0.04, 0.04, (n, 3))) @ rotation([1, 1, 0], 0.3).T, v=rng.uniform(-1, 1, (n, 3))
     )
-    simulation.system.begin_step(0.0, DT)
+    simulation.equations.begin_step(0.0, DT)
     original = simulation.problem.points.mesh_vertices
     iterate, direction = rng.uniform(-1, 1, (n, 3)), rng.uniform(-1, 1, (n, 3))
     return iterate[original], direction[original]
 
 
 def residual(simulation: Simulation, v: Array) -> Array:
-    return simulation.system.residual_at(v)
+    return simulation.equations.residual_at(v)
 
 
 def jacobian(simulation: Simulation, v: Array, blend: float) -> Array:
-    system = simulation.system
-    system.forces.jacobian(system.linearised(v), blend, values := system.discretisation.rows.zeros())
+    equations = simulation.equations
+    equations.forces.jacobian(equations.linearised(v), blend, values := equations.discretisation.rows.zeros())
     return values
 
 
@@ -96,7 +96,7 @@ def test_matrix_is_the_derivative_of_the_residual(comm: MPI.Comm, kind: str) -> 
         assert matrix.kind == kind
         analytic = product(matrix, direction)
         # prescribed coordinates are decoupled in the matrix: move only the free ones for their rows
-        free = ~simulation.system.step.prescribed.mask[: len(v)]
+        free = ~simulation.equations.step.prescribed.mask[: len(v)]
         h = 1e-3
         d = np.where(free, direction, 0.0)
         numeric = (
@@ -138,12 +138,12 @@ def test_formats_agree_and_the_matrix_is_symmetric(comm: MPI.Comm) -> None:
 def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        free = ~simulation.system.step.prescribed.mask[: len(v)]
+        free = ~simulation.equations.step.prescribed.mask[: len(v)]
         d = np.where(free, direction, 0.0)
         h = 1e-3
 
         def value(step: float) -> float:
-            return simulation.system.forces.objective(simulation.system.evaluate(v + step * d))[0]
+            return simulation.equations.forces.objective(simulation.equations.evaluate(v + step * d))[0]
 
         numeric = (8.0 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12.0 * h)
         slope = comm.allreduce(float(np.vdot(residual(simulation, v), d)))
@@ -154,10 +154,10 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
 def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         bent_state(simulation)
-        system = simulation.system
-        rows, x, n = system.discretisation.rows, system.x, simulation.problem.points.n_owned
-        for term in system.active.elastic:
-            weight, frozen = 1.0 + np.arange(term.n_elements), system.step.frozen[term]
+        equations = simulation.equations
+        rows, x, n = equations.discretisation.rows, equations.x, simulation.problem.points.n_owned
+        for term in equations.active.elastic:
+            weight, frozen = 1.0 + np.arange(term.n_elements), equations.step.frozen[term]
             cases: list[tuple[Array, Array] | None] = [None]
             if isinstance(
                 term, Membrane
@@ -172,9 +172,9 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
                 np.testing.assert_allclose(
                     expanded(rows.pattern, values, len(x)), expected, rtol=0.0, atol=atol
                 )
-        assert {term.name for term in system.active.elastic} == {"membrane", "bending", "clamp", "spring"}
-        for term in system.active.viscous:
-            frozen, v = system.step.frozen[term], np.cos(5.0 * x)
+        assert {term.name for term in equations.active.elastic} == {"membrane", "bending", "clamp", "spring"}
+        for term in equations.active.viscous:
+            frozen, v = equations.step.frozen[term], np.cos(5.0 * x)
             term.add_hessian(v, frozen, rows.pattern.offsets, values := rows.zeros())
             expected = summed(term.stencil, blocks := blocks_of(term, v, frozen), len(x))[:n]
             np.testing.assert_allclose(

@@ -86,7 +86,7 @@ from lyra_petsc.stepping.stepper import Stepper
 
 scene = Scene.model_validate(json.loads(sys.argv[1]))
 problem = build_problem(MPI.COMM_SELF, scene, Phases())
-stepper = Stepper(scene, problem.system, problem.surface, problem.whole.spacing, 1e-12)
+stepper = Stepper(scene, problem.equations, problem.surface, problem.whole.spacing, 1e-12)
 stepper.start(0.0, 0)
 assert stepper.attempt(0.0, 0.01).converged
 print(json.dumps(sorted(m for m in sys.modules if m.startswith("lyra_petsc.") or m in HEAVY)))

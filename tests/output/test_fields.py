@@ -45,7 +45,7 @@ def test_collapsed_triangles_have_no_curvature() -> None:
         simulation.set_state(x=flat * [0.0, 1.0, 1.0] + noise)
         bending = simulation.problem.terms["bending"]
         assert isinstance(bending, Bending)
-        angles = bending.angles(simulation.system.x)
+        angles = bending.angles(simulation.equations.x)
         curvature, energy = value(simulation, "curvature"), value(simulation, "bending_energy")
     assert np.abs(angles).max() > 1.0
     assert not np.any(np.abs(curvature) > 1e-30)

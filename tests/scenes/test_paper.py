@@ -24,8 +24,8 @@ def end_of(integrator: str, step: float) -> tuple[float, float]:
     """Relative error of the kinetic energy and distance [m] of the centre of mass at t = 0.48 s."""
     settings = (f"time.integrator={integrator}", f"time.step={step}")
     with finished(MPI.COMM_SELF, load_scene(ROOT / "configs" / "paper.yaml", settings)) as simulation:
-        system, mean = simulation.problem.system, ANSWERS["mean"]
-        centre = system.mass @ system.x / system.mass.sum()
+        equations, mean = simulation.problem.equations, ANSWERS["mean"]
+        centre = equations.mass @ equations.x / equations.mass.sum()
         apart = np.linalg.norm(centre[1:] - [mean["mean_y"][-1], mean["mean_z"][-1]])
         return simulation.budget.kinetic / mean["kinetic_energy"][-1] - 1.0, float(apart)
 

@@ -39,12 +39,12 @@ def simulated(name: str, *settings: str) -> AbstractContextManager[SteppedScene]
 
 
 def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
-    return simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
+    return simulation.problem.equations.x[simulation.problem.probes[probe]].mean(axis=0)
 
 
 def test_a_turning_ball_rotates_its_cloth() -> None:
     with simulated("ball", "mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.01") as simulation:
-        x, surface = simulation.problem.system.x, simulation.problem.surface
+        x, surface = simulation.problem.equations.x, simulation.problem.surface
         columns = simulation.energy_balance.columns()
         crossings = self_crossings(x, surface.triangles.astype(np.int64))
     near = (distance := np.linalg.norm(surface.x[:, :2], axis=1)) < 0.25
@@ -75,7 +75,7 @@ def test_the_draped_square_hangs_with_its_whole_weight() -> None:
         "drape", "mesh.size=0.1", "time.step=0.25", "time.end=20", "output.every=20"
     ) as simulation:
         pull = sum(simulation.energy_balance.handle_forces(2))
-        lowest = simulation.problem.system.x[:, 2].min()
+        lowest = simulation.problem.equations.x[:, 2].min()
     np.testing.assert_allclose(pull, [0.0, 0.0, 0.187 * 9.81], atol=2e-3)
     assert lowest < -0.9
 
@@ -85,8 +85,8 @@ def test_turned_corners_are_opposite_after_half_a_turn() -> None:
     with simulated(
         "spin", "mesh.size=0.12", "time.end=3.5", "time.step=0.05", "output.every=3.5"
     ) as simulation:
-        system = simulation.problem.system
-        corners = {number: system.x[system.held.vertices(number)][0] for number in (0, 1)}
+        equations = simulation.problem.equations
+        corners = {number: equations.x[equations.held.vertices(number)][0] for number in (0, 1)}
     ends = sorted(corner[0] for corner in corners.values())
     np.testing.assert_allclose(ends, [-0.5, 0.5], atol=1e-9)
     np.testing.assert_allclose([corner[1:] for corner in corners.values()], 0.0, atol=1e-9)
@@ -94,12 +94,12 @@ def test_turned_corners_are_opposite_after_half_a_turn() -> None:
 
 def test_handles_of_the_sail_carry_wind_and_weight() -> None:
     with simulated("sail", "mesh.size=0.2", "time.step=0.1", "time.end=20", "output.every=20") as simulation:
-        system, scene = simulation.problem.system, simulation.scene
+        equations, scene = simulation.problem.equations, simulation.scene
         pull = sum(simulation.energy_balance.handle_forces(2))
         membrane = simulation.problem.membrane
-        corners = system.x[membrane.stencil]
+        corners = equations.x[membrane.stencil]
         area = membrane.elements.data["area"][:, None]
-        weight = system.mass.sum() * np.asarray(scene.gravity)
+        weight = equations.mass.sum() * np.asarray(scene.gravity)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     wind = np.asarray(scene.wind.velocity)
@@ -139,8 +139,8 @@ def test_the_free_edge_of_the_swing_falls_freely_and_swings_in() -> None:
 def test_paper_falls_like_the_ensemble() -> None:
     # known from an ensemble: at 0.2 s, before the wrinkles matter, 0.1623 J moving
     with simulated("paper", "time.end=0.2") as simulation:
-        system = simulation.problem.system
-        height = float(system.mass @ system.x[:, 2] / system.mass.sum())
+        equations = simulation.problem.equations
+        height = float(equations.mass @ equations.x[:, 2] / equations.mass.sum())
         moving = simulation.budget.kinetic
     assert moving == pytest.approx(0.1623, abs=5e-4)
     assert height == pytest.approx(-0.1657, abs=5e-4)
@@ -168,7 +168,7 @@ def test_the_twisted_strip_has_turned_by_half_in_the_middle() -> None:
     settings = ("mesh.grid.nx=50", "mesh.grid.ny=6", "time.step=0.02", "output.every=2")
     with simulated("twisted-strip", *settings) as simulation:
         problem, forces = simulation.problem, simulation.energy_balance.handle_forces(2)
-        x = problem.system.x[np.argsort(problem.points.mesh_vertices)].reshape(7, 51, 3)
+        x = problem.equations.x[np.argsort(problem.points.mesh_vertices)].reshape(7, 51, 3)
     assert np.linalg.norm(x[3, 25, 1:]) < 0.015
     assert x[6, 25, 1] < -0.02 < 0.02 < x[0, 25, 1]
     np.testing.assert_allclose(forces[0], -forces[1], atol=0.02 * abs(forces[0][0]))

@@ -50,7 +50,7 @@ def edge_after(
     factors = {"pc_type": "cholesky"}
     with Simulation(scene(integrator, c11, cells), comm, factors) as simulation:
         x = simulation.run(1.0 / frequency, round(frequency * time))
-        strain, _ = simulation.problem.membrane.strain_and_stress(simulation.system.x)
+        strain, _ = simulation.problem.membrane.strain_and_stress(simulation.equations.x)
         largest = comm.allreduce(float(strain[:, 0].max()), op=MPI.MAX)
     edge = x[cells :: cells + 1]
     assert np.ptp(edge[:, [0, 2]], axis=0).max() < 2e-3  # uniform along the edge but for its corners

@@ -25,28 +25,28 @@ AXIS = np.array([0.6, 0.0, 0.8])
 
 def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """Zero velocities, and the increment that is tangential to a rotation about the origin."""
-    system, n = simulation.problem.system, simulation.problem.points.n_vertices
-    system.begin_step(0.0, 1.0)
-    increment = np.zeros_like(system.step.v_h)
-    increment[:n] = angle * np.cross(AXIS, system.x[:n])
-    for term in system.active.with_edges:
+    equations, n = simulation.problem.equations, simulation.problem.points.n_vertices
+    equations.begin_step(0.0, 1.0)
+    increment = np.zeros_like(equations.step.v_h)
+    increment[:n] = angle * np.cross(AXIS, equations.x[:n])
+    for term in equations.active.with_edges:
         places = term.edge_indices
         own = places < increment.size
         increment.reshape(-1)[places[own]] = (
             angle * (term.of_edges.length * (term.frames.direction @ AXIS))[own]
         )
-    return system.stationary_velocity(), increment / system.step.stage.c
+    return equations.stationary_velocity(), increment / equations.step.stage.c
 
 
 @pytest.mark.parallel(2, 3)
 def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SHEET))
-    system, n = simulation.problem.system, simulation.problem.points.n_vertices
+    equations, n = simulation.problem.equations, simulation.problem.points.n_vertices
     staying, increment = turning(simulation, 0.9 * MAX_TURN)
-    arcs = Arcs(system)
+    arcs = Arcs(equations)
     bent, straight = arcs.curve(staying, increment)
     np.testing.assert_array_equal(straight, increment)
-    start, there = system.x[:n].copy(), system.displacement(staying, bent)
+    start, there = equations.x[:n].copy(), equations.displacement(staying, bent)
     moved = (there[0] + there[1])[:n]
     turned = start @ rotation(AXIS, 0.9 * MAX_TURN).T
 
@@ -57,8 +57,8 @@ def test_a_rotation_keeps_the_shape(comm: MPI.Comm) -> None:
         return total / comm.allreduce(len(x))
 
     np.testing.assert_allclose(moved - middle(moved), turned - middle(turned), atol=1e-7)
-    straight_end = there[0] + system.displacement(staying, increment)[1]
-    energy = [sum(float(t.energies(x, system.step.frozen[t]).sum()) for t in system.active.elastic)
+    straight_end = there[0] + equations.displacement(staying, increment)[1]
+    energy = [sum(float(t.energies(x, equations.step.frozen[t]).sum()) for t in equations.active.elastic)
               for x in (there[0] + there[1], straight_end)]  # fmt: skip
     bending, tangent = (comm.allreduce(each) for each in energy)
     assert bending < 1e-9 * tangent

@@ -53,16 +53,16 @@ SCENES["all"] = SCENES["moving"] | SCENES["wind"] | SCENES["loads"] | SCENES["da
 
 def bracket(simulation: Simulation, before: Array) -> float:
     """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the last step."""
-    system = simulation.system
-    n = system.points.n_owned
+    equations = simulation.equations
+    n = equations.points.n_owned
     change = 0.0
-    gradient = np.zeros_like(system.x)
-    for term in system.active.elastic:
+    gradient = np.zeros_like(equations.x)
+    for term in equations.active.elastic:
         if term.name != "spring":
-            frozen = system.step.frozen[term]
-            change += float(term.energies(system.x, frozen).sum() - term.energies(before, frozen).sum())
-            term.add_gradient(system.x, frozen, gradient)
-    change -= float(np.vdot(gradient[:n], system.x[:n] - before[:n]))
+            frozen = equations.step.frozen[term]
+            change += float(term.energies(equations.x, frozen).sum() - term.energies(before, frozen).sum())
+            term.add_gradient(equations.x, frozen, gradient)
+    change -= float(np.vdot(gradient[:n], equations.x[:n] - before[:n]))
     return float(simulation.comm.allreduce(change))
 
 
@@ -71,16 +71,16 @@ def bracket(simulation: Simulation, before: Array) -> float:
 )
 def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: str) -> None:
     with Simulation(BASE | SCENES[name], comm) as simulation:
-        system = simulation.system
-        n = system.points.n_owned
-        energy_balance = EnergyBalance(system)
+        equations = simulation.equations
+        n = equations.points.n_owned
+        energy_balance = EnergyBalance(equations)
         size = max(energy_balance.budget.total, 0.1)
         for _ in range(10):
-            x, v, old = system.x.copy(), system.v[:n].copy(), energy_balance.budget
+            x, v, old = equations.x.copy(), equations.v[:n].copy(), energy_balance.budget
             simulation.step(DT)
             energy_balance.record(x[:n])
             new = energy_balance.budget
-            jump = system.mass[:, None] * (system.v[:n] - v) ** 2
+            jump = equations.mass[:, None] * (equations.v[:n] - v) ** 2
             lost = 0.5 * comm.allreduce(float(jump.sum()))
             heat, work = new.dissipation - old.dissipation, new.external_work - old.external_work
             change = new.total - old.total
@@ -93,13 +93,13 @@ def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: s
 @pytest.mark.parametrize("name", ["free", "damping"])
 def test_a_free_sheet_gains_energy_only_by_its_bracket(comm: MPI.Comm, name: str) -> None:
     with Simulation(BASE | SCENES[name], comm) as simulation:
-        system = simulation.system
-        n = system.points.n_owned
-        energy_balance = EnergyBalance(system)
+        equations = simulation.equations
+        n = equations.points.n_owned
+        energy_balance = EnergyBalance(equations)
         first = energy_balance.budget.total
         fed = 0.0
         for _ in range(10):
-            x = system.x.copy()
+            x = equations.x.copy()
             simulation.step(DT)
             energy_balance.record(x[:n])
             fed += max(0.0, bracket(simulation, x))
@@ -111,18 +111,18 @@ def test_a_free_sheet_gains_energy_only_by_its_bracket(comm: MPI.Comm, name: str
 @pytest.mark.parametrize("name", [name for name in SCENES if "clamp" not in name])
 def test_forces_and_reactions_equal_the_change_of_momentum(comm: MPI.Comm, name: str) -> None:
     with Simulation(BASE | SCENES[name], comm) as simulation:
-        system = simulation.system
-        n = system.points.n_owned
-        energy_balance = EnergyBalance(system)
+        equations = simulation.equations
+        n = equations.points.n_owned
+        energy_balance = EnergyBalance(equations)
         for _ in range(5):
-            x, v = system.x[:n].copy(), system.v[:n].copy()
+            x, v = equations.x[:n].copy(), equations.v[:n].copy()
             simulation.step(DT)
             energy_balance.record(x)
-            parts = dict(system.forces_at_stage())
+            parts = dict(equations.forces_at_stage())
             applied = sum(parts[key] for key in ("loads", "wind", "springs") if key in parts)
             outer = energy_balance.reaction - applied
             force = comm.allreduce(outer.sum(axis=0))
-            momentum = comm.allreduce((system.mass[:, None] * (system.v[:n] - v)).sum(axis=0))
+            momentum = comm.allreduce((equations.mass[:, None] * (equations.v[:n] - v)).sum(axis=0))
             np.testing.assert_allclose(momentum / DT, force, atol=1e-7 * max(1.0, np.abs(force).max()))
 
 
@@ -133,11 +133,11 @@ def test_reactions_of_a_sheet_at_rest_carry_its_weight(comm: MPI.Comm) -> None:
         "handles": [{"box": [[-1, 0.79, -1], [2, 1, 1]]}],
     }
     with Simulation(content, comm) as simulation:
-        system = simulation.system
-        n = system.points.n_owned
-        energy_balance = EnergyBalance(system)
+        equations = simulation.equations
+        n = equations.points.n_owned
+        energy_balance = EnergyBalance(equations)
         for _ in range(12):
-            x = system.x[:n].copy()
+            x = equations.x[:n].copy()
             simulation.step(10.0)
         energy_balance.record(x)
         reaction = comm.allreduce(energy_balance.reaction.sum(axis=0))

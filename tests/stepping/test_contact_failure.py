@@ -127,7 +127,7 @@ def test_a_fast_obstacle_takes_the_sheet_with_it(comm: MPI.Comm, integrator: str
     budget = simulation.budget
     assert 0.2 * 0.5 * 0.2 * speed**2 < budget.external_work < 4.0 * 0.5 * 0.2 * speed**2
     assert budget.total + budget.dissipation < 1.02 * budget.external_work
-    middle = simulation.problem.system.x[:, 2].max(initial=-1.0)
+    middle = simulation.problem.equations.x[:, 2].max(initial=-1.0)
     assert comm.allreduce(middle, MPI.MAX) > 0.3 + speed * 4 * step
     simulation.destroy()
 
@@ -150,7 +150,7 @@ def test_impacts_create_no_energy(comm: MPI.Comm, integrator: str, step: float) 
     while not simulation.finished:
         simulation.step()
         most = max(most, simulation.budget.total + simulation.budget.dissipation)
-        assert simulation.problem.system.integrator.name == integrator
+        assert simulation.problem.equations.integrator.name == integrator
     assert most < 1.005 * start
     if integrator == "bdf2":  # backward Euler takes the long steps of the others, and some energy
         assert simulation.budget.total + simulation.budget.dissipation > 0.8 * start
@@ -202,9 +202,9 @@ def test_the_nearest_obstacle_is_named_even_if_sheets_are_nearer(comm: MPI.Comm)
     for obstacles, name in ((far, None), (near, "floor")):
         simulation = SteppedScene(comm, scene_of(scene | {"obstacles": obstacles}))
         simulation.step()
-        system = simulation.problem.system
-        x, frozen = system.evaluated.x, system.step.frozen[system.contact.barrier]
-        nearest, obstacle = (find(system.contact, x, frozen) for find in (blocking_pair, nearest_obstacle))
+        equations = simulation.problem.equations
+        x, frozen = equations.evaluated.x, equations.step.frozen[equations.contact.barrier]
+        nearest, obstacle = (find(equations.contact, x, frozen) for find in (blocking_pair, nearest_obstacle))
         assert nearest is not None
         assert not nearest.obstacle
         assert (None if obstacle is None else obstacle.obstacle) == name

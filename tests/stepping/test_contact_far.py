@@ -34,7 +34,7 @@ def test_linear_solves_are_those_of_a_step_without_contact() -> None:
     for more in ({}, FAR):
         simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | more | timed("semi-implicit")))
         linear = sum(simulation.step().linear_iterations for _ in range(STEPS))
-        found.append((linear, gathered(simulation.problem.points, simulation.problem.system.x)))
+        found.append((linear, gathered(simulation.problem.points, simulation.problem.equations.x)))
         simulation.destroy()
     assert found[1][0] == found[0][0]
     np.testing.assert_allclose(found[1][1], found[0][1], rtol=0.0, atol=1e-12)
@@ -96,7 +96,7 @@ def test_an_obstacle_of_huge_radius_acts_as_a_plane(comm: MPI.Comm, shape: str) 
         step = simulation.step()
         assert not step.rejected
         iterations.append(step.newton_iterations)
-    weight = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum()))
+    weight = 9.81 * comm.allreduce(float(simulation.problem.equations.mass.sum()))
     force = simulation.energy_balance.obstacle_forces(1)[0, :3]
     simulation.destroy()
     np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-6 * weight)

@@ -57,7 +57,7 @@ def thrown(comm: MPI.Comm, options: dict[str, str]) -> Array:
         simulation.step()
         contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
     assert contacts >= (CELLS + 1) ** 2
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    x = gathered(simulation.problem.points, simulation.problem.equations.x)
     simulation.destroy()
     for name in options:
         PETSc.Options().delValue(name)
@@ -88,7 +88,7 @@ def test_the_monitor_shows_contact_and_friction(comm: MPI.Comm, capfd: pytest.Ca
         columns = simulation.energy_balance.columns()
         touching.append((columns["contacts"], columns["smallest_gap"]))
         # the monitor shows forces of the barrier only
-        damped = comm.allreduce(float(simulation.problem.system.contact_impulses.loads[:, 2].sum()))
+        damped = comm.allreduce(float(simulation.problem.equations.contact_impulses.loads[:, 2].sum()))
         weights.append(simulation.energy_balance.obstacle_forces(1)[0, 2] - damped)
     PETSc.Sys.syncFlush(comm)
     out = capfd.readouterr().out
@@ -127,14 +127,14 @@ def test_linear_systems_are_solved_accurately_while_a_sheet_buckles(comm: MPI.Co
     mesh = grid(0.5, 0.5, 12, 12) | {"transform": {"translate": [-0.25, -0.25, 0.004]}}
     content = {"material": material, "mesh": mesh, "contact": {}, "initial": {}, "solver": {}}
     simulation = SteppedScene(comm, scene_of(SCENE | content))
-    system, tolerances = simulation.problem.system, []
-    x, v = (state[: simulation.problem.points.n_owned].copy() for state in (system.x, system.v))
+    equations, tolerances = simulation.problem.equations, []
+    x, v = (state[: simulation.problem.points.n_owned].copy() for state in (equations.x, equations.v))
     v[:, :2] = -rate * x[:, :2]
     waves = 1.0 - np.cos([37.0, 27.3] * x[:, :2] + [1.9, 0.6])
     x[:, 2] += 0.002 * waves.prod(axis=1)
-    system.state.set(x, v)
+    equations.state.set(x, v)
     simulation.stepper.start(0.0, 0)
-    simulation.energy_balance = EnergyBalance(system)
+    simulation.energy_balance = EnergyBalance(equations)
     simulation.step()  # the first step does not know the Hessian of one before
     simulation.stepper.snes.getKSP().setMonitor(lambda ksp, *_: tolerances.append(ksp.getTolerances()[0]))
     simulation.step()

@@ -141,7 +141,7 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
             simulation.step()
             contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
             if step in (20, STEPS):
-                results[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
+                results[-1].append(gathered(simulation.problem.points, simulation.problem.equations.x))
         assert contacts > 10.0
         simulation.destroy()
     for alone, together, tolerance in zip(*results, (1e-8, 1e-6), strict=True):
@@ -154,7 +154,10 @@ def positions_after(comm: MPI.Comm, content: dict[str, Any], steps: int) -> tupl
     for _ in range(steps):
         simulation.step()
         contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
-    x, size = gathered(simulation.problem.points, simulation.problem.system.x), simulation.problem.whole.size
+    x, size = (
+        gathered(simulation.problem.points, simulation.problem.equations.x),
+        simulation.problem.whole.size,
+    )
     simulation.destroy()
     return x, size, contacts
 
@@ -218,17 +221,17 @@ def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
         for name, value in options.items():
             PETSc.Options().setValue(name, value)
         simulation = SteppedScene(ranks, scene_of(content))
-        system, points = simulation.problem.system, simulation.problem.points
-        n, v = points.n_owned, system.v[: points.n_owned].copy()
+        equations, points = simulation.problem.equations, simulation.problem.points
+        n, v = points.n_owned, equations.v[: points.n_owned].copy()
         v[:, 2] = np.where(points.mesh_vertices < 13 * 13, 10.0, -10.0)
-        system.state.set(system.x[:n], v)
+        equations.state.set(equations.x[:n], v)
         simulation.stepper.start(0.0, 0)
-        simulation.energy_balance = EnergyBalance(system)
+        simulation.energy_balance = EnergyBalance(equations)
         for _ in range(3):
             simulation.step()
             contacts = max(contacts, simulation.energy_balance.columns()["contacts"])
         size = simulation.problem.whole.size
-        results.append(gathered(simulation.problem.points, system.x))
+        results.append(gathered(simulation.problem.points, equations.x))
         simulation.destroy()
     assert contacts > 10.0
     np.testing.assert_allclose(results[1], results[0], rtol=0.0, atol=1e-8 * size)

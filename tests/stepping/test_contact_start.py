@@ -151,9 +151,9 @@ def test_noise_of_the_start_is_included(comm: MPI.Comm) -> None:
 def test_nearer_than_thickness(comm: MPI.Comm) -> None:
     scene = obstacle(plane={"point": [0, 0, -0.003], "normal": [0, 0, 1]})
     with Simulation(scene | {"contact": {"gap": 0.02, "thickness": 0.002}}, comm) as simulation:
-        system, contact = simulation.system, simulation.problem.terms["contact"]
+        equations, contact = simulation.equations, simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)
-        energies = contact.energies(system.x, system.step.frozen[contact])
+        energies = contact.energies(equations.x, equations.step.frozen[contact])
         total = comm.allreduce(float(energies.sum()))
     # 16 vertices inside the gap, in the first state, before any step
     stiffness, left, gap = contact.barrier.stiffness, 0.001, 0.02

@@ -53,7 +53,7 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
     simulation, newton = SteppedScene(comm, scene_of(scene)), 0
     while not simulation.finished:
         newton += simulation.step().newton_iterations
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    x = gathered(simulation.problem.points, simulation.problem.equations.x)
     mesh, term = simulation.problem.mesh, simulation.problem.terms["contact"]
 
     def crossings() -> int:
@@ -150,13 +150,13 @@ def test_friction_holds_a_strip_over_a_rod_within_mu_times_the_normal_force(
     newton = 0
     while not simulation.finished:
         newton += simulation.step().newton_iterations
-    term, system = simulation.problem.terms["contact"], simulation.problem.system
+    term, equations = simulation.problem.terms["contact"], simulation.problem.equations
     assert isinstance(term, ContactBarrier)
     torque = abs(simulation.energy_balance.obstacle_forces(1)[0, 4])
     allowed = (
         MU
         * RADIUS
-        * float(term.find_contacts(system.x, system.step.frozen[term].stage, term.n_owned)[2].sum())
+        * float(term.find_contacts(equations.x, equations.step.frozen[term].stage, term.n_owned)[2].sum())
     )
     simulation.destroy()
     assert newton < 250
@@ -208,7 +208,7 @@ def test_a_cloth_is_pulled_into_a_ring_against_friction(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(scene))
     while not simulation.finished:
         simulation.step()
-    lowest = gathered(simulation.problem.points, simulation.problem.system.x)[:, 2].min()
+    lowest = gathered(simulation.problem.points, simulation.problem.equations.x)[:, 2].min()
     simulation.destroy()
     assert lowest == pytest.approx(0.04 - 0.2)
 
@@ -241,7 +241,7 @@ def test_a_cloth_is_pulled_off_a_table(comm: MPI.Comm, friction: float) -> None:
     simulation, newton = SteppedScene(comm, scene_of(scene)), 0
     while not simulation.finished:
         newton += simulation.step().newton_iterations
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    x = gathered(simulation.problem.points, simulation.problem.equations.x)
     simulation.destroy()
     assert newton < 1200
     assert x[:, 0].min() > 0.9
@@ -276,9 +276,9 @@ def test_friction_follows_an_obstacle_that_moves(comm: MPI.Comm) -> None:
         simulation.step()
     torque, weight = simulation.energy_balance.obstacle_forces(1)[0, 5], WEIGHT * 0.4**2
     # the forces with the friction that the normal forces in the equilibrium allow
-    system, end = simulation.problem.system, simulation.time
-    system.begin_step(end, end + 1e-9)
-    left = system.points.global_sum(float(np.sum(system.out_of_balance() ** 2)))[0] ** 0.5
+    equations, end = simulation.problem.equations, simulation.time
+    equations.begin_step(end, end + 1e-9)
+    left = equations.points.global_sum(float(np.sum(equations.out_of_balance() ** 2)))[0] ** 0.5
     simulation.destroy()
     assert left < 1e-3 * weight
     assert torque < -1e-3 * weight

@@ -80,10 +80,10 @@ def test_a_part_touches_as_the_whole(comm: MPI.Comm, shared_tmp: Path, name: str
         energies, forces = [], []
         scene["contact"]["friction"] = friction
         with stepped(comm, scene, ksp_rtol=1e-12) as run:  # edges slide in parallel, which is sensitive
-            system, term = run.problem.system, run.problem.terms["contact"]
+            equations, term = run.problem.equations, run.problem.terms["contact"]
             while not run.finished:
                 run.step()
-                here = float(term.energies(system.x, system.step.frozen[term]).sum())
+                here = float(term.energies(equations.x, equations.step.frozen[term]).sum())
                 energies.append([comm.allreduce(here), run.budget.dissipation, run.budget.membrane])
                 forces.append(run.energy_balance.obstacle_forces(len(scene.get("obstacles", {})))[:, 2])
             x = shape(run)
@@ -135,16 +135,19 @@ def test_a_part_touches_its_image_as_the_whole_itself(
         }
         energies, apart = [], []
         with stepped(comm, scene, ksp_rtol=1e-12) as run:
-            system, term = run.problem.system, run.problem.terms["contact"]
-            rows, x = slice(0, run.problem.points.n_vertices), system.x[: run.problem.points.n_owned].copy()
+            equations, term = run.problem.equations, run.problem.terms["contact"]
+            rows, x = (
+                slice(0, run.problem.points.n_vertices),
+                equations.x[: run.problem.points.n_owned].copy(),
+            )
             v = np.zeros_like(x)
             v[rows, 0] = -3.0 * np.sign(x[rows, 0]) * np.maximum(x[rows, 2] - 0.06, 0.0)
-            system.state.set(x, v)
+            equations.state.set(x, v)
             run.stepper.start(0.0, 0)
             run.energy_balance.measure()
             while not run.finished:
                 run.step()
-                here = float(term.energies(system.x, system.step.frozen[term]).sum())
+                here = float(term.energies(equations.x, equations.step.frozen[term]).sum())
                 energies.append([comm.allreduce(here), run.budget.dissipation, run.budget.membrane])
                 if (gap := run.energy_balance.columns()["smallest_gap"]) < 0.9 * GAP:
                     apart.append(gap)

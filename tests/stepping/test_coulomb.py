@@ -53,19 +53,21 @@ class Mean:
     """Mean position and velocity of a simulation's sheet, and its weight [N]."""
 
     def __init__(self, simulation: SteppedScene) -> None:
-        self._system = simulation.problem.system
-        self.weight = G * self._sum(np.ones((self._system.points.n_owned, 1)))[0]
+        self._equations = simulation.problem.equations
+        self.weight = G * self._sum(np.ones((self._equations.points.n_owned, 1)))[0]
 
     def _sum(self, values: Array) -> Array:
-        return self._system.points.global_sum(*(self._system.mass @ values[: self._system.points.n_owned]))
+        return self._equations.points.global_sum(
+            *(self._equations.mass @ values[: self._equations.points.n_owned])
+        )
 
     @property
     def position(self) -> Array:
-        return self._sum(self._system.x) * G / self.weight
+        return self._sum(self._equations.x) * G / self.weight
 
     @property
     def velocity(self) -> Array:
-        return self._sum(self._system.v) * G / self.weight
+        return self._sum(self._equations.v) * G / self.weight
 
 
 def steps_by_coulombs_law(simulation: SteppedScene, friction: float, weight: float) -> None:
@@ -159,15 +161,15 @@ def test_friction_between_sheets_is_below_its_limit(
         "time": {"end": 0.08, "step": step, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, layout = simulation.problem.system, simulation.problem.points
+    equations, layout = simulation.problem.equations, simulation.problem.points
     moves = (layout.mesh_vertices >= 36)[:, None]
-    system.v[: layout.n_vertices] = np.where(moves, [1.5, 0.0, -1.0], 0.0)
-    system.state.update_ghosts()
+    equations.v[: layout.n_vertices] = np.where(moves, [1.5, 0.0, -1.0], 0.0)
+    equations.state.update_ghosts()
     simulation.energy_balance.measure()
-    mass = np.where(moves[:, 0], system.mass[: layout.n_vertices], 0.0)
+    mass = np.where(moves[:, 0], equations.mass[: layout.n_vertices], 0.0)
 
     def momentum() -> Array:
-        return layout.global_sum(*(mass @ system.v[: layout.n_vertices]))
+        return layout.global_sum(*(mass @ equations.v[: layout.n_vertices]))
 
     before = momentum()
     size = float(np.abs(before).max())

@@ -46,14 +46,14 @@ def failing(
     direct = direct_solver(comm) | {"ksp_rtol": "1e-12"}
     with stepped(comm, {**SCENE, **scene}, **direct | dict(petsc)) as simulation:
         if spoil is not None:
-            system = simulation.problem.system
-            plain = system.forces.residual
+            equations = simulation.problem.equations
+            plain = equations.forces.residual
 
             def spoiled(v: Array, at: Evaluation, out: Array) -> None:
                 plain(v, at, out)
                 spoil(simulation, out)
 
-            system.forces.residual = spoiled  # type: ignore[method-assign]
+            equations.forces.residual = spoiled  # type: ignore[method-assign]
 
         def run() -> None:
             while not simulation.finished:
@@ -156,7 +156,7 @@ def test_a_failed_load_step(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> 
         force = failure.failed_solve.residual
         assert np.sqrt(comm.allreduce(float(np.vdot(force, force)))) == pytest.approx(failure.diagnosis.norm)
         # the state is the one before the load step, the iterate another
-        x = simulation.problem.system.x[: simulation.problem.points.n_owned]
+        x = simulation.problem.equations.x[: simulation.problem.points.n_owned]
         assert comm.allreduce(float(np.abs(x[:, 2]).max(initial=0.0)), MPI.MAX) == 0.0
         assert (
             comm.allreduce(float(np.abs(failure.failed_solve.position - x).max(initial=0.0)), MPI.MAX) > 0.0

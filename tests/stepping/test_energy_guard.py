@@ -213,8 +213,8 @@ def test_checkpoints_have_the_state_of_the_guard() -> None:
     for _ in range(7):
         one.step()
     arrays, scalars = one.saved_state()
-    system = one.problem.system
-    other.problem.system.state.set(system.x.copy(), system.v.copy())
+    equations = one.problem.equations
+    other.problem.equations.state.set(equations.x.copy(), equations.v.copy())
     copies = {name: values.copy() for name, values in arrays.items()}
     other.resume(copies, json.loads(json.dumps(scalars)))
     assert run(other) == pytest.approx(run(one), rel=2e-6)  # with other first guesses
@@ -264,7 +264,7 @@ def test_the_run_ends_after_six_halvings(comm: MPI.Comm) -> None:
 
     def on() -> None:
         while True:
-            states.append((one.problem.system.x.copy(), dict(vars(one.budget))))
+            states.append((one.problem.equations.x.copy(), dict(vars(one.budget))))
             one.step()
 
     words = r"even with Δt = 0.000625 s.*time.integrator: bdf2"
@@ -272,7 +272,7 @@ def test_the_run_ends_after_six_halvings(comm: MPI.Comm) -> None:
         on()
     before, start = states[-1]
     assert error.value.collective
-    np.testing.assert_array_equal(one.problem.system.x, before)
+    np.testing.assert_array_equal(one.problem.equations.x, before)
     assert dict(vars(one.budget)) == start
     one.destroy()
 

@@ -148,7 +148,7 @@ def test_a_run_resumes_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Pa
     simulation = SteppedScene(comm, scene)
     while not simulation.finished:
         simulation.step()
-    unbroken = gathered(simulation.problem.points, simulation.problem.system.x)
+    unbroken = gathered(simulation.problem.points, simulation.problem.equations.x)
     heat = simulation.energy_balance.budget.dissipation
     simulation.destroy()
     x = end_on_one_rank(comm, scene, shared_tmp / "run", 20)

@@ -29,17 +29,17 @@ def force_of(load: Load, x: Array, out: Array) -> None:
 def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     content = scene_of({"mesh": grid(1.0, 0.7, 3, 2), "loads": [{"pressure": 7.0}]})
     simulation = SteppedScene(MPI.COMM_SELF, content, Phases())
-    system, random = simulation.problem.system, np.random.default_rng(0)
-    x = system.x + 0.1 * random.normal(size=system.x.shape)
+    equations, random = simulation.problem.equations, np.random.default_rng(0)
+    x = equations.x + 0.1 * random.normal(size=equations.x.shape)
     u, direction = (0.1 * random.normal(size=x.shape) for _ in range(2))
-    loads = FollowingLoads(system.active.loads, x, force_of, 0.5)
+    loads = FollowingLoads(equations.active.loads, x, force_of, 0.5)
 
     force, change = np.zeros_like(x), np.zeros_like(x)
     loads.add_force(x + u, force)
     energies = [loads.energy(x + u + sign * direction) for sign in (1.0, -1.0)]
     assert float(np.vdot(force, direction)) == pytest.approx(0.5 * (energies[1] - energies[0]), rel=1e-12)
 
-    rows = system.discretisation.rows
+    rows = equations.discretisation.rows
     values = rows.zeros()
     loads.add_hessian(2.0, rows.pattern, values)
     loads.add_force(x + direction, change)
@@ -47,11 +47,11 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     np.testing.assert_allclose(product, -2.0 * change, rtol=0, atol=1e-12 * np.abs(product).max())
 
     # with a rim that is held the stiffness is symmetric, and that of the force itself
-    inside = (np.abs(system.x[:, :1] - 0.5) < 0.4) & (np.abs(system.x[:, 1:2] - 0.35) < 0.3)
+    inside = (np.abs(equations.x[:, :1] - 0.5) < 0.4) & (np.abs(equations.x[:, 1:2] - 0.35) < 0.3)
     direction *= inside
     there, back, change = (np.zeros_like(x) for _ in range(3))
-    system.active.loads[0].add_force(x + 1e-6 * direction, 0.0, 1.0, there)
-    system.active.loads[0].add_force(x - 1e-6 * direction, 0.0, 1.0, back)
+    equations.active.loads[0].add_force(x + 1e-6 * direction, 0.0, 1.0, there)
+    equations.active.loads[0].add_force(x - 1e-6 * direction, 0.0, 1.0, back)
     loads.add_force(x + direction, change)
     expected = 0.5 * (there - back) / 2e-6
     np.testing.assert_allclose(change * inside, expected * inside, rtol=0, atol=1e-6 * np.abs(change).max())
@@ -122,9 +122,9 @@ def test_forces_on_the_way_to_an_equilibrium_do_not_loosen_the_tolerance() -> No
     with bench.simulation(content) as trial:
         while not trial.simulation.finished:
             trial.step()
-            system = trial.simulation.problem.system
-            force = float(np.linalg.norm(system.out_of_balance()))
-            worst = max(worst, force / system.forces.largest_force())
+            equations = trial.simulation.problem.equations
+            force = float(np.linalg.norm(equations.out_of_balance()))
+            worst = max(worst, force / equations.forces.largest_force())
     assert worst <= 1e-6  # the force tolerance; it was 0.3
 
 

@@ -65,14 +65,14 @@ def on_slope(
         "time": {"end": end, "step": 0.01, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
-    start = system.x[:n].copy()
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
+    start = equations.x[:n].copy()
     while not simulation.finished:
         simulation.step()
-    mass = system.points.global_sum(float(system.mass.sum()))[0]
+    mass = equations.points.global_sum(float(equations.mass.sum()))[0]
     slip, speed = (
-        float(system.points.global_sum(float(system.mass @ (values @ DOWN)))[0]) / mass
-        for values in (system.x[:n] - start, system.v[:n])
+        float(equations.points.global_sum(float(equations.mass @ (values @ DOWN)))[0]) / mass
+        for values in (equations.x[:n] - start, equations.v[:n])
     )
     force = simulation.energy_balance.obstacle_forces(1)[0]
     work = simulation.energy_balance.columns()["friction_work"]
@@ -100,13 +100,13 @@ def test_friction_is_a_part_of_the_residual_by_its_own_name(comm: MPI.Comm) -> N
         "obstacles": {"floor": {"plane": FLAT}},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
     for _ in range(3):
         simulation.step()
-    parts = {name: part.sum(axis=0) for name, part in system.forces_at_stage()}
+    parts = {name: part.sum(axis=0) for name, part in equations.forces_at_stage()}
     assert "springs" not in parts
     friction, internal = (comm.allreduce(parts[name]) for name in ("friction", "internal"))
-    weight = G * comm.allreduce(float(system.mass[:n].sum()))
+    weight = G * comm.allreduce(float(equations.mass[:n].sum()))
     assert 0.05 * weight < friction[0] < 0.2 * weight
     assert -internal[2] > 0.5 * weight
     simulation.destroy()
@@ -156,12 +156,14 @@ def test_a_sheet_sticks_until_static_friction_is_exceeded(comm: MPI.Comm) -> Non
         "solver": {},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, ratios = simulation.problem.system, []
-    weight = system.points.global_sum(float(system.mass.sum()))[0]
+    equations, ratios = simulation.problem.equations, []
+    weight = equations.points.global_sum(float(equations.mass.sum()))[0]
     for time in (1.3, 1.8):
         while simulation.time < time - 0.01:
             simulation.step()
-        middle = system.points.global_sum(*(float(system.mass @ x) for x in system.x[: len(system.mass)].T))
+        middle = equations.points.global_sum(
+            *(float(equations.mass @ x) for x in equations.x[: len(equations.mass)].T)
+        )
         ratios.append(math.hypot(middle[0], middle[2]) / weight)
     simulation.destroy()
     assert ratios[0] < 0.01
@@ -181,11 +183,11 @@ def test_a_sheet_slips_on_a_plane_that_accelerates_at_its_static_friction(
     time = {"end": end, "step": 0.01, "integrator": integrator}
     content = on_plane((0.3, 3), GAP, 0.95, both, motion, time=time)
     simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
-    start, slip = system.x[:n, 0].copy(), 0.0
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
+    start, slip = equations.x[:n, 0].copy(), 0.0
     while slip < 0.02 * GAP:
         simulation.step()
-        behind = moved[0] * (simulation.time / end) ** 3 - system.x[:n, 0] + start
+        behind = moved[0] * (simulation.time / end) ** 3 - equations.x[:n, 0] + start
         slip = comm.allreduce(float(np.abs(behind).max(initial=0.0)), MPI.MAX)
     slips = simulation.time / end * fastest / (static * G)
     simulation.destroy()
@@ -212,11 +214,11 @@ def test_a_sheet_released_at_rest_is_held_by_static_friction(comm: MPI.Comm, int
             "time": {"end": end, "step": step, "integrator": integrator},
         }
         simulation = SteppedScene(comm, scene_of(content))
-        system = simulation.problem.system
-        start = system.x.copy()
+        equations = simulation.problem.equations
+        start = equations.x.copy()
         while not simulation.finished:
             simulation.step()
-        distance, slip = (values.mean(axis=0) for values in (system.x, system.x - start))
+        distance, slip = (values.mean(axis=0) for values in (equations.x, equations.x - start))
         simulation.destroy()
         return float(distance @ NORMAL) / GAP, float(slip @ DOWN)
 
@@ -231,7 +233,7 @@ def first_accelerations(comm: MPI.Comm, content: dict[str, Any]) -> Array:
     """Accelerations [m/s²] of all vertices with which the integrator for contact starts."""
     content = content | {"time": {"end": 0.02, "step": 0.02, "integrator": "alpha2"}}
     simulation = SteppedScene(comm, scene_of(content))
-    integrator, found = simulation.problem.system.integrators.in_contact, []
+    integrator, found = simulation.problem.equations.integrators.in_contact, []
     keep = integrator.set_acceleration
 
     def set_acceleration(acceleration: Array) -> None:
@@ -315,8 +317,8 @@ def test_a_sticking_sheet_rotates_with_a_plane(comm: MPI.Comm) -> None:
     while not simulation.finished:
         simulation.step()
         if settled is None and simulation.time > 0.29:
-            settled = gathered(layout, simulation.problem.system.x)
-    x = gathered(layout, simulation.problem.system.x)
+            settled = gathered(layout, simulation.problem.equations.x)
+    x = gathered(layout, simulation.problem.equations.x)
     simulation.destroy()
     assert settled is not None
     crept = np.column_stack([x[:, 1], -x[:, 0]]) - settled[:, :2]
@@ -335,9 +337,9 @@ def test_friction_turns_half_of_the_work_of_a_belt_into_heat(comm: MPI.Comm, int
     speed = 0.35
     time = {"end": 0.14, "step": 0.001, "integrator": integrator}
     with finished(comm, on_plane((0.2, 4), 0.002, 1.5, 0.4, running(speed), time=time)) as simulation:
-        system, n = simulation.problem.system, simulation.problem.points.n_owned
-        own = float(system.mass.sum()), float(system.mass @ system.v[:n, 0])
-        mass, momentum = system.points.global_sum(*own)
+        equations, n = simulation.problem.equations, simulation.problem.points.n_owned
+        own = float(equations.mass.sum()), float(equations.mass @ equations.v[:n, 0])
+        mass, momentum = equations.points.global_sum(*own)
         work = simulation.energy_balance.columns()["friction_work"]
     assert momentum == pytest.approx(mass * speed, rel=1e-6)
     assert work == pytest.approx(0.5 * mass * speed**2, rel=0.04)
@@ -368,8 +370,8 @@ def test_a_running_belt_drags_a_sheet_from_rest(comm: MPI.Comm) -> None:
     time, heavy = {"end": end, "step": 0.01, "integrator": "midpoint"}, LIGHT | {"density": 40.0}
     content = on_plane((0.06, 2), GAP, 0.985, friction, running(speed), time=time, material=heavy)
     with finished(comm, content) as simulation:
-        system, n = simulation.problem.system, simulation.problem.points.n_owned
-        momentum = comm.allreduce(np.append(system.mass @ system.v[:n], system.mass.sum()))
+        equations, n = simulation.problem.equations, simulation.problem.points.n_owned
+        momentum = comm.allreduce(np.append(equations.mass @ equations.v[:n], equations.mass.sum()))
         rejected = simulation.totals["rejected"]
     assert momentum[0] / momentum[3] == pytest.approx(friction * G * end, rel=0.05)  # the sheet bounces
     assert rejected <= 2
@@ -425,13 +427,13 @@ def test_a_sheet_sticks_to_a_plane_and_to_a_sheet(comm: MPI.Comm, integrator: st
     }
     for content in (plane, sheet):
         simulation = SteppedScene(comm, scene_of(content))
-        system, n = simulation.problem.system, simulation.problem.points.n_owned
+        equations, n = simulation.problem.equations, simulation.problem.points.n_owned
         settled = None
         while not simulation.finished:
             simulation.step()
             if settled is None and simulation.time > 0.8 - 1e-9:
-                settled = system.x[:n].copy()
-        moved = comm.allreduce(float(np.abs(system.x[:n] - settled).max(initial=0.0)), MPI.MAX)
+                settled = equations.x[:n].copy()
+        moved = comm.allreduce(float(np.abs(equations.x[:n] - settled).max(initial=0.0)), MPI.MAX)
         simulation.destroy()
         assert moved < 1e-6
 
@@ -440,15 +442,15 @@ def test_a_sheet_sticks_to_a_plane_and_to_a_sheet(comm: MPI.Comm, integrator: st
 def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: str) -> None:
     friction, end, begin = 0.8 * math.tan(SLOPE), 0.5, 0.2
     simulation = SteppedScene(comm, scene_of(on_a_sheet(friction, integrator, end)))
-    system, layout = simulation.problem.system, simulation.problem.points
-    upper = np.where(layout.mesh_vertices >= 25 * 7, system.mass[: layout.n_vertices], 0.0)
+    equations, layout = simulation.problem.equations, simulation.problem.points
+    upper = np.where(layout.mesh_vertices >= 25 * 7, equations.mass[: layout.n_vertices], 0.0)
     mass = comm.allreduce(float(upper.sum()))
     speeds, times = [], []
     while not simulation.finished:
         simulation.step()
         if simulation.time > begin - 1e-9:
             times.append(simulation.time)
-            speeds.append(comm.allreduce(float(upper @ system.v[: layout.n_vertices] @ DOWN)) / mass)
+            speeds.append(comm.allreduce(float(upper @ equations.v[: layout.n_vertices] @ DOWN)) / mass)
     found = (speeds[-1] - speeds[0]) / (times[-1] - times[0])
     simulation.destroy()
     assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=6e-3)
@@ -466,18 +468,18 @@ def test_sheets_with_friction_conserve_momentum(comm: MPI.Comm) -> None:
         "time": {"end": 0.04, "step": 0.002, "integrator": "midpoint"},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, layout = simulation.problem.system, simulation.problem.points
+    equations, layout = simulation.problem.equations, simulation.problem.points
     n = layout.n_vertices
     below = (layout.mesh_vertices < low)[:, None]
-    spin = np.cross(np.where(below, [0.0, 0.0, 8.0], [0.0, 0.0, -8.0]), system.x[:n] - 0.5 * side)
-    system.v[:n] = np.where(below, [0.4, 0.0, 2.0], [0.0, 0.0, -2.0]) + spin
-    layout.update_ghosts(system.v)
+    spin = np.cross(np.where(below, [0.0, 0.0, 8.0], [0.0, 0.0, -8.0]), equations.x[:n] - 0.5 * side)
+    equations.v[:n] = np.where(below, [0.4, 0.0, 2.0], [0.0, 0.0, -2.0]) + spin
+    layout.update_ghosts(equations.v)
     simulation.energy_balance.measure()
 
     def momenta() -> tuple[Array, Array]:
         """Momentum and angular momentum, and the sums of their parts' magnitudes."""
-        momentum = system.mass[:n, None] * system.v[:n]
-        each = np.column_stack([momentum, np.cross(system.x[:n], momentum)])
+        momentum = equations.mass[:n, None] * equations.v[:n]
+        each = np.column_stack([momentum, np.cross(equations.x[:n], momentum)])
         both = comm.allreduce(np.stack([each.sum(axis=0), np.abs(each).sum(axis=0)]))
         return both[0], both[1].reshape(2, 3).sum(axis=1).repeat(3)
 
@@ -516,10 +518,10 @@ def test_a_resumed_run_keeps_sticking_contacts(comm: MPI.Comm, shared_tmp: Path,
         }
     )
     simulation = SteppedScene(comm, scene)
-    start = gathered(simulation.problem.points, simulation.problem.system.x)
+    start = gathered(simulation.problem.points, simulation.problem.equations.x)
     while not simulation.finished:
         simulation.step()
-    unbroken = gathered(simulation.problem.points, simulation.problem.system.x)
+    unbroken = gathered(simulation.problem.points, simulation.problem.equations.x)
     term = simulation.problem.terms["friction"]
     assert isinstance(term, CoulombFriction)
     stored = term.state()["pairs"]

@@ -79,11 +79,11 @@ def test_energy_of_a_turning_clamp_uses_targets_of_the_same_time(integrator: str
     material = CLOTH | {"bending": 0.1}
     scene = {"handles": handles, "motions": motions, "time": time, "material": material}
     with done(comm, **scene) as simulation:
-        system, problem = simulation.problem.system, simulation.problem
-        end = UpcomingStep(0.02, simulation.time, simulation.time, system.x, system.reference.at)
+        equations, problem = simulation.problem.equations, simulation.problem
+        end = UpcomingStep(0.02, simulation.time, simulation.time, equations.x, equations.reference.at)
         here = 0.0
         for name in ("bending", "clamp"):
             term: Any = problem.terms[name]
-            here += float(term.energies(system.x, term.freeze(end)).sum())
+            here += float(term.energies(equations.x, term.freeze(end)).sum())
         assert simulation.budget.bending == pytest.approx(comm.allreduce(here), rel=1e-12)
         assert comm.allreduce(here) > 1e-4

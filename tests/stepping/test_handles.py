@@ -246,7 +246,7 @@ def test_held_vertices_follow_the_motion_in_every_step(
             simulation.step(DT)
             expected = motion.moved(start, 0.0, simulation.time)
             np.testing.assert_allclose(simulation.x[nodes], expected, rtol=0.0, atol=1e-15)
-            written = simulation.gather(simulation.system.output_velocity())[nodes]
+            written = simulation.gather(simulation.equations.output_velocity())[nodes]
             np.testing.assert_allclose(written, motion.velocity(start, 0.0, simulation.time), atol=1e-12)
             assert step < 2 or np.abs(simulation.x[19] - start[0]).max() > 0.0
 
@@ -346,7 +346,9 @@ def test_a_fading_handle_weakens_with_the_fourth_power(soft: bool) -> None:
             simulation.step(DT)
             t = step * DT
             block = np.empty((1, 1, 1, 3, 3))
-            spring.hessians(simulation.system.x, simulation.system.step.frozen[spring], 0, 1, 0.0, block)
+            spring.hessians(
+                simulation.equations.x, simulation.equations.step.frozen[spring], 0, 1, 0.0, block
+            )
             share = 1.0 if t <= 0.1 + 1e-12 else max(0.0, 1.0 - (t - 0.1) / 0.2) ** 4
             if not soft and t <= 0.1 + 1e-12:
                 share = 0.0  # held exactly: no spring yet

@@ -38,13 +38,13 @@ def test_colliding_parts_hardly_rebound(
     comm: MPI.Comm, integrator: str, step: float, floor_moves: bool
 ) -> None:
     simulation = SteppedScene(comm, scene_of(impact(integrator, step, floor_moves=floor_moves)))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
     before, impulse = simulation.budget.total, 0.0
     while not simulation.finished:
         taken = simulation.step()
         impulse -= taken.dt * float(simulation.energy_balance.obstacle_forces(1)[0, 2])
-    own = float(system.mass.sum()), float(system.mass @ system.v[:n, 2])
-    mass, momentum = (float(value) for value in system.points.global_sum(*own))
+    own = float(equations.mass.sum()), float(equations.mass @ equations.v[:n, 2])
+    mass, momentum = (float(value) for value in equations.points.global_sum(*own))
     budget = simulation.budget
     simulation.destroy()
     floor = SPEED if floor_moves else 0.0
@@ -123,7 +123,7 @@ def test_contacts_reached_after_the_stage_are_noticed_in_the_same_step(integrato
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(content))
     while not simulation.finished:
         simulation.step()
-    x, steps = simulation.problem.system.x.copy(), simulation.step_number
+    x, steps = simulation.problem.equations.x.copy(), simulation.step_number
     simulation.destroy()
     assert steps < 300
     assert (x[:, 2] > 0.0).all()
@@ -154,13 +154,13 @@ def test_a_sheet_that_lands_obliquely_is_not_thrown_back(
         "time": {"end": 0.025 + 10.0 * step, "step": step, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
     back = 0.0
     while not simulation.finished:
         simulation.step()
-        mean = float(system.points.global_sum(float(system.v[:n, 0].sum()))[0]) / 16
+        mean = float(equations.points.global_sum(float(equations.v[:n, 0].sum()))[0]) / 16
         back = max(back, -mean)
-    stays = comm.allreduce(float(np.abs(system.v[:n, 0]).max(initial=0.0)), MPI.MAX)
+    stays = comm.allreduce(float(np.abs(equations.v[:n, 0]).max(initial=0.0)), MPI.MAX)
     simulation.destroy()
     assert back < largest * SPEED
     assert stays < max(largest, 0.01) * SPEED
@@ -180,10 +180,12 @@ def test_an_oblique_impact_is_slowed_by_friction(comm: MPI.Comm, integrator: str
         "time": {"end": 0.06, "step": step, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    equations, n = simulation.problem.equations, simulation.problem.points.n_owned
     while not simulation.finished:
         simulation.step()
-    mass, *momentum = system.points.global_sum(float(system.mass.sum()), *(system.mass @ system.v[:n]))
+    mass, *momentum = equations.points.global_sum(
+        float(equations.mass.sum()), *(equations.mass @ equations.v[:n])
+    )
     along, _, normal = momentum / mass
     simulation.destroy()
     assert 2.0 - along == pytest.approx(friction * (normal + 1.0), rel=1e-4)
@@ -210,10 +212,10 @@ def test_a_sheet_at_rest_on_an_accelerating_floor_is_pressed_but_not_damped(
         "time": {"end": end, "step": 0.01, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
-    system = simulation.problem.system
+    equations = simulation.problem.equations
     while not simulation.finished:
         simulation.step()
-    budget, (mass,) = simulation.budget, system.points.global_sum(float(system.mass.sum()))
+    budget, (mass,) = simulation.budget, equations.points.global_sum(float(equations.mass.sum()))
     force = -float(simulation.energy_balance.obstacle_forces(1)[0, 2])
     simulation.destroy()
     assert force == pytest.approx(mass * (gravity + acceleration), rel=1e-3)

@@ -116,14 +116,14 @@ def test_handles_follow_their_motion_exactly(integrator: str, comm: MPI.Comm) ->
     with Simulation(content, comm) as simulation:
         start = simulation.x
         simulation.run(0.05, 5)
-        held = simulation.system.held
+        held = simulation.equations.held
         points = simulation.problem.points
         goal = start[points.mesh_vertices].copy()
-        goal[:] = simulation.system.prescriptions.positions(
+        goal[:] = simulation.equations.prescriptions.positions(
             simulation.time, simulation.time, simulation.time, goal
         )
         for number in held.active(simulation.time, simulation.time):
             rows = held.vertices(number)
-            np.testing.assert_allclose(simulation.system.x[rows], goal[rows], rtol=0, atol=1e-14)
+            np.testing.assert_allclose(simulation.equations.x[rows], goal[rows], rtol=0, atol=1e-14)
         moved = np.abs(simulation.x - start).max()
         assert 0.1 < moved < 1.0

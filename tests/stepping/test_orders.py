@@ -109,13 +109,13 @@ def test_second_order_during_contact(integrator: str, comm: MPI.Comm) -> None:
     for steps in (80, 160, 320):
         time = {"end": END, "step": END / steps, "integrator": integrator}
         simulation = SteppedScene(comm, scene_of(LYING | {"time": time}))
-        weight, support = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum())), 0.0
+        weight, support = 9.81 * comm.allreduce(float(simulation.problem.equations.mass.sum())), 0.0
         while not simulation.finished:
             assert simulation.step().rejected == 0
             support -= float(simulation.energy_balance.obstacle_forces(1)[0, 2]) / steps
         assert support == pytest.approx(weight, rel=0.2)
-        system = simulation.problem.system
-        shapes.append(gathered(system.points, system.x))
+        equations = simulation.problem.equations
+        shapes.append(gathered(equations.points, equations.x))
         simulation.destroy()
     first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
     assert np.log2(first / second) == pytest.approx(2.0, abs=0.25)

@@ -53,10 +53,10 @@ def outcome(
 ) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Positions, velocities and energies after some steps."""
     with Simulation(content, comm) as simulation:
-        energy_balance = EnergyBalance(simulation.system)
-        n = simulation.system.points.n_owned
+        energy_balance = EnergyBalance(simulation.equations)
+        n = simulation.equations.points.n_owned
         for _ in range(steps):
-            x = simulation.system.x[:n].copy()
+            x = simulation.equations.x[:n].copy()
             simulation.step(0.01)
             energy_balance.record(x)
         return (

@@ -30,23 +30,23 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     """Final positions and number of rejected steps; attempts with these numbers are made to fail."""
     time = {"end": 0.12, "step": step, "integrator": integrator}
     with stepped(comm, SCENE | {"time": time}) as simulation:
-        system, attempts = simulation.problem.system, 0
-        residual = system.forces.residual
+        equations, attempts = simulation.problem.equations, 0
+        residual = equations.forces.residual
 
         def spoiled(v: Array, at: Evaluation, out: Array) -> None:
             residual(v, at, out)
             if attempts in fail:
                 out[:] = np.nan
 
-        system.forces.residual = spoiled  # type: ignore[method-assign]
-        begin = system.begin_step
+        equations.forces.residual = spoiled  # type: ignore[method-assign]
+        begin = equations.begin_step
 
         def counted(t0: float, t1: float) -> None:
             nonlocal attempts
             attempts += 1
             begin(t0, t1)
 
-        system.begin_step = counted  # type: ignore[method-assign]
+        equations.begin_step = counted  # type: ignore[method-assign]
         rejected = 0
         while not simulation.finished:
             rejected += simulation.step().rejected

@@ -26,7 +26,7 @@ def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
     }
     with finished(comm, scene) as simulation:
         points = simulation.problem.points
-        lowest = float(gathered(points, simulation.problem.system.x)[:, 2].min())
+        lowest = float(gathered(points, simulation.problem.equations.x)[:, 2].min())
         notes = [note for note in simulation.notes if "round-off" in note]
     return lowest, notes
 

@@ -30,26 +30,26 @@ MOVING = {"handles": [{"nodes": [0, 2], "motion": "away"}, HELD["handles"][1]]}
 MOVING |= {"motions": {"away": [{"time": 0.0}, {"time": 1.0} | AWAY]}}  # type: ignore[dict-item]
 
 
-def paper_step(system: StageEquations, time: float, dt: float) -> Array:
+def paper_step(equations: StageEquations, time: float, dt: float) -> Array:
     """Velocity (V, 3) after a step from ``time``: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n)."""
-    x, v_old = system.x, system.v
-    system.begin_step(time, time + dt)
-    mass = np.repeat(system.mass, 3)
+    x, v_old = equations.x, equations.v
+    equations.begin_step(time, time + dt)
+    mass = np.repeat(equations.mass, 3)
     a, force = np.diag(mass), np.zeros_like(x)
-    for term in system.active.elastic:
-        frozen = system.step.frozen[term]
+    for term in equations.active.elastic:
+        frozen = equations.step.frozen[term]
         force -= gradient(term, x, frozen)
         damping = GAMMA if term.name != "spring" else 0.0
         stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
         a += dt * (dt + damping) * stiffness.reshape(len(a), len(a))
-    for load in system.active.loads:
+    for load in equations.active.loads:
         load.add_force(x, time, time + dt, force)
-    for wind in system.active.viscous:
-        force -= gradient(wind, v_old, system.step.frozen[wind])
+    for wind in equations.active.viscous:
+        force -= gradient(wind, v_old, equations.step.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()
-    free = ~system.step.prescribed.mask.ravel()
+    free = ~equations.step.prescribed.mask.ravel()
     v = np.zeros(len(b))
-    v[~free] = system.step.prescribed.velocity
+    v[~free] = equations.step.prescribed.velocity
     v[free] = np.linalg.solve(a[np.ix_(free, free)], b[free] - a[np.ix_(free, ~free)] @ v[~free])
     return v.reshape(x.shape)
 
@@ -57,12 +57,12 @@ def paper_step(system: StageEquations, time: float, dt: float) -> Array:
 @pytest.mark.parametrize("handles", [{}, SPRINGS, HELD, MOVING], ids=["free", "springs", "held", "moving"])
 def test_steps_follow_the_papers_formula(handles: dict[str, Any]) -> None:
     with Simulation(SCENE | handles, MPI.COMM_SELF) as simulation:
-        system = simulation.system
+        equations = simulation.equations
         for _ in range(5):
-            x, expected = system.x.copy(), paper_step(system, simulation.time, DT)
+            x, expected = equations.x.copy(), paper_step(equations, simulation.time, DT)
             attempt = simulation.step(DT)
-            np.testing.assert_allclose(system.v, expected, rtol=0.0, atol=1e-11)
-            np.testing.assert_allclose(system.x, x + DT * expected, rtol=0.0, atol=1e-13)
+            np.testing.assert_allclose(equations.v, expected, rtol=0.0, atol=1e-11)
+            np.testing.assert_allclose(equations.x, x + DT * expected, rtol=0.0, atol=1e-13)
             assert attempt.newton_iterations <= 1
 
 

@@ -154,7 +154,7 @@ def end(scene: Scene) -> Array:
     """Final positions [m] of this rank's vertices."""
     with finished(MPI.COMM_WORLD, scene) as simulation:
         points = simulation.problem.points
-        x: Array = simulation.problem.system.x[: points.n_vertices].copy()
+        x: Array = simulation.problem.equations.x[: points.n_vertices].copy()
         order = np.argsort(points.mesh_vertices)
     return x[order]
 

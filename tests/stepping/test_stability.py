@@ -59,8 +59,8 @@ def test_a_strip_above_its_critical_weight_falls_over(weight: float, comm: MPI.C
         assert "its lowest mode was followed once" in notes(simulation)[0]
         tip = shape(simulation)[-1]
         assert np.abs(tip[1]) > 0.3 * LENGTH
-        system = simulation.problem.system
-        free = system.out_of_balance()
+        equations = simulation.problem.equations
+        free = equations.out_of_balance()
         assert comm.allreduce(np.abs(free).max(initial=0.0), MPI.MAX) < 1e-6 * weight * CRITICAL
 
 
@@ -120,35 +120,35 @@ def test_the_hessian_is_the_derivative_of_all_forces(name: str) -> None:
     """Its symmetric part if loads follow the shape; by finite differences on free unknowns."""
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
-    system = simulation.problem.system
-    system.take_loads(factor=0.7, unbalanced=None)
-    system.x[:, 0] *= 0.95
-    system.begin_step(0.3, 0.7)
-    free = np.flatnonzero(system.step.prescribed.free)
-    add_exact_hessian(system, values := system.discretisation.rows.zeros())
-    matrix = AssembledMatrix(system.points, system.discretisation.rows.pattern, "aij")
+    equations = simulation.problem.equations
+    equations.take_loads(factor=0.7, unbalanced=None)
+    equations.x[:, 0] *= 0.95
+    equations.begin_step(0.3, 0.7)
+    free = np.flatnonzero(equations.step.prescribed.free)
+    add_exact_hessian(equations, values := equations.discretisation.rows.zeros())
+    matrix = AssembledMatrix(equations.points, equations.discretisation.rows.pattern, "aij")
     matrix.set(values)
     indices, columns, entries = matrix.mat.getValuesCSR()
     matrix.destroy()
-    dense = np.zeros((system.x.size, system.x.size))
+    dense = np.zeros((equations.x.size, equations.x.size))
     dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
     dense = dense[np.ix_(free, free)]
     slopes = np.empty_like(dense)
-    here = system.x.copy()
+    here = equations.x.copy()
     for column, place in enumerate(free):
         force = []
         for sign in (1.0, -1.0):
-            system.x.ravel()[:] = here.ravel()
-            system.x.ravel()[place] += sign * 1e-6
-            system.begin_step(0.3, 0.7)
-            force.append(system.out_of_balance().ravel()[free])
+            equations.x.ravel()[:] = here.ravel()
+            equations.x.ravel()[place] += sign * 1e-6
+            equations.begin_step(0.3, 0.7)
+            force.append(equations.out_of_balance().ravel()[free])
         slopes[:, column] = (force[1] - force[0]) / 2e-6
     symmetric = 0.5 * (slopes + slopes.T)
     np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
-    system.x[:] = here
-    system.begin_step(0.3, 0.7)
+    equations.x[:] = here
+    equations.begin_step(0.3, 0.7)
     values = np.linalg.eigvalsh(symmetric)
-    with Examination(system, 1.4) as examination:
+    with Examination(equations, 1.4) as examination:
         assert examination.stability.negative == np.sum(values < 0.0)
         assert examination.stability.negative > 0
         mode = examination.lowest_mode()

@@ -43,8 +43,8 @@ def motion(comm: MPI.Comm, **content: Any) -> AbstractContextManager[SteppedScen
 
 def out_of_balance(simulation: SteppedScene) -> float:
     """Largest force [N] on a free coordinate."""
-    system = simulation.problem.system
-    return float(simulation.comm.allreduce(np.abs(system.out_of_balance()).max(initial=0.0), MPI.MAX))
+    equations = simulation.problem.equations
+    return float(simulation.comm.allreduce(np.abs(equations.out_of_balance()).max(initial=0.0), MPI.MAX))
 
 
 MOVED = {
@@ -200,7 +200,7 @@ def test_a_solve_ends_when_its_error_estimate_is_below_the_tolerance(comm: MPI.C
             "petsc": {"ts_adapt_dt_max": 0.1},
         }
         with at_rest(comm, **content) as simulation:
-            found.append(simulation.problem.system.x[: simulation.problem.points.n_vertices].copy())
+            found.append(simulation.problem.equations.x[: simulation.problem.points.n_vertices].copy())
             iterations.append(simulation.totals["newton_iterations"])
             spacing = simulation.problem.whole.spacing
     assert np.abs(found[0] - found[1]).max() <= 1e-6 * spacing
@@ -248,7 +248,7 @@ def test_static_analyses_end_at_their_tolerance(comm: MPI.Comm) -> None:
     for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
         content = {"handles": [{"nodes": [0, 6]}], "solver": {"force_tolerance": tolerance}}
         with at_rest(comm, **content) as simulation:
-            force = simulation.problem.system.out_of_balance()
+            force = simulation.problem.equations.out_of_balance()
             norm = np.sqrt(comm.allreduce(float(np.vdot(force, force))))
             # the largest part of the forces is hardly larger than the pull of the two handles
             left.append(norm / (tolerance * weight))
@@ -259,10 +259,10 @@ def test_a_static_analysis_starts_in_equilibrium(comm: MPI.Comm) -> None:
     """Forces that hold the start shape decrease with the load factor."""
     still = {"gravity": [0, 0, 0], "initial": {"noise": 5e-3}, "handles": [{"nodes": [0, 6]}]}
     with motion(comm, **still, time={"analysis": "static"}) as simulation:
-        system, left = simulation.problem.system, []
+        equations, left = simulation.problem.equations, []
         for factor in (0.0, 0.5, 1.0):
-            system.take_loads(factor=factor)
-            system.begin_step(0.0, factor)
-            left.append(comm.allreduce(np.abs(system.out_of_balance()).max(initial=0.0), MPI.MAX))
+            equations.take_loads(factor=factor)
+            equations.begin_step(0.0, factor)
+            left.append(comm.allreduce(np.abs(equations.out_of_balance()).max(initial=0.0), MPI.MAX))
         assert left[0] < 1e-12 * left[2]
         assert left[1] == pytest.approx(0.5 * left[2])

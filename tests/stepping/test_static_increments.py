@@ -71,12 +71,12 @@ def at_rest(
         normal, friction = simulation.energy_balance.obstacle_forces(1)[0, 6:]
         mu = scene["contact"]["friction"]
         assert friction <= mu * normal * (1.0 + 2e-6) + 1e-9
-    system = simulation.problem.system
+    equations = simulation.problem.equations
     terms = [
-        term for term in system.active.elastic if term.name in ("membrane", "hinge", "bending", "midedge")
+        term for term in equations.active.elastic if term.name in ("membrane", "hinge", "bending", "midedge")
     ]
-    energy = sum(float(term.energies(system.x, system.step.frozen[term]).sum()) for term in terms)
-    found = gathered(simulation.problem.points, system.x), comm.allreduce(energy), simulation.notes
+    energy = sum(float(term.energies(equations.x, equations.step.frozen[term]).sum()) for term in terms)
+    found = gathered(simulation.problem.points, equations.x), comm.allreduce(energy), simulation.notes
     simulation.destroy()
     return found
 

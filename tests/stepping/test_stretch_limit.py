@@ -49,7 +49,7 @@ def limits(simulation: SteppedScene) -> StretchLimit:
 
 def largest(simulation: SteppedScene) -> float:
     """Largest principal stretch of the whole sheet."""
-    term, x = limits(simulation), simulation.problem.system.x
+    term, x = limits(simulation), simulation.problem.equations.x
     found = float(term._largest(x).max(initial=0.0))
     return float(simulation.comm.allreduce(found, MPI.MAX))
 
@@ -112,10 +112,10 @@ def test_the_result_is_that_of_one_rank(comm: MPI.Comm) -> None:
     content["time"]["end"] = 0.25
     with stepped(comm, content) as simulation:
         stretches = run(simulation)[1]
-        found = gathered(simulation.problem.points, simulation.problem.system.x)
+        found = gathered(simulation.problem.points, simulation.problem.equations.x)
     with stepped(MPI.COMM_SELF, content) as simulation:
         assert run(simulation)[1] == pytest.approx(stretches, rel=1e-6)
-        alone = gathered(simulation.problem.points, simulation.problem.system.x)
+        alone = gathered(simulation.problem.points, simulation.problem.equations.x)
     np.testing.assert_allclose(found, alone, rtol=0.0, atol=1e-9)
 
 
@@ -150,7 +150,7 @@ def test_groups_have_limits_of_their_own() -> None:
     content = hanging("bdf2") | {"mesh": sheets, "material": material, "handles": tops}
     with stepped(MPI.COMM_SELF, content) as simulation:
         run(simulation)
-        term, x = limits(simulation), simulation.problem.system.x
+        term, x = limits(simulation), simulation.problem.equations.x
         assert term.n_elements == 64
         stretch, limit = term._largest(x), term.elements.data["limit"]
         for value in (1.1, 1.02):

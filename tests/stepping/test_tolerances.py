@@ -29,7 +29,7 @@ def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:
 
 
 def state_of(simulation: SteppedScene) -> tuple[np.ndarray, np.ndarray]:
-    return simulation.problem.system.x, simulation.problem.system.v
+    return simulation.problem.equations.x, simulation.problem.equations.v
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])

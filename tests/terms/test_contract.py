@@ -77,7 +77,7 @@ def moved(simulation: Simulation, x: Array, turn: Array, translation: list[float
 def disturbed(simulation: Simulation, size: float, squeeze: float = 1.0) -> Array:
     """A randomly disturbed, rotated shape far from rest."""
     n = simulation.problem.points.n_vertices
-    x = simulation.system.x * np.where(np.arange(len(simulation.system.x)) < n, squeeze, 1.0)[:, None]
+    x = simulation.equations.x * np.where(np.arange(len(simulation.equations.x)) < n, squeeze, 1.0)[:, None]
     disturbance = np.random.default_rng(3).uniform(-size, size, x.shape)
     y = moved(simulation, x + disturbance, rotation([1.0, 2.0, 0.5], 0.9), [0.3, -0.2, 0.1])
     for term in simulation.problem.terms.values():
@@ -120,8 +120,8 @@ def elastic(term: Term) -> Elastic:
 def frozen(term: Term, simulation: Simulation) -> Any:
     """The frozen data of the term, for wind those of a disturbed shape."""
     assert isinstance(term, (Elastic, Viscous))
-    x = disturbed(simulation, 0.1) if isinstance(term, Viscous) else simulation.system.x
-    return frozen_by(term, simulation.system, x)
+    x = disturbed(simulation, 0.1) if isinstance(term, Viscous) else simulation.equations.x
+    return frozen_by(term, simulation.equations, x)
 
 
 @every_elastic
@@ -174,7 +174,7 @@ def test_exact_hessian_of_a_compressed_sheet_is_indefinite(tmp_path: Path) -> No
     # otherwise the test above would hold without the regularisation
     with example("membrane", tmp_path) as simulation:
         term = simulation.problem.membrane
-        matrices = element_hessians(term, 0.4 * simulation.system.x, None, 0.0)
+        matrices = element_hessians(term, 0.4 * simulation.equations.x, None, 0.0)
     assert np.linalg.eigvalsh(matrices).min() < -0.1
 
 
@@ -209,7 +209,7 @@ def test_hessians_of_a_range_are_those_of_the_whole(
 
 @every_elastic
 def test_no_force_and_no_energy_at_rest(elastic: Elastic, frozen: Any, simulation: Simulation) -> None:
-    x = simulation.system.x
+    x = simulation.equations.x
     stiffness = np.abs(element_hessians(elastic, x, frozen, 0.0)).max()
     assert np.abs(gradient(elastic, x, frozen)).max() <= 1e-14 * stiffness
     assert np.all(elastic.energies(x, frozen) <= 1e-28 * stiffness)
@@ -239,7 +239,7 @@ def test_force_scale_bounds_the_round_off_of_the_force(term: Term, simulation: S
     assert isinstance(term, Elastic)
     # Newton's method may stop at 10 ε of this scale: the force at rest must be below it
     far = 100.0
-    x = moved(simulation, simulation.system.x, np.eye(3), [far, far, far])
+    x = moved(simulation, simulation.equations.x, np.eye(3), [far, far, far])
     before = term.force_scale(far + 1.0)
     # springs and clamps start at the present positions
     frozen = term.freeze(UpcomingStep(0.0, 0.01, 0.01, x, lambda start, rows: x[rows]))
@@ -267,7 +267,7 @@ def velocities(n: int) -> Array:
 
 @every_viscous
 def test_viscous_gradient_and_hessian(viscous: Viscous, frozen: Any, simulation: Simulation) -> None:
-    v = velocities(len(simulation.system.x))
+    v = velocities(len(simulation.equations.x))
     analytic = gradient(viscous, v, frozen)
     numeric = differences(lambda w: viscous.potentials(w, frozen).sum(), v, 1e-4)
     np.testing.assert_allclose(analytic, numeric, atol=1e-8 * np.abs(analytic).max())
@@ -281,7 +281,7 @@ def test_viscous_gradient_and_hessian(viscous: Viscous, frozen: Any, simulation:
 @every_viscous
 def test_viscous_potential_is_convex(viscous: Viscous, frozen: Any, simulation: Simulation) -> None:
     for seed in range(5):
-        v = 10.0 * np.random.default_rng(seed).standard_normal(simulation.system.x.shape)
+        v = 10.0 * np.random.default_rng(seed).standard_normal(simulation.equations.x.shape)
         matrix = hessian(viscous, v, frozen).reshape(v.size, v.size)
         assert np.linalg.eigvalsh(matrix).min() >= -1e-12 * np.abs(matrix).max()
         # and that of each element
@@ -297,7 +297,7 @@ def test_viscous_potential_is_convex(viscous: Viscous, frozen: Any, simulation: 
 @every_load
 def test_potential_of_a_load_is_minus_its_work(term: Term, simulation: Simulation) -> None:
     assert isinstance(term, Load)
-    x = simulation.system.x
+    x = simulation.equations.x
     force = np.zeros_like(x)
     term.add_force(x, 0.0, 0.01, force)
     assert np.abs(force).max() > 0.0

@@ -26,10 +26,10 @@ Physical Surface("sheet") = {1}; Physical Curve("base") = {1}; Physical Point("c
 
 def force_of(simulation: Simulation, t0: float = 0.0, t1: float = 0.01) -> Array:
     """Force (V, 3) [N] of all loads in the present state, in mesh order."""
-    out = np.zeros_like(simulation.system.x)
+    out = np.zeros_like(simulation.equations.x)
     for term in simulation.problem.terms.values():
         if isinstance(term, Load):
-            term.add_force(simulation.system.x, t0, t1, out)
+            term.add_force(simulation.equations.x, t0, t1, out)
     return simulation.gather(out)
 
 
@@ -151,7 +151,7 @@ def test_loads_act_within_their_window_only() -> None:
 def wind_on(simulation: Simulation, v: Array) -> Array:
     term = simulation.problem.terms["wind"]
     assert isinstance(term, Viscous)
-    return -gradient(term, v, frozen_by(term, simulation.system))
+    return -gradient(term, v, frozen_by(term, simulation.equations))
 
 
 def test_wind_force_of_a_tilted_sheet_follows_the_law() -> None:

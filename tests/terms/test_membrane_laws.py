@@ -225,7 +225,7 @@ def test_forces_of_a_sheet_are_the_derivatives_of_its_energy(cloth: str, tmp_pat
     law = "measured" if cloth == "gray-interlock" else "neo-hookean"
     mesh = obj_file(tmp_path / "one.obj", [(0, 0, 0), (1, 0.1, 0), (0.2, 0.8, 0)], [(0, 1, 2)])
     with Simulation({"mesh": mesh, "material": {"cloth": cloth, "law": law}}, MPI.COMM_SELF) as simulation:
-        term, x = simulation.problem.membrane, simulation.system.x
+        term, x = simulation.problem.membrane, simulation.equations.x
         for scale in (0.5, 0.97, 1.1):
             y = scale * x + np.random.default_rng(1).uniform(-0.05, 0.05, x.shape)
             force, stiffness = gradient(term, y, None), hessian(term, y, None, 0.0)

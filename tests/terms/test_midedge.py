@@ -67,7 +67,7 @@ def midedge_of(simulation: Simulation | Run) -> MidEdge:
 def cylinder(pattern: str, n: int) -> float:
     """Energy over ½ B κ² A of a sheet rolled up to κ = 1 with directors along the exact normals."""
     with Simulation({"mesh": grid(1.0, 1.0, n, n, pattern), "material": STIFF}, MPI.COMM_SELF) as simulation:
-        term, x = midedge_of(simulation), simulation.system.x.copy()
+        term, x = midedge_of(simulation), simulation.equations.x.copy()
         rows = slice(0, simulation.problem.points.n_vertices)
         flat, edges = x[rows].copy(), term.of_edges
         x[rows] = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], 1.0 - np.cos(flat[:, 0])])
@@ -98,7 +98,7 @@ def test_moments_and_forces_balance_under_rotation(tmp_path: Path) -> None:
     with Simulation(content, MPI.COMM_SELF) as simulation:
         term, n = midedge_of(simulation), simulation.problem.points.n_vertices
         random = np.random.default_rng(2)
-        x = simulation.system.x.copy()
+        x = simulation.equations.x.copy()
         x[:n] = (x[:n] + random.uniform(-0.1, 0.1, (n, 3))) @ rotation([1.0, 2.0, 0.5], 0.9).T
         x.ravel()[term.of_edges.indices] = directors_along_normals(term, x)
         before = term.energies(x, term.frames)
@@ -118,7 +118,7 @@ def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
         "material": BENDING | {"bending_model": "midedge"},
     }
     with Simulation(content, MPI.COMM_SELF) as simulation:
-        term, x = midedge_of(simulation), simulation.system.x.copy()
+        term, x = midedge_of(simulation), simulation.equations.x.copy()
         turn = np.radians(degrees) * np.resize([1.0, -1.0, 1.0, 1.0], len(term.edge_indices))
         places, length = term.edge_indices, term.of_edges.length
         x.ravel()[places] = directors_along_normals(term, x) + length * turn
@@ -135,7 +135,7 @@ def test_derivatives_at_any_angle(tmp_path: Path, degrees: float) -> None:
 def test_energy_is_continuous_at_all_angles() -> None:
     """It grows up to 180° on either side, to the same value for flat sheets."""
     with Simulation({"mesh": grid(1.0, 1.0, 1, 1), "material": STIFF}, MPI.COMM_SELF) as simulation:
-        term, x = midedge_of(simulation), simulation.system.x.copy()
+        term, x = midedge_of(simulation), simulation.equations.x.copy()
         direction = np.zeros_like(x)
         direction.ravel()[term.of_edges.indices] = term.of_edges.length * [1.0, 0.1, 0.2, -0.1, 0.3]
 
@@ -186,7 +186,7 @@ def test_plates_converge(pattern: str, clamp: bool) -> None:
         simulation = Run(MPI.COMM_SELF, scene_of(content))
         simulation.step()
         middle = n // 2 * (n + 2)
-        height = gathered(simulation.problem.points, simulation.problem.system.x)[middle, 2]
+        height = gathered(simulation.problem.points, simulation.problem.equations.x)[middle, 2]
         errors.append(height / 1e-6 / (0.00126532 if clamp else 0.00406235) - 1.0)
         simulation.destroy()
     assert 0.0 < errors[1] < (0.1 if clamp else 0.02)
@@ -205,7 +205,7 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[Array, Array]:
     energies = np.array(
         [budget.kinetic, budget.membrane, budget.bending, budget.dissipation, budget.external_work]
     )
-    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    x = gathered(simulation.problem.points, simulation.problem.equations.x)
     simulation.destroy()
     return x, energies
 
@@ -432,7 +432,7 @@ def test_a_tape_spring_is_bistable(twist: float, rolled: bool, tmp_path: Path) -
     while not run.finished:
         newton += run.step().newton_iterations
     term = midedge_of(run)
-    found = term.curvatures(run.problem.system.x, term.frames)[:, :2].mean(axis=0)
+    found = term.curvatures(run.problem.equations.x, term.frames)[:, :2].mean(axis=0)
     expected = [-coupling * bent, 0.0] if rolled else [0.0, -bent]
     np.testing.assert_allclose(found, expected, atol=6.0 if rolled else 0.1)  # free edges bend on
     assert run.stability["stable"]
@@ -475,7 +475,7 @@ def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) ->
     for number, each in enumerate((degrees, (0, 180))):
         content = {"mesh": fan(tmp_path / f"{number}.obj", *each), "material": STIFF | {"bending": PLATE}}
         with Simulation(content, MPI.COMM_SELF) as simulation:
-            term, x = midedge_of(simulation), simulation.system.x.copy()
+            term, x = midedge_of(simulation), simulation.equations.x.copy()
             assert np.abs(gradient(term, x, term.frames)).max() < 1e-12
             if number == 0 and degrees != (0, 10):
                 assert np.abs(term.curvatures(x, term.frames)).max() < 1e-12
@@ -536,7 +536,7 @@ def test_vertices_of_four_triangles_in_a_curved_shell_are_noted(tmp_path: Path) 
     (said,) = (re.search(r"vertex (\d+) \(and 2 more\) only 4 .* about (\d+)% too", n) for n in run.notes)
     assert said is not None
     run.step()
-    radius = np.linalg.norm(run.problem.system.x[: run.problem.points.n_vertices], axis=1)
+    radius = np.linalg.norm(run.problem.equations.x[: run.problem.points.n_vertices], axis=1)
     run.destroy()
     given = pressure * (1.0 - BALL["poisson"]) / (2.0 * BALL["young"] * BALL["thickness"])
     lacking = 1.0 - (radius - 1.0) / given
@@ -811,7 +811,7 @@ def test_a_moment_does_work_on_the_rotation_of_directors() -> None:
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         bending, load = midedge_of(simulation), simulation.problem.terms["moment"]
         assert isinstance(load, Moment)
-        x = simulation.system.x.copy()
+        x = simulation.equations.x.copy()
         random = np.random.default_rng(3)
         x += random.uniform(-0.2, 0.2, x.shape)
         direction = random.uniform(-1.0, 1.0, x.shape)
@@ -1061,7 +1061,7 @@ def pushed(comm: MPI.Comm, path: Path, n: int) -> float:
     run = Run(comm, scene_of(content))
     while not run.finished:
         run.step()
-    x = gathered(run.problem.points, run.problem.system.x)
+    x = gathered(run.problem.points, run.problem.equations.x)
     run.destroy()
     return float(x[x[:, 2] > 0.999][:, 0].mean() - 1.0)
 

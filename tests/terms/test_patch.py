@@ -62,7 +62,7 @@ def test_regularisation_keeps_the_stress_of_extension_along_the_material_axes(
     f = rotation([0, 0, 1], 0.4)[:2, :2] @ np.diag(stretches) @ rotation([0, 0, 1], 0.7)[:2, :2]
     with Simulation({"mesh": mesh}, MPI.COMM_SELF) as simulation:
         membrane = simulation.problem.membrane
-        x = simulation.system.x.copy()
+        x = simulation.equations.x.copy()
         x[:, :2] = x[:, :2] @ f.T
         exact, regularised = (hessian(membrane, x, None, blend) for blend in (0.0, 1.0))
         order = membrane.stencil[0]
@@ -94,13 +94,13 @@ def test_energy_strain_stress_and_boundary_forces(patch: Simulation, row: list[o
     assert patch.energy("membrane") == pytest.approx(AREA * float(density), rel=1e-12, abs=1e-12)
 
     membrane = patch.problem.membrane
-    strains, stresses = membrane.strain_and_stress(patch.system.x)
+    strains, stresses = membrane.strain_and_stress(patch.equations.x)
     e11, e22, shear = green
     np.testing.assert_allclose(strains, np.tile([e11, e22, 0.5 * shear], (8, 1)), rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(stresses, np.tile(second, (8, 1)), rtol=1e-12, atol=1e-12 * scale)
 
-    gradient = np.zeros_like(patch.system.x)
-    membrane.add_gradient(patch.system.x, None, gradient)
+    gradient = np.zeros_like(patch.equations.x)
+    membrane.add_gradient(patch.equations.x, None, gradient)
     expected = np.zeros((9, 2))
     edges, _, opposite = boundary_edges(TRIANGLES)
     for (tail, head), inner in zip(edges, opposite, strict=True):

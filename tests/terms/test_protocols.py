@@ -86,14 +86,16 @@ def test_a_restored_state_gives_the_same_forces(name: str, tmp_path: Path) -> No
         term, again = simulation.problem.terms[name], other.problem.terms[name]
         assert isinstance(term, Stateful)
         assert isinstance(again, Stateful)
-        x, y = (bent(simulation.system.x, size, seed) for size, seed in ((0.1, 5), (0.01, 6)))
-        term.accept(x, frozen_by(term, simulation.system))
-        frozen = frozen_by(term, simulation.system, x)
+        x, y = (bent(simulation.equations.x, size, seed) for size, seed in ((0.1, 5), (0.01, 6)))
+        term.accept(x, frozen_by(term, simulation.equations))
+        frozen = frozen_by(term, simulation.equations, x)
         state = term.state()
         assert sum(entry.place is Place.ELEMENT for entry in state.values()) <= 1
-        assert not np.allclose(gradient(again, y, frozen_by(again, other.system)), gradient(term, y, frozen))
+        assert not np.allclose(
+            gradient(again, y, frozen_by(again, other.equations)), gradient(term, y, frozen)
+        )
         again.restore({name: entry.values.copy() for name, entry in state.items()}, x)
-        found = gradient(again, y, frozen_by(again, other.system, x))
+        found = gradient(again, y, frozen_by(again, other.equations, x))
         expected = gradient(term, y, frozen)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
@@ -103,7 +105,7 @@ def test_heat_is_what_a_step_takes_from_the_energy(name: str, tmp_path: Path) ->
     with example(name, tmp_path) as simulation:
         term = simulation.problem.terms[name]
         assert isinstance(term, Dissipates)
-        frozen, x = frozen_by(term, simulation.system), bent(simulation.system.x, 0.1)
+        frozen, x = frozen_by(term, simulation.equations), bent(simulation.equations.x, 0.1)
         before, heat = term.energies(x, frozen).sum(), term.heat(x, frozen)
         term.accept(x, frozen)
         after = term.energies(x, frozen).sum()
@@ -114,9 +116,9 @@ def test_heat_is_what_a_step_takes_from_the_energy(name: str, tmp_path: Path) ->
 @having(MovingTargets)
 def test_forces_on_targets_are_derivatives_of_the_energy(name: str, tmp_path: Path) -> None:
     with example(name, tmp_path) as simulation:
-        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        term, x = simulation.problem.terms[name], bent(simulation.equations.x)
         assert isinstance(term, MovingTargets)
-        frozen = frozen_by(term, simulation.system)
+        frozen = frozen_by(term, simulation.equations)
         places, force = term.targets(x, frozen)
         moved = next(name for name, values in frozen._asdict().items() if np.shares_memory(values, places))
         numeric = differences(
@@ -128,10 +130,10 @@ def test_forces_on_targets_are_derivatives_of_the_energy(name: str, tmp_path: Pa
 @having(PullsHandles)
 def test_springs_pull_handles_as_they_pull_the_sheet(name: str, tmp_path: Path) -> None:
     with example(name, tmp_path) as simulation:
-        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        term, x = simulation.problem.terms[name], bent(simulation.equations.x)
         assert isinstance(term, PullsHandles)
         assert np.isin(term.reference_rows, np.arange(len(x))).all()
-        frozen = frozen_by(term, simulation.system)
+        frozen = frozen_by(term, simulation.equations)
         forces = term.handle_forces(x, frozen, len(simulation.problem.scene.handles))
         np.testing.assert_allclose(forces.sum(axis=0), -gradient(term, x, frozen).sum(axis=0), rtol=1e-12)
 
@@ -141,15 +143,15 @@ def test_shared_frozen_data_are_those_of_the_partner(name: str, tmp_path: Path) 
     with example(name, tmp_path) as simulation:
         term = simulation.problem.terms[name]
         assert isinstance(term, SharesFrozen)
-        assert frozen_by(term, simulation.system) is frozen_by(term.partner, simulation.system)
+        assert frozen_by(term, simulation.equations) is frozen_by(term.partner, simulation.equations)
 
 
 @having(HasDirectors)
 def test_new_frames_change_neither_energy_nor_forces_on_edges(name: str, tmp_path: Path) -> None:
     with example(name, tmp_path) as simulation:
-        term, x = simulation.problem.terms[name], bent(simulation.system.x)
+        term, x = simulation.problem.terms[name], bent(simulation.equations.x)
         assert isinstance(term, HasDirectors)
-        frozen = frozen_by(term, simulation.system)
+        frozen = frozen_by(term, simulation.equations)
         frames = term.frames_at_end(x, frozen)
         np.testing.assert_allclose(term.energies(x, frames), term.energies(x, frozen), rtol=1e-9)
         edges = gradient(term, x, frozen).ravel()[term.edge_indices]
@@ -164,9 +166,9 @@ def test_new_frames_change_neither_energy_nor_forces_on_edges(name: str, tmp_pat
 @having(LimitsStep)
 def test_no_step_passes_a_limit(name: str, tmp_path: Path) -> None:
     with example(name, tmp_path) as simulation:
-        term, x = simulation.problem.terms[name], simulation.system.x
+        term, x = simulation.problem.terms[name], simulation.equations.x
         assert isinstance(term, LimitsStep)
-        frozen, dx = frozen_by(term, simulation.system), 3.0 * x
+        frozen, dx = frozen_by(term, simulation.equations), 3.0 * x
         assert not term.energies(x, frozen).any()
         assert term.overrun(x, frozen) == (0.0, "")
         excess, text = term.overrun(x + dx, frozen)
@@ -393,6 +395,6 @@ def test_checkpoints_hold_the_state_of_a_term(comm: MPI.Comm, shared_tmp: Path) 
             term = again.problem.terms["idle"]
             assert isinstance(term, IdleState)
             assert "restore" in term.calls
-            for found, expected in zip(term.mark, term.marks(again.problem.system.x), strict=True):
+            for found, expected in zip(term.mark, term.marks(again.problem.equations.x), strict=True):
                 n = term.n_owned if found.ndim == 2 and found.shape[1] == 1 else len(found)
                 np.testing.assert_array_equal(found[:n], expected[:n])

@@ -24,10 +24,10 @@ def test_cylinder_at_rest_is_curved_and_free_of_force(tmp_path: Path) -> None:
     content = {"mesh": curved_sheet(tmp_path / "cylinder.obj"), "material": BENDING}
     with Simulation(content, MPI.COMM_SELF) as simulation:
         bending = bending_of(simulation)
-        assert np.abs(bending.angles(simulation.system.x)).max() > 0.1
-        force = np.zeros_like(simulation.system.x)
-        bending.add_gradient(simulation.system.x, None, force)
-        simulation.problem.membrane.add_gradient(simulation.system.x, None, force)
+        assert np.abs(bending.angles(simulation.equations.x)).max() > 0.1
+        force = np.zeros_like(simulation.equations.x)
+        bending.add_gradient(simulation.equations.x, None, force)
+        simulation.problem.membrane.add_gradient(simulation.equations.x, None, force)
         assert np.abs(force).max() < 1e-11
         before = simulation.x
         np.testing.assert_allclose(simulation.run(0.05, 3), before, atol=1e-13)
@@ -44,7 +44,7 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
         {"mesh": grid(1.0, 0.8, 4, 3, pattern), "material": material}, MPI.COMM_SELF
     ) as simulation:
         bending = bending_of(simulation)
-        x = simulation.system.x.copy()
+        x = simulation.equations.x.copy()
         angle = np.radians(warp)
         u, w = (
             np.cos(angle) * x[:, 0] + np.sin(angle) * x[:, 1],
@@ -55,7 +55,7 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
         rest = bending.elements.data["rest_angle"]
         # angles of a surface with small slopes s agree with its slopes up to s³
         np.testing.assert_allclose(bending.angles(x), rest, atol=1e-3 * np.abs(rest).max())
-        flat = float(bending.energies(simulation.system.x).sum())
+        flat = float(bending.energies(simulation.equations.x).sum())
         assert flat > 0.0
         assert float(bending.energies(x).sum()) < 1e-6 * flat
 
@@ -82,7 +82,7 @@ def test_positive_curvature_raises_the_sheet_towards_its_normal() -> None:
     with Simulation({"mesh": grid(1, 1, 2, 2), "material": material}, MPI.COMM_SELF) as simulation:
         # the grid's normals are +z; with κ > 0 the corners rise above the middle
         assert np.all(bending_of(simulation).elements.data["rest_angle"] <= 1e-15)
-        bowl, dome = simulation.system.x.copy(), simulation.system.x.copy()
+        bowl, dome = simulation.equations.x.copy(), simulation.equations.x.copy()
         squared = (bowl[:, 0] - 0.5) ** 2 + (bowl[:, 1] - 0.5) ** 2
         bowl[:, 2], dome[:, 2] = 0.05 * squared, -0.05 * squared
         bending = bending_of(simulation)
@@ -109,7 +109,7 @@ def test_a_clamped_strip_rolls_up_without_energy(pattern: str) -> None:
         "handles": [{"group": "left", "clamp": True}],
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
-        simulation.system.begin_step(0.0, 1.0)
+        simulation.equations.begin_step(0.0, 1.0)
         flat = simulation.x
         assert simulation.energy("clamp") > 1e-6
         slope = turn * (np.arange(10) + 0.5)
@@ -133,7 +133,7 @@ def test_hinge_energy_is_b_l2_theta2_over_twice_the_areas(tmp_path: Path, angle:
         # triangle (1, 0, 3) turned about the edge; below the normals (−z) the angle is positive
         x[3, 1:] = -0.3 * np.cos(angle), -0.3 * np.sin(angle)
         simulation.set_state(x=x)
-        assert bending_of(simulation).angles(simulation.system.x)[0] == pytest.approx(angle, rel=1e-13)
+        assert bending_of(simulation).angles(simulation.equations.x)[0] == pytest.approx(angle, rel=1e-13)
         expected = b * 0.5**2 * angle**2 / (2 * (0.05 + 0.075))
         assert simulation.energy("bending") == pytest.approx(expected, rel=1e-13)
 
@@ -143,7 +143,7 @@ def test_stiffness_follows_the_direction_of_the_rest_edge() -> None:
     material = CLOTH | {"bending": list(values.values())}
     with Simulation({"mesh": grid(1, 1, 2, 2), "material": material}, MPI.COMM_SELF) as simulation:
         data = bending_of(simulation).elements.data
-        x, quad = simulation.system.x, bending_of(simulation).stencil
+        x, quad = simulation.equations.x, bending_of(simulation).stencil
         edge = x[quad[:, 1]] - x[quad[:, 0]]
         b = data["k"] * 2 * (2 * 0.125) / data["length"] ** 2
         along_x, along_y = np.isclose(edge[:, 1], 0.0), np.isclose(edge[:, 0], 0.0)
@@ -185,7 +185,7 @@ def test_the_softer_material_counts_at_the_hinge_between_two(tmp_path: Path) -> 
         {"mesh": {"file": str(path), "size": 5.0}, "material": material}, MPI.COMM_SELF
     ) as simulation:
         bending = bending_of(simulation)
-        data, x = bending.elements.data, simulation.system.x
+        data, x = bending.elements.data, simulation.equations.x
         middle = x[bending.stencil[:, :2], 0].mean(axis=1)
         areas = 0.5 * data["rest_height"] * data["length"]
         b = data["k"] * 2.0 * areas / data["length"] ** 2

@@ -183,7 +183,7 @@ class Model:
                     f"is at {remaining[0].time:g}, where the run has ended before",
                     key=remaining[0].readings[0].key,
                 )
-            shape = simulation.problem.points.gather(simulation.problem.system.x)
+            shape = simulation.problem.points.gather(simulation.problem.equations.x)
             self.shape = shape if self.comm.rank == 0 else None
             if sensitivities is not None:
                 sensitivities.destroy()

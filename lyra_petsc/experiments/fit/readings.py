@@ -94,7 +94,7 @@ class Positions(Reading):
         return found
 
     def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
-        x, rows = problem.system.x, self._rows(problem)
+        x, rows = problem.equations.x, self._rows(problem)
         parts = [np.append(x[mine].sum(axis=0), float(len(mine))) for mine in rows]
         return np.concatenate(parts)
 
@@ -130,7 +130,7 @@ class Shadow(Reading):
 
     def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
         membrane = problem.membrane
-        a, b, c = (problem.system.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
+        a, b, c = (problem.equations.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
         first, second = b - a, c - a
         return np.array([0.5 * float(np.sum(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]))])
 

@@ -211,36 +211,36 @@ class BalanceRecorder:
 
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
-        self._system = system = simulation.problem.system
-        self._identity = system.integrators.usual.name == "beuler"
-        constraints = system.active.external
-        self._sheet_terms = [term for term in system.active.elastic if term not in constraints]
+        self._equations = equations = simulation.problem.equations
+        self._identity = equations.integrators.usual.name == "beuler"
+        constraints = equations.active.external
+        self._sheet_terms = [term for term in equations.active.elastic if term not in constraints]
         # with their targets in motion, energies of other terms change with positions alone
-        moving = system.active.moving
+        moving = equations.active.moving
         self._turning = [term for term in moving if term.registration.of_contact or not self._identity]
         self.record_state()
 
     def record_state(self) -> None:
         """Store the state, and the energy of terms with the targets at the end of the last step."""
-        system = self._system
-        self._x, self._v = system.x.copy(), system.v.copy()
-        self._turning_energy = energy(self._frozen(self._turning), system.x)
+        equations = self._equations
+        self._x, self._v = equations.x.copy(), equations.v.copy()
+        self._turning_energy = energy(self._frozen(self._turning), equations.x)
         self._frames: Terms = {term: term.frames for term in self._sheet_terms if isinstance(term, MidEdge)}
 
     def _frozen(self, terms: Iterable[Elastic]) -> Terms:
         """Terms with their present frozen data."""
-        return {term: self._system.step.frozen[term] for term in terms}
+        return {term: self._equations.step.frozen[term] for term in terms}
 
     def balance(self, report: StepReport) -> StepBalance:
         """The balance of the step just accepted, which started from the state recorded last."""
-        system, simulation = self._system, self._simulation
-        layout, account = system.points, simulation.energy_balance.account
+        equations, simulation = self._equations, self._simulation
+        layout, account = equations.points, simulation.energy_balance.account
         comm, n, dt = layout.comm, layout.n_owned, report.dt
         for name in ("_x", "_v"):  # extended to the present ghosts of contact
             values = resized(getattr(self, name), n, layout.n_local)
             layout.update_ghosts(values)
             setattr(self, name, values)
-        x0, x1 = self._x, system.x
+        x0, x1 = self._x, equations.x
         dx, sheet = x1 - x0, self._frozen(self._sheet_terms)
         frames = {term: old for term, old in self._frames.items() if sheet[term] is not old}
         parts, within = self._force_terms(dt)
@@ -248,12 +248,12 @@ class BalanceRecorder:
         turned, inner, free_dx, all_dx, energy_noise, forces, powers, heights = layout.global_sum(
             energy(self._frozen(self._turning), x0) - self._turning_energy,
             float(np.vdot(parts["internal"], dx[:n])),
-            float(np.sum(dx[:n] ** 2, where=system.step.prescribed.free)),
+            float(np.sum(dx[:n] ** 2, where=equations.step.prescribed.free)),
             float(np.sum(dx[:n] ** 2)),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
             float(sum(np.abs(part * dx[:n]).sum() for part in parts.values())),
-            float(np.abs(system.mass[:, None] * np.abs(x1[:n])).sum()) * size_of_g,
+            float(np.abs(equations.mass[:, None] * np.abs(x1[:n])).sum()) * size_of_g,
         ).tolist()
         reach = largest(comm, x1)
         left = self._residual_norms(parts, reach, dt)
@@ -281,51 +281,55 @@ class BalanceRecorder:
     def _residual_norms(self, parts: Mapping[str, Array], reach: float, dt: float) -> dict[str, float]:
         """Norms [N] of the residual, its promised bound, its round-off floor and the driving forces, and the
         displacement [m] by these; keys are fields of `StepBalance`."""
-        system, simulation = self._system, self._simulation
-        free = system.step.prescribed.free
+        equations, simulation = self._equations, self._simulation
+        free = equations.step.prescribed.free
         everything = [*parts.values(), np.asarray(sum(parts.values()))]
-        squares = system.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
+        squares = equations.points.global_sum(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
-        floor = residual_roundoff(system, max(reach, simulation.problem.whole.largest_coordinate))
+        floor = residual_roundoff(equations, max(reach, simulation.problem.whole.largest_coordinate))
         n = len(free)
-        displacement = system.x[:n] - self._x[:n] - dt * self._v[:n]
+        displacement = equations.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
             "residual": residual,
             "promised": max(simulation.scene.solver.force_tolerance * max(each), floor),
             "floor": floor,
             "driving": max(norm for name, norm in zip(parts, each, strict=True) if name != "internal"),
-            "displacement": largest(system.points.comm, np.where(free, displacement, 0.0)),
+            "displacement": largest(equations.points.comm, np.where(free, displacement, 0.0)),
         }
 
     def _force_terms(self, dt: float) -> tuple[dict[str, Array], tuple[Array, Array]]:
         """The terms of the residual at the stage of the step, each (n_owned, 3) [N], evaluated again; and the
         internal forces and those of damping without the terms that act from outside.
         """
-        system, n, stage = self._system, self._system.points.n_owned, self._system.step.stage
+        equations, n, stage = self._equations, self._equations.points.n_owned, self._equations.step.stage
         # before impacts, which act after the equations are solved
-        x, v, y = system.evaluated.x, system.evaluated.v, self._x
+        x, v, y = equations.evaluated.x, equations.evaluated.v, self._x
         if self._simulation.last_integrator.centred:
-            vertices = system.points.are_vertices(system.points.global_number)
+            vertices = equations.points.are_vertices(equations.points.global_number)
             y = y + np.where(vertices[:, None], stage.offset * self._v, 0.0)
         step = UpcomingStep(
-            system.step.start, system.step.end, system.step.start + stage.offset, y, system.reference.at
+            equations.step.start,
+            equations.step.end,
+            equations.step.start + stage.offset,
+            y,
+            equations.reference.at,
         )
-        frozen = dict(self._frozen(system.active.elastic))
+        frozen = dict(self._frozen(equations.active.elastic))
         if stage.offset < dt:  # moving targets are at the end of the step by now
             moved = (
-                *system.active.moving,
-                *(t for t in system.active.external if not t.registration.of_contact),
+                *equations.active.moving,
+                *(t for t in equations.active.external if not t.registration.of_contact),
             )
             frozen |= {term: term.freeze(step) for term in moved}
         force, wind = np.zeros_like(x), np.zeros_like(x)
-        for load in system.active.loads:
-            load.add_force(y, system.step.start, system.step.end, force)
-        for term in system.active.viscous:
+        for load in equations.active.loads:
+            load.add_force(y, equations.step.start, equations.step.end, force)
+        for term in equations.active.viscous:
             term.add_gradient(v, term.freeze(step), wind)
-        rate = stage.sigma * (v[:n] - system.step.v_h)
+        rate = stage.sigma * (v[:n] - equations.step.v_h)
         if stage.offset < dt:  # handles do not have the integrator's accelerations
-            at = system.step.prescribed.indices
-            system.step.prescribed.overwrite(rate, (system.v[:n] - system.step.v_h).take(at) / dt)
+            at = equations.step.prescribed.indices
+            equations.step.prescribed.overwrite(rate, (equations.v[:n] - equations.step.v_h).take(at) / dt)
         sheet: Terms = {term: frozen[term] for term in self._sheet_terms}
         # clamps and obstacles store energy, but exert external forces as they are fixed in space
         inner = {
@@ -334,9 +338,9 @@ class BalanceRecorder:
             if not (isinstance(t, MovingTargets) or t.registration.of_contact)
         }
         parts = {
-            "inertia": system.mass[:, None] * rate,
+            "inertia": equations.mass[:, None] * rate,
             "internal": gradient(sheet, x)[:n],
-            "springs": gradient({term: frozen[term] for term in system.active.external}, x)[:n],
+            "springs": gradient({term: frozen[term] for term in equations.active.external}, x)[:n],
             "damping": self._damping(sheet, y, v),
             "wind": wind[:n],
             "loads": -force[:n],
@@ -347,14 +351,14 @@ class BalanceRecorder:
 
     def _damping(self, terms: Terms, y: Array, v: Array) -> Array:
         """D v (n_owned, 3) [N], assembled again with the stiffness at y (n_local, 3)."""
-        rows = self._system.discretisation.fixed
+        rows = self._equations.discretisation.fixed
         values = rows.zeros()
         for term, frozen in terms.items():
             gamma = term.elements.data.get("damping")
             if term.registration.damped and gamma is not None and np.any(gamma):
-                at_start = self._system.damping.frozen.get(term, frozen)
+                at_start = self._equations.damping.frozen.get(term, frozen)
                 rows.add_stiffness(term, y, at_start, 1.0, gamma, values)
-        return rows.product(values, v)[: self._system.points.n_owned]
+        return rows.product(values, v)[: self._equations.points.n_owned]
 
     def _energy_roundoff(self, x: Array) -> float:
         """Sum [J] over this rank's elements; times the machine epsilon it is the round-off of the energies.
@@ -382,30 +386,30 @@ class BalanceRecorder:
 
         The sum of damping forces, frozen with the geometry at the start, vanishes, but not their moment.
         """
-        system, comm = self._system, self._system.points.comm
-        n, rows = system.points.n_owned, slice(0, system.points.n_vertices)
+        equations, comm = self._equations, self._equations.points.comm
+        n, rows = equations.points.n_owned, slice(0, equations.points.n_vertices)
         reaction = self._simulation.energy_balance.reaction
-        if system.contact_impulses is not None:
-            at = system.step.prescribed.indices
-            reaction.put(at, reaction.take(at) - system.contact_impulses.handle_force)
+        if equations.contact_impulses is not None:
+            at = equations.step.prescribed.indices
+            reaction.put(at, reaction.take(at) - equations.contact_impulses.handle_force)
         internal, damping = within
         damped = dt * (sum(parts.values()) - internal - reaction)
         linear = (damped - dt * damping)[rows].sum(axis=0)
         noise = EPSILON * forces * dt
         found = {
             "momentum": float(np.abs(comm.allreduce(linear)).max()),
-            "momentum_tolerance": dt * left * math.sqrt(system.points.n_global) + noise,
+            "momentum_tolerance": dt * left * math.sqrt(equations.points.n_global) + noise,
         }
         if not self._identity:
             return found
-        x, mass = system.x[:n], system.mass[:, None]
+        x, mass = equations.x[:n], equations.mass[:, None]
         centre = comm.allreduce(np.append((mass * x).sum(axis=0), mass.sum()))
         arms = x[rows] - centre[:3] / centre[3]
         moment = np.cross(arms, damped[rows]).sum(axis=0)
         for term, frozen in self._frozen(self._sheet_terms).items():
             if isinstance(term, MidEdge):
                 own = np.flatnonzero(term.edge_indices < 3 * n)
-                moment += term.moment(damped.ravel()[term.edge_indices[own]], own, system.x, frozen)
+                moment += term.moment(damped.ravel()[term.edge_indices[own]], own, equations.x, frozen)
         longest = math.sqrt(comm.allreduce(float(np.square(arms).sum())))
         return found | {
             "angular": float(np.abs(comm.allreduce(moment)).max()),

@@ -174,19 +174,19 @@ def small_motions(trial: Trial) -> SmallMotions:
     from scipy.sparse import csr_array, vstack
 
     problem = trial.simulation.problem
-    system, points = problem.system, problem.points
+    equations, points = problem.equations, problem.points
     rows, n = BlockRows(problem.pattern), points.n_owned
     values = rows.zeros()
     for term in problem.terms.values():
         if isinstance(term, Elastic):
-            rows.add_stiffness(term, system.x, system.step.frozen[term], 0.0, 1.0, values)
+            rows.add_stiffness(term, equations.x, equations.step.frozen[term], 0.0, 1.0, values)
     matrix = AssembledMatrix(points, problem.pattern, "aij", prefix="verify_")
     matrix.set(values)
     mine = csr_array(matrix.mat.getValuesCSR()[::-1], shape=(3 * n, 3 * points.n_global))
     matrix.destroy()
-    free = ~system.held.mask(trial.simulation.time, trial.simulation.time, n).ravel()
+    free = ~equations.held.mask(trial.simulation.time, trial.simulation.time, n).ravel()
     free[points.padding] = False
-    owned = mine, np.repeat(system.mass, 3), free, points.mesh_vertices
+    owned = mine, np.repeat(equations.mass, 3), free, points.mesh_vertices
     stiffness, mass, are_free, original = zip(*points.comm.allgather(owned), strict=True)
     vertices = np.empty((points.n_vertices_global, 3), dtype=np.int64)
     for first, numbers in zip(points.bounds, original, strict=False):

@@ -229,16 +229,16 @@ def explain_failure(
     iterations_key : str
         Key or option that limits Newton's iterations.
     """
-    system = problem.system
-    diagnosis = diagnose(problem.points, solve, system.x, problem.tags)
+    equations = problem.equations
+    diagnosis = diagnose(problem.points, solve, equations.x, problem.tags)
     near = obstacle = None
-    if (contact := system.contact) is not None:
+    if (contact := equations.contact) is not None:
         from lyra_petsc.contact.nearest_pair import blocking_pair, nearest_obstacle
 
-        x, frozen = system.evaluated.x, system.step.frozen[contact.barrier]
+        x, frozen = equations.evaluated.x, equations.step.frozen[contact.barrier]
         near = blocking_pair(contact, x, frozen)
         obstacle = nearest_obstacle(contact, x, frozen) if near is not None and not near.obstacle else None
-    static, kind = not system.integrator.dynamic, diagnosis.kind
+    static, kind = not equations.integrator.dynamic, diagnosis.kind
     shorter = (
         "a smaller time.step (first increment of the load), or a damped motion instead"
         if static

@@ -54,13 +54,13 @@ class Arcs:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
         System of a scene with directors on edges.
     """
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system = system
-        self._term = next(term for term in system.active.elastic if isinstance(term, Membrane))
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations = equations
+        self._term = next(term for term in equations.active.elastic if isinstance(term, Membrane))
         data = self._term.elements.data
         one, two = data["inverse"][:, 0], data["inverse"][:, 1]
         self._area, self._slopes = data["area"], np.stack([-one - two, one, two], axis=1)
@@ -70,7 +70,7 @@ class Arcs:
 
     def turns_notably(self, increment: Array) -> bool:
         """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
-        return self._system.directors.largest_turn(increment * self._system.step.stage.c) > MIN_TURN
+        return self._equations.directors.largest_turn(increment * self._equations.step.stage.c) > MIN_TURN
 
     def curve(self, v: Array, increment: Array, *, strains: bool = True) -> tuple[Array, Array]:
         """An increment (n_owned, 3) [m/s] from v along arcs, and the linear one.
@@ -78,11 +78,11 @@ class Arcs:
         Both are shortened so that no triangle turns by more than `MAX_TURN`. Without ``strains`` they are not
         shortened, and triangles keep their strain.
         """
-        system = self._system
-        x, displacement = system.displacement(v, increment)
+        equations = self._equations
+        x, displacement = equations.displacement(v, increment)
         deformation, spin, strain = self._spin_and_strain(x, displacement)
         turn = np.linalg.norm(spin, axis=1)
-        largest = float(system.points.global_max(float(turn.max(initial=0.0)))[0])
+        largest = float(equations.points.global_max(float(turn.max(initial=0.0)))[0])
         part = min(1.0, MAX_TURN / largest) if strains and largest > 0.0 else 1.0
         displacement, increment = part * displacement, part * increment
         stretch = np.eye(3) + (part * strain if strains else 0.0)
@@ -92,8 +92,8 @@ class Arcs:
         forces = [
             np.bincount(corners, element_forces[:, :, i].ravel(), len(x))[: len(increment)] for i in range(3)
         ]
-        curved = increment + self._solve(np.stack(forces, axis=1)) / system.step.stage.c
-        match(system, v, increment, curved)
+        curved = increment + self._solve(np.stack(forces, axis=1)) / equations.step.stage.c
+        match(equations, v, increment, curved)
         return curved, increment
 
     def _gradients(self, x: Array) -> Array:
@@ -121,8 +121,8 @@ class Arcs:
 
     def _solve(self, forces: Array) -> Array:
         """Displacements (n_owned, 3) [m] of the free unknowns by the Poisson equation for ``forces``."""
-        mask, free = self._system.step.prescribed.mask, self._system.step.prescribed.free
-        (changed,) = self._system.points.global_max(float(not np.array_equal(mask, self._held)))
+        mask, free = self._equations.step.prescribed.mask, self._equations.step.prescribed.free
+        (changed,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
         if changed:
             self._factor()
         assert self._matrix is not None
@@ -131,7 +131,7 @@ class Arcs:
 
     def _factor(self) -> None:
         self.destroy()
-        layout, mask, name = self._system.points, self._system.step.prescribed.mask, self._term.name
+        layout, mask, name = self._equations.points, self._equations.step.prescribed.mask, self._term.name
         pattern = BlockPattern({name: self._term.stencil}, layout.n_owned, layout.n_local)
         rows = BlockRows(pattern)
         self._held = mask.copy()

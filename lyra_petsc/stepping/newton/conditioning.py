@@ -9,11 +9,11 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 
-def vertex_scales(system: StageEquations, size: float) -> Array:
+def vertex_scales(equations: StageEquations, size: float) -> Array:
     """Force [N] at each owned row (n_owned,) if all coordinates changed by ``size`` [m] at random."""
-    points = system.points
+    points = equations.points
     scale = np.zeros(points.n_local)
-    for term in system.active.elastic:
+    for term in equations.active.elastic:
         amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
         scale += np.bincount(term.stencil.ravel(), amount, points.n_local)
         if term.edges is not None:
@@ -22,12 +22,12 @@ def vertex_scales(system: StageEquations, size: float) -> Array:
     return scale[: points.n_owned]
 
 
-def expected_iterations(system: StageEquations, dt: float) -> float:
+def expected_iterations(equations: StageEquations, dt: float) -> float:
     """Iterations of conjugate gradients with block Jacobi in a step of length dt [s]; collective.
 
     It is half the root of the largest ratio of stiffness to inertia: after scaling with the diagonal the
     spectrum reaches from the inertia to the stiffness.
     """
-    n = system.points.n_vertices
-    ratio = dt * dt * vertex_scales(system, 1.0)[:n] / system.mass[:n]
-    return 0.5 * float(np.sqrt(system.points.comm.allreduce(float(ratio.max(initial=0.0)), MPI.MAX)))
+    n = equations.points.n_vertices
+    ratio = dt * dt * vertex_scales(equations, 1.0)[:n] / equations.mass[:n]
+    return 0.5 * float(np.sqrt(equations.points.comm.allreduce(float(ratio.max(initial=0.0)), MPI.MAX)))

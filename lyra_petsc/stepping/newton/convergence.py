@@ -39,7 +39,7 @@ class Convergence:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     tolerances : Solver
         The block ``solver`` of the scene.
     spacing : float
@@ -73,14 +73,14 @@ class Convergence:
 
     def __init__(
         self,
-        system: StageEquations,
+        equations: StageEquations,
         tolerances: Solver,
         spacing: float,
         floor: float,
         *,
         break_even_iterations: float,
     ) -> None:
-        self._system, self._tolerances, self.spacing = system, tolerances, spacing
+        self._equations, self._tolerances, self.spacing = equations, tolerances, spacing
         self._floor = self._minimum_floor = floor
         self._break_even_iterations = break_even_iterations
         self.mean_iterations, self.max_displacement = 0.0, np.inf
@@ -103,7 +103,7 @@ class Convergence:
         a failed line search PETSc reports convergence if the step is short, whatever the residual. In statics
         balanced forces are not enough, because small forces may cause large displacements.
         """
-        if self._ended or not self._system.integrator.dynamic:
+        if self._ended or not self._equations.integrator.dynamic:
             return self._ended
         self._raise_floor()
         self.at_roundoff = self.force_tolerance() < self.norm <= self._floor
@@ -128,7 +128,7 @@ class Convergence:
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
-            moved = increment * self._system.step.stage.c
+            moved = increment * self._equations.step.stage.c
             if moved > self.max_displacement:
                 return int(Reason.DIVERGED_MAX_IT)
             self._estimate_remaining(moved)
@@ -171,25 +171,25 @@ class Convergence:
 
     def _raise_floor(self) -> None:
         """Include the round-off of limits at the positions last evaluated in the floor; collective."""
-        if self._system.near or self._system.active.limiting:
-            self._floor = max(self._minimum_floor, limit_roundoff(self._system))
+        if self._equations.near or self._equations.active.limiting:
+            self._floor = max(self._minimum_floor, limit_roundoff(self._equations))
 
     def _needs_finer_solve(self, tolerance: float) -> bool:
         """Whether a solve that meets the tolerances needs one more iteration because parts may collide.
 
         ``tolerance`` [m] is that of the remaining correction; collective.
         """
-        system, was_good = self._system, self._met_tolerances
+        equations, was_good = self._equations, self._met_tolerances
         self._met_tolerances = True
-        if was_good or not (system.contact is not None and system.integrator.dynamic):
+        if was_good or not (equations.contact is not None and equations.integrator.dynamic):
             return False
         enough, part = self.force_tolerance(), FINER_IN_CONTACT
         coarse = self.norm > part * enough or self.remaining > part * tolerance
-        return coarse and may_impact(system)
+        return coarse and may_impact(equations)
 
     def force_tolerance(self) -> float:
         """Residual norm [N] that the scene's tolerance allows; collective."""
-        return float(self._tolerances.force_tolerance * self._system.forces.largest_force())
+        return float(self._tolerances.force_tolerance * self._equations.forces.largest_force())
 
     def correction_suffices(self, correction: float, last: float, residual: float) -> bool:
         """Whether a Newton step and its corrections meet the tolerances, so that no further one is needed.
@@ -200,7 +200,7 @@ class Convergence:
         """
         part = correction / last
         expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
-        self._after_correction = expected * self._system.step.stage.c
+        self._after_correction = expected * self._equations.step.stage.c
         tolerance = self._tolerances.step_tolerance * self.spacing
         return self._after_correction <= tolerance and residual <= self.force_tolerance()
 

@@ -109,16 +109,21 @@ class Globalisation:
     Parameters
     ----------
     snes : PETSc.SNES
-    system : StageEquations
+    equations : StageEquations
     iterates : Iterates
     convergence : Convergence
     """
 
     def __init__(
-        self, snes: PETSc.SNES, system: StageEquations, iterates: Iterates, convergence: Convergence
+        self, snes: PETSc.SNES, equations: StageEquations, iterates: Iterates, convergence: Convergence
     ) -> None:
-        self._snes, self._system, self._iterates, self._convergence = snes, system, iterates, convergence
-        self._shape = (system.points.n_owned, 3)
+        self._snes, self._equations, self._iterates, self._convergence = (
+            snes,
+            equations,
+            iterates,
+            convergence,
+        )
+        self._shape = (equations.points.n_owned, 3)
         self._watchdog = Watchdog()
         self._first_energy = -math.inf
         self.begin_solve()
@@ -131,11 +136,11 @@ class Globalisation:
 
     def note_iterate(self, u: PETSc.Vec) -> None:
         """Note energy and residual of iterate u, with which trial points are compared; collective."""
-        self._energy = self._system.forces.objective(self._iterates.at(u))
+        self._energy = self._equations.forces.objective(self._iterates.at(u))
         self._norm = self._snes.getFunctionNorm()
         # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
         # would progress slowly
-        kinks = self._system.has_active_pairs and self._system.integrator.dynamic
+        kinks = self._equations.has_active_pairs and self._equations.integrator.dynamic
         self._near_kinks = kinks and not self._convergence.balanced
         energy, size = self._energy
         if self._snes.getIterationNumber() == 0:
@@ -158,7 +163,7 @@ class Globalisation:
         self._returns = self._watchdog.must_return
         if self._returns:
             self._watchdog.return_to_best(x, y)
-            self._system.predicted_stress.forget()
+            self._equations.predicted_stress.forget()
         return self._returns
 
     @property
@@ -177,15 +182,15 @@ class Globalisation:
         value that every line search accepts.
         """
         at = self._iterates.at(u)
-        value, size = self._system.forces.objective(at)
+        value, size = self._equations.forces.objective(at)
         here, own_size = self._energy
         if value != here and np.isfinite(value) and (self._returns or self.takes_full_steps):
             return min(value, here - self._slope)
         noise = ENERGY_ROUNDOFF * max(size, own_size)
         if value == here or not abs(value - here) < noise:
             return value
-        system, trial = self._system, np.empty(self._shape)
-        system.forces.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
-        (square,) = system.points.global_sum(float(np.vdot(trial, trial)))
+        equations, trial = self._equations, np.empty(self._shape)
+        equations.forces.residual(u.getArray(readonly=True).reshape(self._shape), at, trial)
+        (square,) = equations.points.global_sum(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._norm)
         return here - noise if smaller else here + noise

@@ -16,44 +16,46 @@ from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 
-def first_guess(system: StageEquations, start: Array, out: Array) -> bool:
+def first_guess(equations: StageEquations, start: Array, out: Array) -> bool:
     """Write velocities of the stage to ``out`` (n_owned, 3), prescribed unknowns exactly; collective.
 
     ``start`` (n_owned, 3) can be reached from the positions at the start of the step without a collision.
 
     Returns whether they are extrapolated from earlier equilibria.
     """
-    n, integrator = system.points.n_owned, system.integrator
+    n, integrator = equations.points.n_owned, equations.integrator
     if integrator.starts_at_rest:
         out[:] = start
         if not isinstance(integrator, Static) or integrator.predicted is None:
             return False
         guess = integrator.predicted / integrator.pseudo_dt
-        system.prescribe(guess)
-        if system.near or not limits.moves_freely(system, out, guess - out):
+        equations.prescribe(guess)
+        if equations.near or not limits.moves_freely(equations, out, guess - out):
             return False
         out[:] = guess
-        system.predicted_stress.take_state(system.x)
+        equations.predicted_stress.take_state(equations.x)
         return True
-    moving = system.v[:n].copy()
-    system.prescribe(moving)
+    moving = equations.v[:n].copy()
+    equations.prescribe(moving)
     still = start
-    if limits.limits_steps(system):
-        fraction = limits.largest_step(system, still, moving - still)
+    if limits.limits_steps(equations):
+        fraction = limits.largest_step(equations, still, moving - still)
         moving = moving if fraction == 1.0 else still + fraction * (moving - still)
-    if integrator.order > 1 and system.contact is None and not system.active.limiting:
+    if integrator.order > 1 and equations.contact is None and not equations.active.limiting:
         out[:] = moving
         return False
-    energies = [system.forces.objective(system.evaluate(each))[0] for each in (still, moving)]
+    energies = [equations.forces.objective(equations.evaluate(each))[0] for each in (still, moving)]
     use_still = energies[0] < energies[1]
     out[:] = still if use_still else moving
     return False
 
 
-def has_start(system: StageEquations, start: Array) -> bool:
+def has_start(equations: StageEquations, start: Array) -> bool:
     """Whether the first guess of a solve is within the limits of all terms; collective."""
-    if not (system.active.limiting and system.integrator.iterates):  # one linear solve starts from the state
+    if not (
+        equations.active.limiting and equations.integrator.iterates
+    ):  # one linear solve starts from the state
         return True
     guess = np.empty_like(start)
-    first_guess(system, start, guess)
-    return limits.are_kept(system, system.evaluate(guess).x)
+    first_guess(equations, start, guess)
+    return limits.are_kept(equations, equations.evaluate(guess).x)

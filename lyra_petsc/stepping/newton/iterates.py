@@ -18,11 +18,11 @@ class Iterates:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     """
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system = system
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations = equations
         self._known: dict[Key, Evaluation] = {}
 
     def forget(self) -> None:
@@ -30,14 +30,14 @@ class Iterates:
         self._known = {}
 
     def _key(self, u: PETSc.Vec) -> Key:
-        return int(u.handle), int(u.stateGet()), self._system.step.number
+        return int(u.handle), int(u.stateGet()), self._equations.step.number
 
     def at(self, u: PETSc.Vec) -> Evaluation:
         """The evaluation of the equations at velocities u."""
         found = self._known.get(self._key(u))
         if found is not None:
-            return self._system.revisit(found)
-        found = self._system.linearised(u.getArray(readonly=True).reshape(-1, 3))
+            return self._equations.revisit(found)
+        found = self._equations.linearised(u.getArray(readonly=True).reshape(-1, 3))
         self._add(u, found)
         return found
 

@@ -115,9 +115,9 @@ class Reuse:
         """Make the next solve set up its own preconditioner."""
         self._solves, self._iterations = 0, SET_UP
 
-    def begin_solve(self, system: StageEquations) -> bool:
+    def begin_solve(self, equations: StageEquations) -> bool:
         """Whether the next solve reuses the present preconditioner."""
-        reach, held = system.step.stage.c, system.step.prescribed.number
+        reach, held = equations.step.stage.c, equations.step.prescribed.number
         if self._for is None or self._for[1] != held or not _similar(reach, self._for[0]):
             self.discard()
         self.reused = self._enabled and self._solves > 0
@@ -142,7 +142,7 @@ class LinearSystem:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     surface : Surface
         The surface of which multigrid's coarse meshes are made.
     preset : str
@@ -166,9 +166,9 @@ class LinearSystem:
     """
 
     def __init__(
-        self, system: StageEquations, surface: Surface, preset: str, hessian: str, *, iterates: bool
+        self, equations: StageEquations, surface: Surface, preset: str, hessian: str, *, iterates: bool
     ) -> None:
-        self._system, self._surface, self._preset = system, surface, preset
+        self._equations, self._surface, self._preset = equations, surface, preset
         self._iterates = iterates
         direct = PETSc.Options().getString("ksp_type", "cg") == PETSc.KSP.Type.PREONLY
         # Eisenstat's trick multiplies by the operator, and needs its entries
@@ -189,8 +189,8 @@ class LinearSystem:
         self._create()
 
     def _create(self) -> None:
-        discretisation = self._system.discretisation
-        self._system.update_pattern()  # stencils may have changed since the last matrix
+        discretisation = self._equations.discretisation
+        self._equations.update_pattern()  # stencils may have changed since the last matrix
         self._is_empty = True  # whether the preconditioner's new matrix has no values yet
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
@@ -211,7 +211,7 @@ class LinearSystem:
                 self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows, entries)
             assert isinstance(self.preconditioner, BlockMatrix)
             self._multigrid = Multigrid(
-                self.preconditioner, hierarchy, held=lambda: self._system.step.prescribed.mask
+                self.preconditioner, hierarchy, held=lambda: self._equations.step.prescribed.mask
             )
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE
@@ -222,22 +222,22 @@ class LinearSystem:
             )
 
     def _block_summary(self) -> list[str]:
-        return contact_steps.block_summary(self._system)
+        return contact_steps.block_summary(self._equations)
 
     def _hierarchy(self, *, spare: bool) -> Hierarchy:
-        discretisation = self._system.discretisation
+        discretisation = self._equations.discretisation
         found = self._interpolations
         if found is None:
             found = interpolations(discretisation.layout, self._surface, multigrid.max_levels())
         if discretisation.stencils_change:
             self._interpolations = found
         vertex_matrix = None
-        if self._system.active.coarse and not discretisation.stencils_change:
+        if self._equations.active.coarse and not discretisation.stencils_change:
             from lyra_petsc.stepping.newton.vertex_equations import (
                 VertexEquations,  # needed with edge unknowns only
             )
 
-            vertex_matrix = VertexEquations(self._system)
+            vertex_matrix = VertexEquations(self._equations)
         return Hierarchy(
             discretisation.layout, discretisation.rows.pattern, found, vertex_matrix, spare=spare
         )
@@ -251,8 +251,8 @@ class LinearSystem:
 
     def update_pattern(self) -> bool:
         """Create new matrices if stencils have changed the pattern; whether they did."""
-        discretisation = self._system.discretisation
-        if not self._system.update_pattern() and discretisation.rows is self._rows:
+        discretisation = self._equations.discretisation
+        if not self._equations.update_pattern() and discretisation.rows is self._rows:
             return False
         self._free(permanently=False)
         self._create()
@@ -290,9 +290,9 @@ class LinearSystem:
             As `StageForces.jacobian`.
         """
         force = self.assemble_operator(at, blend)
-        if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._system):
+        if self.preconditioner is not self.operator and not self.reuse.begin_solve(self._equations):
             self._set_preconditioner(at, keep=keep, convex=convex)
-        self._system.directors.forget()
+        self._equations.directors.forget()
         return force
 
     def _set_preconditioner(self, at: Evaluation, *, keep: bool, convex: bool) -> None:
@@ -301,7 +301,7 @@ class LinearSystem:
             return
         assert self._ksp is not None
         # an equilibrium's Newton steps are large, and factors cost less than one more
-        keep = keep and not self._is_empty and (self._system.integrator.dynamic or not self.factors)
+        keep = keep and not self._is_empty and (self._equations.integrator.dynamic or not self.factors)
         self._is_empty = False
         self.kept_preconditioner = keep
         self.uses_operator = convex and not keep and shows_negative_curvature(self._ksp.getPC())
@@ -318,8 +318,8 @@ class LinearSystem:
         return force
 
     def _jacobian(self, at: Evaluation, blend: float, rows: Array) -> Array | None:
-        predicted = self._system.predicted_stress.positions
-        return self._system.forces.jacobian(at, blend, rows, predicted)
+        predicted = self._equations.predicted_stress.positions
+        return self._equations.forces.jacobian(at, blend, rows, predicted)
 
     def _set_regularised(self, at: Evaluation) -> None:
         self._jacobian(at, 1.0, self.preconditioner.rows)
@@ -366,7 +366,7 @@ class LinearSystem:
         self.assemble_operator(at, blend)
 
     def _free(self, *, permanently: bool) -> None:
-        self._system.damping.release_values()
+        self._equations.damping.release_values()
         if self._multigrid is not None:
             self._multigrid.destroy(for_good=permanently)
             self._multigrid = None

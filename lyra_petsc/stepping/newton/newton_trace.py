@@ -87,15 +87,15 @@ class Trace:
     Parameters
     ----------
     snes : PETSc.SNES
-    system : StageEquations
+    equations : StageEquations
     linear_iterations : callable
         Returns the number of linear iterations of the present solve so far.
     """
 
     def __init__(
-        self, snes: PETSc.SNES, system: StageEquations, linear_iterations: Callable[[], int]
+        self, snes: PETSc.SNES, equations: StageEquations, linear_iterations: Callable[[], int]
     ) -> None:
-        self._snes, self._ksp, self._system = snes, snes.getKSP(), system
+        self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
         self._linear_iterations = linear_iterations
         self._iterations: list[Iteration] = []
         self._linear = 0
@@ -113,7 +113,7 @@ class Trace:
         taken = None
         if number > 0 and self._last is not None:
             increment = here - self._last
-            (square,) = self._system.points.global_sum(float(np.vdot(increment, increment)))
+            (square,) = self._equations.points.global_sum(float(np.vdot(increment, increment)))
             moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0
@@ -126,26 +126,26 @@ class Trace:
 
         If a solve could not begin, ``velocity`` (n_owned, 3) [m/s] is its starting point.
         """
-        system, stage = self._system, self._system.step.stage
-        n = system.points.n_owned
+        equations, stage = self._equations, self._equations.step.stage
+        n = equations.points.n_owned
         if velocity is None:
             velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
-        residual = system.residual_at(velocity)
-        position = (system.x[:n] if stage.x is None else stage.x) + stage.c * velocity
-        if system.held and system.integrator.handles_at_stage:
-            step, held = system.step, system.step.prescribed
-            there = system.prescriptions.positions(step.start, step.end, step.at_stage, system.x)
+        residual = equations.residual_at(velocity)
+        position = (equations.x[:n] if stage.x is None else stage.x) + stage.c * velocity
+        if equations.held and equations.integrator.handles_at_stage:
+            step, held = equations.step, equations.step.prescribed
+            there = equations.prescriptions.positions(step.start, step.end, step.at_stage, equations.x)
             held.overwrite(position, there.take(held.indices))
-        square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
+        square = equations.points.comm.allreduce(float(np.vdot(residual, residual)))
         return FailedSolve(
             tuple(self._iterations),
             float(np.sqrt(square)),
-            system.step.start + stage.offset,
+            equations.step.start + stage.offset,
             velocity,
             position,
             residual,
-            dict(system.forces_at_stage()),
-            system.step.prescribed.mask[:n].copy(),
+            dict(equations.forces_at_stage()),
+            equations.step.prescribed.mask[:n].copy(),
             int(self._snes.getConvergedReason()),
             int(self._ksp.getConvergedReason()),
             np.array(self._ksp.getConvergenceHistory()),

@@ -19,7 +19,7 @@ class RepeatedSolves:
     Parameters
     ----------
     ksp : PETSc.KSP
-    system : StageEquations
+    equations : StageEquations
     linear : LinearSystem
     at : callable
         Returns the evaluation of the equations at Newton's iterate.
@@ -36,13 +36,13 @@ class RepeatedSolves:
     def __init__(
         self,
         ksp: PETSc.KSP,
-        system: StageEquations,
+        equations: StageEquations,
         linear: LinearSystem,
         at: Callable[[], Evaluation],
         renew: Callable[[], None],
         ease: Callable[[], bool],
     ) -> None:
-        self._ksp, self._system, self._linear, self._at = ksp, system, linear, at
+        self._ksp, self._equations, self._linear, self._at = ksp, equations, linear, at
         self._renew, self._ease = renew, ease
         self.iterations = 0
 
@@ -70,12 +70,12 @@ class RepeatedSolves:
         """Solve for z after ``add`` has added to the block rows (n_blocks, 3, 3), to a residual of at most
         ``tolerance`` [N]; whether it succeeded with a direction of descent.
         """
-        ksp, system = self._ksp, self._system
+        ksp, equations = self._ksp, self._equations
 
         def constrained(values: Array) -> None:
             add(values)
-            if len((entries := system.forces.constrained(system.step.prescribed)).changed):
-                system.discretisation.rows.constrain(values, system.step.prescribed.mask, entries)
+            if len((entries := equations.forces.constrained(equations.step.prescribed)).changed):
+                equations.discretisation.rows.constrain(values, equations.step.prescribed.mask, entries)
 
         self._linear.assemble_with(constrained)
         ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)

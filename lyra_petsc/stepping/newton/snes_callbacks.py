@@ -73,7 +73,7 @@ class NewtonCallbacks:
     Parameters
     ----------
     snes : PETSc.SNES
-    system : StageEquations
+    equations : StageEquations
     linear : LinearSystem
     blend : HessianBlend
     convergence : Convergence
@@ -96,7 +96,7 @@ class NewtonCallbacks:
     def __init__(
         self,
         snes: PETSc.SNES,
-        system: StageEquations,
+        equations: StageEquations,
         linear: LinearSystem,
         blend: HessianBlend,
         convergence: Convergence,
@@ -105,11 +105,14 @@ class NewtonCallbacks:
         iterates: bool,
         follow: Callable[[], bool],
     ) -> None:
-        self._snes, self._ksp, self._system = snes, snes.getKSP(), system
+        self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
         self._linear, self._blend, self._points, self._iterates = linear, blend, points, iterates
-        self.convergence, self.globalisation = convergence, Globalisation(snes, system, points, convergence)
-        self._shape = (system.points.n_owned, 3)
-        self._follow, contact = follow, system.contact
+        self.convergence, self.globalisation = (
+            convergence,
+            Globalisation(snes, equations, points, convergence),
+        )
+        self._shape = (equations.points.n_owned, 3)
+        self._follow, contact = follow, equations.contact
         self._models_contact = (
             iterates and contact is not None and contact.skin < SMALL_GAP * convergence.spacing
         )
@@ -117,16 +120,16 @@ class NewtonCallbacks:
         self._last_c = 0.0
         self._convex_at_start = False
         self._can_correct = (
-            not system.integrator.dynamic and linear.factors and bool(system.active.with_edges)
+            not equations.integrator.dynamic and linear.factors and bool(equations.active.with_edges)
         )
         self._arcs: Arcs | None = None
         if self._can_correct:
             from lyra_petsc.stepping.newton.arcs import Arcs, can_factor  # needed in equilibria only
 
-            self._arcs = Arcs(system) if can_factor(system.points.comm.size) else None
-        fixed = is_set("ksp_rtol") or not system.integrator.dynamic
+            self._arcs = Arcs(equations) if can_factor(equations.points.comm.size) else None
+        fixed = is_set("ksp_rtol") or not equations.integrator.dynamic
         self.forcing = Forcing(
-            self._ksp, fixed=fixed, cycles=linear.cycles, contact=system.contact is not None
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.contact is not None
         )
 
     def begin_solve(self) -> None:
@@ -136,26 +139,26 @@ class NewtonCallbacks:
         # the Hessian at the start of a step mostly resembles that at the start of the last step
         self._convex = self._convex_at_start
         approach = COLLISION * self.convergence.spacing
-        collides = self._iterates and limits.may_collide(self._system, approach)
+        collides = self._iterates and limits.may_collide(self._equations, approach)
         self._points.forget()
         self._linear.begin_solve()
         self._linear.shift.decrease()
         self.convergence.begin_solve()
         self.globalisation.begin_solve()
-        near = self._system.near
+        near = self._equations.near
         self.forcing.begin_solve(near=near, collides=collides, buckles=not self._convex_at_start)
 
     @property
     def _corrects(self) -> bool:
         """Whether steps follow arcs and are corrected: in equilibria of shells, while no parts are near."""
-        return self._can_correct and not self._system.near
+        return self._can_correct and not self._equations.near
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
         """Assemble the Jacobian and the preconditioning matrix at velocities u; collective."""
         at = self._points.at(u)
         if self._iterates:
-            self._system.predicted_stress.set_iterate(at.x)
+            self._equations.predicted_stress.set_iterate(at.x)
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
@@ -164,7 +167,7 @@ class NewtonCallbacks:
         if by_prescribed is not None:
             force = self._snes.getFunction()[0].getArray().reshape(self._shape)
             force += by_prescribed
-        self._last_c = self._system.step.stage.c
+        self._last_c = self._equations.step.stage.c
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -210,9 +213,9 @@ class NewtonCallbacks:
             changed |= self._apply_contact_model(x, residual, y)
         full = self.globalisation.takes_full_steps
         curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
-        if self._system.active.with_edges and full and not curved:
+        if self._equations.active.with_edges and full and not curved:
             changed |= self._turn_directors(x, residual, y)
-        if limits.limits_steps(self._system) and not curved:
+        if limits.limits_steps(self._equations) and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
         if full and self._corrects:
@@ -253,8 +256,8 @@ class NewtonCallbacks:
             self._linear.reassemble_operator(at(), self._blend.value)
             return self._ease_linear_solve(x)
 
-        solves = RepeatedSolves(self._ksp, self._system, self._linear, at, renew, ease)
-        model = ContactModel(*limits.contact_at(self._system, self._array(x)))
+        solves = RepeatedSolves(self._ksp, self._equations, self._linear, at, renew, ease)
+        model = ContactModel(*limits.contact_at(self._equations, self._array(x)))
         changed = model.improve(residual, y, solves, self.forcing.effective_tolerance)
         self.contact_iterations += solves.iterations
         return changed
@@ -281,7 +284,7 @@ class NewtonCallbacks:
             if exact:
                 _apply_broyden(correction, steps)
             before, increment = size, -self._array(y) - self._array(correction)
-            if not limits.moves_freely(self._system, v, increment):
+            if not limits.moves_freely(self._equations, v, increment):
                 break
             size, force = self._residual(v + increment)
             if not size < MAX_REMAINING * before:
@@ -292,15 +295,15 @@ class NewtonCallbacks:
                 break
             steps.append(correction.copy())
         if corrected:
-            self._system.predicted_stress.take_uncorrected(self._system.evaluate(first).x)
+            self._equations.predicted_stress.take_uncorrected(self._equations.evaluate(first).x)
         for vector in (right, correction, *steps):
             vector.destroy()
         return corrected
 
     def _residual(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
-        force = self._system.residual_at(v)
-        (square,) = self._system.points.global_sum(float(np.vdot(force, force)))
+        force = self._equations.residual_at(v)
+        (square,) = self._equations.points.global_sum(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
 
     def curve_guess(self, v: Array, start: Array, guess: Array) -> None:
@@ -309,17 +312,17 @@ class NewtonCallbacks:
 
         Of all expected increments it takes the one whose end has the least energy.
         """
-        integrator = self._system.integrator
+        integrator = self._equations.integrator
         if self._arcs is None or not isinstance(integrator, Static):
             return
         others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
         lowest = np.inf
         for increment in (guess - v, *others):
             end = v + self._arcs.curve(v, increment, strains=False)[0]
-            self._system.prescribe(end)
-            if not limits.moves_freely(self._system, start, end - start):
+            self._equations.prescribe(end)
+            if not limits.moves_freely(self._equations, start, end - start):
                 continue
-            energy = self._system.forces.objective(self._system.evaluate(end))[0] if others else 0.0
+            energy = self._equations.forces.objective(self._equations.evaluate(end))[0] if others else 0.0
             if energy < lowest:
                 lowest, guess[:] = energy, end
 
@@ -347,9 +350,9 @@ class NewtonCallbacks:
         before = y.copy()
         curved, increment = self._arcs.curve(v, -self._array(y))
         y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and limits.moves_freely(self._system, v, curved)
+        descends = bool(residual.dot(y) > 0.0) and limits.moves_freely(self._equations, v, curved)
         if descends:
-            self._system.predicted_stress.take_uncorrected(self._system.evaluate(v + increment).x)
+            self._equations.predicted_stress.take_uncorrected(self._equations.evaluate(v + increment).x)
             self.step_fraction = 1.0
         else:
             before.copy(y)
@@ -364,7 +367,7 @@ class NewtonCallbacks:
     def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Turn directors with their triangles in a step y that is taken in full; whether y changed."""
         increment = -self._array(y)
-        if not turn_with_triangles(self._system, self._array(x), increment):
+        if not turn_with_triangles(self._equations, self._array(x), increment):
             return False
         before = y.copy()
         y.setArray(-increment.ravel())
@@ -379,16 +382,16 @@ class NewtonCallbacks:
 
         Returns whether y changed.
         """
-        system, v = self._system, self._array(x)
+        equations, v = self._equations, self._array(x)
         shortened = self._limit_displacement(y)
-        fraction = limits.largest_step(system, v, -self._array(y))
+        fraction = limits.largest_step(equations, v, -self._array(y))
         slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell_fast
         correct = fraction < 1.0 or slow
-        separated = limits.separated(system, v, -self._array(y)) if correct else None
+        separated = limits.separated(equations, v, -self._array(y)) if correct else None
         if separated is not None:
             before = y.copy()
             y.setArray(-separated.ravel())
-            farther = limits.largest_step(system, v, separated) if residual.dot(y) > 0.0 else 0.0
+            farther = limits.largest_step(equations, v, separated) if residual.dot(y) > 0.0 else 0.0
             if farther > 0.0 and farther >= fraction:
                 fraction = farther
             else:
@@ -401,12 +404,12 @@ class NewtonCallbacks:
 
     def _limit_displacement(self, y: PETSc.Vec) -> bool:
         """Shorten a step y to `MAX_INCREMENT` in equilibria in contact; whether y changed."""
-        system = self._system
-        if system.integrator.dynamic or not system.near:
+        equations = self._equations
+        if equations.integrator.dynamic or not equations.near:
             return False
-        vertices = self._array(y)[: system.points.n_vertices]
-        (largest,) = system.points.global_max(float(np.abs(vertices).max(initial=0.0)))
-        allowed = MAX_INCREMENT * self.convergence.spacing / system.step.stage.c
+        vertices = self._array(y)[: equations.points.n_vertices]
+        (largest,) = equations.points.global_max(float(np.abs(vertices).max(initial=0.0)))
+        allowed = MAX_INCREMENT * self.convergence.spacing / equations.step.stage.c
         if largest <= allowed:
             return False
         y.scale(allowed / largest)

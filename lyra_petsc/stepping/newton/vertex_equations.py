@@ -23,7 +23,7 @@ class VertexEquations:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
         System of a scene with terms in ``active.coarse``.
 
     Attributes
@@ -33,13 +33,13 @@ class VertexEquations:
         The edges' unknowns as functions of the vertices.
     """
 
-    def __init__(self, system: StageEquations) -> None:
-        self._system, layout = system, system.points
-        self._bent = next(term for term in system.active.elastic if isinstance(term, MidEdge))
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations, layout = equations, equations.points
+        self._bent = next(term for term in equations.active.elastic if isinstance(term, MidEdge))
         self._elastic: list[Elastic] = [
-            system.active.coarse.get(term, term) for term in system.active.elastic
+            equations.active.coarse.get(term, term) for term in equations.active.elastic
         ]
-        self._viscous: list[Viscous] = [] if system.integrator.lagged_loads else system.active.viscous
+        self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.active.viscous
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
@@ -61,21 +61,21 @@ class VertexEquations:
 
         Prescribed unknowns ``held`` (n_local, 3) are decoupled.
         """
-        system, rows = self._system, self._rows
-        x, vs = system.evaluated.x, system.evaluated.v
-        stage, damped = system.step.stage, system.damping.active
+        equations, rows = self._equations, self._rows
+        x, vs = equations.evaluated.x, equations.evaluated.v
+        stage, damped = equations.step.stage, equations.damping.active
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.update(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
-        rows.set_diagonal(stage.sigma * system.mass, values)
+        rows.set_diagonal(stage.sigma * equations.mass, values)
         for term in self._elastic:
             weight: Array | float = stage.c
             if damped and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, system.step.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, equations.step.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(vs, system.step.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(vs, equations.step.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, values)
             rows.constrain(values, held, self._constrained)
@@ -93,9 +93,9 @@ class VertexEquations:
         edge = head - tail
         normal = np.cross(edge, opposite - tail)
         square = np.sum(normal * normal, axis=1)
-        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._system.step.stage.c
-        if self._system.damping.active:
-            factor *= 1.0 + data["damping"][triangle] / self._system.step.stage.c
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.step.stage.c
+        if self._equations.damping.active:
+            factor *= 1.0 + data["damping"][triangle] / self._equations.step.stage.c
         # n nᵀ / height²
         factor *= np.divide(
             np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0

@@ -41,7 +41,7 @@ class BuckledShape:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     examine : callable
         Returns an `Examination` of the present state.
     before, factor : float
@@ -52,19 +52,19 @@ class BuckledShape:
 
     def __init__(
         self,
-        system: StageEquations,
+        equations: StageEquations,
         examine: Callable[[], Examination],
         before: float,
         factor: float,
         size: float,
     ) -> None:
-        self._system, self._examine, self._size = system, examine, size
+        self._equations, self._examine, self._size = equations, examine, size
         self._load_step = before, factor
 
     def find(self, mode: Array) -> bool:
         """Set the state to a shape near an equilibrium along the mode (n_owned, 3); whether it did."""
-        system, n = self._system, self._system.points.n_owned
-        start = system.x[:n].copy()
+        equations, n = self._equations, self._equations.points.n_owned
+        start = equations.x[:n].copy()
         mode = self._oriented(mode)
         unit = self._size / self._largest(mode)  # a per relative displacement
         step, reached, last, holding = FIRST_STEP, 0.0, start, 0.0
@@ -77,7 +77,7 @@ class BuckledShape:
                 step *= SHORTER
                 continue
             before = reached, holding
-            reached, last, holding = reached + step, system.x[:n].copy(), force
+            reached, last, holding = reached + step, equations.x[:n].copy(), force
             if force >= 0.0:
                 self._find_root(start, mode, unit, before, (reached, holding))
                 break
@@ -88,10 +88,10 @@ class BuckledShape:
         self, start: Array, mode: Array, unit: float, one: tuple[float, float], other: tuple[float, float]
     ) -> None:
         """Go to the equilibrium between two relative displacements with their forces μ, by secants."""
-        system, n = self._system, self._system.points.n_owned
+        equations, n = self._equations, self._equations.points.n_owned
         for _ in range(MAX_ITERATIONS):
             (before, force_before), (at, force) = one, other
-            last, between = system.x[:n].copy(), at - force * (at - before) / (force - force_before)
+            last, between = equations.x[:n].copy(), at - force * (at - before) / (force - force_before)
             found = self._solve(start, mode, between * unit, abs(between - at))
             if found is None:
                 self._set_positions(last)
@@ -101,27 +101,29 @@ class BuckledShape:
 
     def _solve(self, start: Array, mode: Array, goal: float, step: float) -> float | None:
         """Newton's method to an equilibrium with m · (x − start) = goal; returns the force μ [N], or None."""
-        system, n = self._system, self._system.points.n_owned
+        equations, n = self._equations, self._equations.points.n_owned
         before = last = np.inf
         for _ in range(MAX_ITERATIONS):
-            system.begin_step(*self._load_step)
-            unbalanced = system.out_of_balance()
+            equations.begin_step(*self._load_step)
+            unbalanced = equations.out_of_balance()
             with self._examine() as examination:
                 change = examination.solve(unbalanced) if self._is_finite(unbalanced) else None
                 response = None if change is None else examination.solve(mode)
             if change is None or response is None:
                 return None
-            moved, by_force, by_mode = system.points.global_sum(
-                *(float(np.vdot(mode, u)) for u in (system.x[:n] - start, change, response))
+            moved, by_force, by_mode = equations.points.global_sum(
+                *(float(np.vdot(mode, u)) for u in (equations.x[:n] - start, change, response))
             )
             holding = (goal - moved - by_force) / by_mode
             change += holding * response
             largest = self._largest(change) / self._size
             if not largest < max(2.0 * before, 10.0 * step):
                 return None
-            if limits.limits_steps(system):
-                change *= limits.largest_step(system, np.zeros_like(change), change / system.step.stage.c)
-            self._set_positions(system.x[:n] + change)
+            if limits.limits_steps(equations):
+                change *= limits.largest_step(
+                    equations, np.zeros_like(change), change / equations.step.stage.c
+                )
+            self._set_positions(equations.x[:n] + change)
             if largest <= CONVERGED * step and abs(holding - last) <= CONVERGED * abs(holding):
                 return holding
             before, last = largest, holding
@@ -129,7 +131,7 @@ class BuckledShape:
 
     def _oriented(self, mode: Array) -> Array:
         """The mode on vertices alone, with a sign that does not depend on the number of ranks."""
-        points = self._system.points
+        points = self._equations.points
         mode = mode.copy()
         mode[points.n_vertices :] = 0.0
         number = 3 * points.mesh_vertices[:, None] + np.arange(3) + 1
@@ -138,14 +140,14 @@ class BuckledShape:
         return mode if sign >= 0.0 else -mode
 
     def _set_positions(self, x: Array) -> None:
-        self._system.state.set(x, np.zeros_like(x))
-        transport_frames(self._system)
+        self._equations.state.set(x, np.zeros_like(x))
+        transport_frames(self._equations)
 
     def _is_finite(self, values: Array) -> bool:
-        return not any(self._system.points.global_max(float(not np.all(np.isfinite(values)))))
+        return not any(self._equations.points.global_max(float(not np.all(np.isfinite(values)))))
 
     def _largest(self, displacement: Array) -> float:
         """Largest displacement [m] of a vertex."""
-        points = self._system.points
+        points = self._equations.points
         lengths = np.linalg.norm(displacement[: points.n_vertices], axis=1)
         return float(points.comm.allreduce(float(lengths.max(initial=0.0)), MPI.MAX))

@@ -96,7 +96,7 @@ class Equilibrium:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
         With the integrator `Static`; its positions are the start shape.
     stepper : Stepper
     tolerances : Solver
@@ -110,7 +110,7 @@ class Equilibrium:
 
     def __init__(
         self,
-        system: StageEquations,
+        equations: StageEquations,
         stepper: Stepper,
         tolerances: Solver,
         spacing: float,
@@ -118,39 +118,39 @@ class Equilibrium:
         floor: float,
         end: float,
     ) -> None:
-        assert isinstance(system.integrator, Static)
-        self._system, self._stepper, self._integrator = system, stepper, system.integrator
+        assert isinstance(equations.integrator, Static)
+        self._equations, self._stepper, self._integrator = equations, stepper, equations.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._whole_first = False  # whether the next load step begins with it
         self._in_vain = 0
-        self._friction = FrictionBalance(system, spacing, end)
+        self._friction = FrictionBalance(equations, spacing, end)
         self._whole_stiffness: WholeStiffness | None = None
-        if system.active.following:
+        if equations.active.following:
             from lyra_petsc.stepping.statics.whole_stiffness import (
                 WholeStiffness,  # needed with loads that follow the shape only
             )
 
-            self._whole_stiffness = WholeStiffness(system, stepper.tangent, self._examine, self._balanced)
+            self._whole_stiffness = WholeStiffness(equations, stepper.tangent, self._examine, self._balanced)
         # load factor λ of the last equilibrium, change of the loads over that of λ [N], and tangent dx/dλ [m]
-        self._last_factor, self._load_rate = 0.0, np.zeros((system.points.n_owned, 3))
+        self._last_factor, self._load_rate = 0.0, np.zeros((equations.points.n_owned, 3))
         self._tangent: Array | None = None
         self._pseudo_time = PseudoTimeStep(
             self._integrator,
             spacing,
-            leaps=not system.active.viscous,
-            contact=system.contact is not None,
+            leaps=not equations.active.viscous,
+            contact=equations.contact is not None,
             factors=stepper.linear.factors,
         )
-        self._extrapolation = Extrapolation(system.points.comm)
-        self._follows = bool(system.active.viscous or system.active.following)
-        system.take_loads(factor=0.0)
-        system.begin_step(0.0, 0.0)
-        force = system.out_of_balance()
+        self._extrapolation = Extrapolation(equations.points.comm)
+        self._follows = bool(equations.active.viscous or equations.active.following)
+        equations.take_loads(factor=0.0)
+        equations.begin_step(0.0, 0.0)
+        force = equations.out_of_balance()
         self._scale = self._norm(force)
         # if the sheet slides, forces that hold its start shape would push it along
-        held = not system.near
+        held = not equations.near
         if held and self._scale > floor and not self._unstable():
-            system.take_loads(unbalanced=-force)
+            equations.take_loads(unbalanced=-force)
 
     def _unstable(self) -> bool:
         """Whether the start shape with the forces that hold it is unstable, as if compressed; collective.
@@ -162,7 +162,7 @@ class Equilibrium:
             return examination.stability.stable is False
 
     def _examine(self) -> Examination:
-        return Examination(self._system, self._size)
+        return Examination(self._equations, self._size)
 
     def attempt(self, before: float, factor: float, *, limited: bool = True) -> Attempt:
         """Find the equilibrium at load factor ``factor``; on failure the state is restored; collective.
@@ -188,9 +188,9 @@ class Equilibrium:
         """Find the equilibrium by Newton's method with the whole stiffness; collective."""
         if self._whole_stiffness is None:
             return None
-        system = self._system
-        system.take_loads(factor=factor)
-        guess = self._extrapolation.extrapolate(factor, before, system.x[: system.points.n_owned])
+        equations = self._equations
+        equations.take_loads(factor=factor)
+        guess = self._extrapolation.extrapolate(factor, before, equations.x[: equations.points.n_owned])
         found = self._whole_stiffness.find(before, factor, guess)
         if found is not None:
             self._record(factor)
@@ -199,15 +199,15 @@ class Equilibrium:
 
     def _by_proximal_steps(self, before: float, factor: float, *, limited: bool) -> Attempt:
         """Find the equilibrium as described at the top of the module; collective."""
-        system, n = self._system, self._system.points.n_owned
-        x = system.x[:n].copy()
-        system.take_loads(factor=factor)
+        equations, n = self._equations, self._equations.points.n_owned
+        x = equations.x[:n].copy()
+        equations.take_loads(factor=factor)
         newton = linear = solves = resumed = 0
         last, solved_once = np.inf, False
-        contact = system.contact is not None
+        contact = equations.contact is not None
         judges_energy = contact and self._is_held()
         self._integrator.predicted = self._extrapolation.extrapolate(factor, before, x) - x
-        progress, relaxation = LoadStepProgress(), Relaxation(system.points.comm)
+        progress, relaxation = LoadStepProgress(), Relaxation(equations.points.comm)
         self._pseudo_time.begin_load_step()
         self._friction.begin_step()
         attempt = Attempt(False, 0, 0, 0.0)
@@ -216,9 +216,9 @@ class Equilibrium:
             if not solves:
                 self._pseudo_time.start(fastest)
                 self._predict_by_tangent(before, factor)
-                frozen = system.step.frozen
+                frozen = equations.step.frozen
             progress.record_force(force, attempt.linear_iterations if solves else None)
-            if solves and judges_energy and not contact_steps.has_friction_pairs(system):
+            if solves and judges_energy and not contact_steps.has_friction_pairs(equations):
                 progress.record_potential(self._potential_energy(x))
             balanced = solved_once and self._balanced(force, last)
             settled = self._friction.is_rough or (balanced and self._friction.is_settled())
@@ -249,11 +249,11 @@ class Equilibrium:
                 self._pseudo_time.restart(fastest)
             if self._follows:
                 linear += self._update_loads(relaxation, before, factor, first=solves == 0)
-            leap, begin = self._pseudo_time.is_leap, system.x[:n].copy()
+            leap, begin = self._pseudo_time.is_leap, equations.x[:n].copy()
             attempt = self._proximal_step(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
-                relaxation.record(system.step.loads.force_at(system.x))
-            system.take_loads(override=None, following=None)
+                relaxation.record(equations.step.loads.force_at(equations.x))
+            equations.take_loads(override=None, following=None)
             self._integrator.predicted = None
             self._integrator.alternatives = []
             solves += 1
@@ -261,13 +261,13 @@ class Equilibrium:
             linear += attempt.linear_iterations
             lags = attempt.converged and self._friction.lags(begin)
             if lags and self._pseudo_time.shorten_to_repeat():
-                system.state.set(begin, np.zeros_like(x))
+                equations.state.set(begin, np.zeros_like(x))
                 attempt = dataclasses.replace(attempt, converged=False)
             elif attempt.converged:
                 if not solved_once:  # the force before is smaller if handles move
                     progress.restart()
                 solved_once = True
-                transport_frames(system)  # edges may turn far until they are in equilibrium
+                transport_frames(equations)  # edges may turn far until they are in equilibrium
                 self._pseudo_time.record_success(attempt.newton_iterations)
             elif leap and resumed < MAX_RESUMED and self._resume_from_lowest(attempt):
                 resumed += 1
@@ -285,10 +285,10 @@ class Equilibrium:
         self._pseudo_time.sufficed = 0.0
         self._in_vain += solves - progress.last_by_force if solved_once and not self.lands else 0
         stuck = attempt.failed_solve or self._failed_solve(before, factor, progress, x)
-        system.x[:n] = x
-        system.points.update_ghosts(system.x)
-        transport_frames(system, frozen)
-        system.active.restore_contacts(self._friction.contacts)
+        equations.x[:n] = x
+        equations.points.update_ghosts(equations.x)
+        transport_frames(equations, frozen)
+        equations.active.restore_contacts(self._friction.contacts)
         return dataclasses.replace(
             attempt,
             converged=False,
@@ -302,7 +302,7 @@ class Equilibrium:
         """Set the predictions along the tangent of the last equilibrium; collective."""
         if before != self._last_factor:
             return
-        self._load_rate = self._system.out_of_balance() / (factor - before)
+        self._load_rate = self._equations.out_of_balance() / (factor - before)
         if self._tangent is not None:
             self._integrator.alternatives = self._extrapolation.tangent_predictions(factor, self._tangent)
 
@@ -312,23 +312,23 @@ class Equilibrium:
         Loads are assumed to change further as in this load step, and handles to move further as from
         positions ``start`` (n_owned, 3) [m].
         """
-        system, n = self._system, len(start)
+        equations, n = self._equations, len(start)
         step = factor - before
-        moved = np.where(system.step.prescribed.free, 0.0, system.x[:n] - start)
-        (largest,) = system.points.global_max(float(np.abs(moved).max(initial=0.0)))
+        moved = np.where(equations.step.prescribed.free, 0.0, equations.x[:n] - start)
+        (largest,) = equations.points.global_max(float(np.abs(moved).max(initial=0.0)))
         rate = self._load_rate
-        if system.near:
+        if equations.near:
             self._tangent = None  # the first guess is another
             return 0
         if largest > 0.0:
-            x, part = system.x.copy(), HANDLE_STEP * self._spacing / largest
-            here = system.out_of_balance()
-            system.x[:n] += part * moved
-            system.points.update_ghosts(system.x)
-            system.change()
-            rate = rate + (system.out_of_balance() - here) / (part * step)
-            system.x[:] = x
-            system.change()
+            x, part = equations.x.copy(), HANDLE_STEP * self._spacing / largest
+            here = equations.out_of_balance()
+            equations.x[:n] += part * moved
+            equations.points.update_ghosts(equations.x)
+            equations.change()
+            rate = rate + (equations.out_of_balance() - here) / (part * step)
+            equations.x[:] = x
+            equations.change()
         if self._whole_stiffness is None:
             self._tangent, iterations = self._stepper.tangent(rate)
         else:
@@ -343,40 +343,40 @@ class Equilibrium:
 
         Returns linear iterations; collective.
         """
-        system, now = self._system, self._system.step.loads.force.copy()
+        equations, now = self._equations, self._equations.step.loads.force.copy()
         if self._whole_stiffness is None:
-            system.take_loads(override=relaxation.relax(now))
+            equations.take_loads(override=relaxation.relax(now))
             return 0
         loads = self._whole_stiffness.linearise_loads(before, factor)
         displacement, iterations = None, 0
-        if system.active.viscous:  # the wind's stiffness is not known
+        if equations.active.viscous:  # the wind's stiffness is not known
             pass
         elif not first:
-            displacement, iterations = self._whole_stiffness.tangent(system.out_of_balance(), loads)
+            displacement, iterations = self._whole_stiffness.tangent(equations.out_of_balance(), loads)
         elif self._integrator.alternatives and self._tangent is not None:
             displacement = (factor - before) * self._tangent
         if displacement is None:
             now = relaxation.relax(now)
         else:
             now = now + self._whole_stiffness.skew_force(loads, displacement)
-        system.take_loads(override=now, following=loads)
+        equations.take_loads(override=now, following=loads)
         return iterations
 
     def _is_held(self) -> bool:
         """Whether handles hold vertices, and loads have a potential: it is then bounded below; collective."""
-        system = self._system
-        springs = any(not term.registration.of_contact for term in system.active.external)
-        holds = springs or len(system.step.prescribed.indices) > 0
-        return not self._follows and any(system.points.global_max(float(holds)))
+        equations = self._equations
+        springs = any(not term.registration.of_contact for term in equations.active.external)
+        holds = springs or len(equations.step.prescribed.indices) > 0
+        return not self._follows and any(equations.points.global_max(float(holds)))
 
     def _potential_energy(self, start: Array) -> float:
         """Energy [J] without friction, less the work of loads from ``start`` (n_owned, 3); collective."""
-        system, frozen = self._system, self._system.step.frozen
-        friction = None if system.contact is None else system.contact.friction
-        terms = [term for term in system.active.elastic if term is not friction]
-        energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
-        energy -= float(np.vdot(system.step.loads.force, system.x[: len(start)] - start))
-        return float(system.points.global_sum(energy)[0])
+        equations, frozen = self._equations, self._equations.step.frozen
+        friction = None if equations.contact is None else equations.contact.friction
+        terms = [term for term in equations.active.elastic if term is not friction]
+        energy = sum(float(term.energies(equations.x, frozen[term]).sum()) for term in terms)
+        energy -= float(np.vdot(equations.step.loads.force, equations.x[: len(start)] - start))
+        return float(equations.points.global_sum(energy)[0])
 
     def _proximal_step(self, before: float, factor: float, limit: int | None) -> Attempt:
         """One proximal step; ``limit`` bounds Newton iterations, and then also displacements; collective."""
@@ -395,20 +395,20 @@ class Equilibrium:
         Returns whether it did: the energy must have fallen. Not with loads that follow the shape, nor with
         friction, whose forces do not follow the normal forces in a solve: sheets might slide off.
         """
-        system = self._system
+        equations = self._equations
         ran_out = attempt.newton_iterations >= LEAP_ITERATIONS
-        if not ran_out or self._follows or contact_steps.has_friction_pairs(system):
+        if not ran_out or self._follows or contact_steps.has_friction_pairs(equations):
             return False
         lowest = self._stepper.lowest_energy_positions()
         if lowest is None:
             return False
-        system.state.set(lowest, np.zeros_like(lowest))
-        transport_frames(system)
+        equations.state.set(lowest, np.zeros_like(lowest))
+        transport_frames(equations)
         return True
 
     def settle(self, before: float, factor: float) -> EquilibriumReport:
         """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
-        system, n = self._system, self._system.points.n_owned
+        equations, n = self._equations, self._equations.points.n_owned
         newton = linear = followed = 0
         message = ""
         while True:
@@ -434,18 +434,18 @@ class Equilibrium:
                     message = f"its lowest mode was followed {followed} times"
             if message:
                 break
-            x = system.x[:n].copy()
+            x = equations.x[:n].copy()
             self._pseudo_time.sufficed = 0.0
             assert mode is not None
-            buckled = BuckledShape(system, self._examine, before, factor, self._size)
+            buckled = BuckledShape(equations, self._examine, before, factor, self._size)
             attempt = self.attempt(before, factor, limited=False) if buckled.find(mode) else None
             if attempt is not None:
                 newton += attempt.newton_iterations
                 linear += attempt.linear_iterations
             if attempt is None or not attempt.converged:
-                system.state.set(x, np.zeros_like(x))
-                system.begin_step(before, factor)
-                system.evaluate_at_start()
+                equations.state.set(x, np.zeros_like(x))
+                equations.begin_step(before, factor)
+                equations.evaluate_at_start()
                 message = "from its lowest mode no other was found"
                 break
             followed += 1
@@ -455,7 +455,7 @@ class Equilibrium:
 
     def saved_state(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers of a checkpoint at the equilibrium at ``factor``; collective."""
-        self._extrapolation.record(factor, self._system.x[: self._system.points.n_owned].copy())
+        self._extrapolation.record(factor, self._equations.x[: self._equations.points.n_owned].copy())
         arrays, past = self._extrapolation.saved_state()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._pseudo_time.sufficed}
         numbers |= self._friction.saved_state()
@@ -470,7 +470,7 @@ class Equilibrium:
         self._pseudo_time.sufficed = saved["sufficed"]
         self._last_factor = factor
         self._tangent = np.array(arrays["rate"]) if "rate" in arrays else None
-        x = self._system.x[: self._system.points.n_owned].copy()
+        x = self._equations.x[: self._equations.points.n_owned].copy()
         self._extrapolation.restore(arrays, saved["extrapolation"], factor, x)
 
     @property
@@ -492,8 +492,8 @@ class Equilibrium:
         """
         if not solved_once:
             return "no proximal step was found" if solves >= MAX_FAILURES else ""
-        moved = float(np.abs(self._system.x[: len(before)] - before).max(initial=0.0))
-        moved = self._system.points.comm.allreduce(moved, MPI.MAX)
+        moved = float(np.abs(self._equations.x[: len(before)] - before).max(initial=0.0))
+        moved = self._equations.points.comm.allreduce(moved, MPI.MAX)
         if moved > MAX_DISPLACEMENT * self._size:
             return f"no equilibrium within {moved:.1g} m of the start, as if nothing held the sheet"
         idle = solves - progress.last
@@ -505,18 +505,18 @@ class Equilibrium:
         self, before: float, factor: float, progress: LoadStepProgress, x: Array
     ) -> FailedSolve:
         """The state that the proximal steps from positions x (n_owned, 3) [m] have reached; collective."""
-        system, n = self._system, self._system.points.n_owned
-        system.begin_step(before, factor)
-        force = system.out_of_balance()
+        equations, n = self._equations, self._equations.points.n_owned
+        equations.begin_step(before, factor)
+        force = equations.out_of_balance()
         return FailedSolve(
             iterations=tuple(progress.history),
             norm=self._norm(force),
             time=factor,
             velocity=np.zeros_like(x),
-            position=system.x[:n].copy(),
+            position=equations.x[:n].copy(),
             residual=-force,
-            forces={"loads": -system.step.loads.force, "internal": system.step.loads.force - force},
-            prescribed=system.step.prescribed.mask[:n].copy(),
+            forces={"loads": -equations.step.loads.force, "internal": equations.step.loads.force - force},
+            prescribed=equations.step.prescribed.mask[:n].copy(),
             snes_reason=0,
             ksp_reason=0,
             linear_residuals=np.empty(0),
@@ -524,25 +524,28 @@ class Equilibrium:
 
     def _out_of_balance(self, before: float, factor: float) -> tuple[float, float]:
         """Norm [N] of the out-of-balance force, and the largest acceleration [m/s²] by it; collective."""
-        system = self._system
-        system.begin_step(before, factor)
-        force = system.out_of_balance()
+        equations = self._equations
+        equations.begin_step(before, factor)
+        force = equations.out_of_balance()
         norm = self._norm(force)
         if not np.isfinite(norm):  # an obstacle has moved into the sheet
             return norm, 0.0
-        n = system.points.n_vertices
-        fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
-        if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
-            mass = system.points.global_sum(float(system.mass.sum()))[0] / system.points.n_vertices_global
+        n = equations.points.n_vertices
+        fastest = float(np.abs(force[:n] / equations.mass[:n, None]).max(initial=0.0))
+        if equations.points.n_edges_global:  # loads may act on edges alone, which have no mass
+            mass = (
+                equations.points.global_sum(float(equations.mass.sum()))[0]
+                / equations.points.n_vertices_global
+            )
             fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
-        return norm, system.points.comm.allreduce(fastest, MPI.MAX)
+        return norm, equations.points.comm.allreduce(fastest, MPI.MAX)
 
     def _largest_force(self) -> float:
         """Norm [N] of the largest part of the forces here and in all equilibria found; collective.
 
         Not that on the way to them: in a snap it may be 1e5 times as large.
         """
-        return max(self._scale, self._system.forces.largest_force())
+        return max(self._scale, self._equations.forces.largest_force())
 
     def _record(self, factor: float) -> None:
         """Record that the present state is the equilibrium at load factor ``factor``; collective."""
@@ -555,10 +558,10 @@ class Equilibrium:
         """
         if force <= self._tolerances.force_tolerance * self._largest_force():
             return True
-        return PROGRESS * last <= force <= max(self._floor, limit_roundoff(self._system))
+        return PROGRESS * last <= force <= max(self._floor, limit_roundoff(self._equations))
 
     def _norm(self, vector: Array) -> float:
-        return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
+        return float(np.sqrt(self._equations.points.comm.allreduce(float(np.vdot(vector, vector)))))
 
 
 def _note(found: Stability, followed: int, message: str) -> str:

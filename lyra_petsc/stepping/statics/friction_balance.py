@@ -59,10 +59,10 @@ class FrictionBalance:
         Whether so many load steps failed with sliding that a smaller one would not help.
     """
 
-    def __init__(self, system: StageEquations, spacing: float, end: float) -> None:
-        self._system, self._spacing = system, spacing
+    def __init__(self, equations: StageEquations, spacing: float, end: float) -> None:
+        self._equations, self._spacing = equations, spacing
         self._longest = end / LANDING_PARTS
-        self._acts = system.contact is not None and system.contact.friction is not None
+        self._acts = equations.contact is not None and equations.contact.friction is not None
         self.lag, self.is_rough, self.lands = 0.0, False, False
         self._rounds = self._sliding_steps = 0
         self._sliding_increment = 0.0  # the last increment of the load factor in which all slid
@@ -75,23 +75,23 @@ class FrictionBalance:
         """Begin a load step at the present positions."""
         self.lag, self.is_rough, self.lands = 0.0, False, False
         self._rounds, self._landed_heat, self._start = 0, 0.0, None
-        system = self._system
-        self._begin = system.x[: system.points.n_owned].copy()
-        self.contacts = system.active.contact_state()
+        equations = self._equations
+        self._begin = equations.x[: equations.points.n_owned].copy()
+        self.contacts = equations.active.contact_state()
 
     def lags(self, begin: Array) -> bool:
         """Whether points slipped too far in the solve from positions ``begin`` (n_owned, 3) [m]; collective.
 
         Friction may have been far from what the normal forces allow.
         """
-        if not (self._acts and self._system.near):
+        if not (self._acts and self._equations.near):
             return False
-        x, points = self._system.x, self._system.points
+        x, points = self._equations.x, self._equations.points
         displacement = x.copy()
         displacement[: len(begin)] -= begin
         points.update_ghosts(displacement)
         slip, normal = points.global_sum(
-            *self._system.active.slip_under_changed_forces(x, displacement, self._system.step.frozen)
+            *self._equations.active.slip_under_changed_forces(x, displacement, self._equations.step.frozen)
         )
         return bool(slip > MAX_SLIP * self._spacing * normal)
 
@@ -100,26 +100,30 @@ class FrictionBalance:
 
         In the first such state slip begins to count from the start of the load step.
         """
-        system = self._system
+        equations = self._equations
         self.lag = self._sums()[0]
         self._rounds += 1
         if self._start is not None:
             return self.lag <= LAG or (self.lag <= ROUGH_LAG and self._rounds > MAX_ROUNDS)
         settled = self.lag <= ROUGH_LAG or self._rounds > MAX_ROUNDS
-        if not (settled and self._acts and system.near):
+        if not (settled and self._acts and equations.near):
             return settled
         self._start, self._rounds = (self._begin, self.contacts), 0
-        self._first = system.x[: system.points.n_owned].copy(), system.active.contact_state(), self.lag
+        self._first = (
+            equations.x[: equations.points.n_owned].copy(),
+            equations.active.contact_state(),
+            self.lag,
+        )
         return False
 
     def accept_substep(self) -> None:
         """Accept the part of the load step that ends at the present positions; collective."""
-        system, start = self._system, self._start
+        equations, start = self._equations, self._start
         if start is not None:  # the search for pairs may have added ghosts since
-            x = resized(start[0], system.points.n_owned, system.points.n_local)
-            system.points.update_ghosts(x)
+            x = resized(start[0], equations.points.n_owned, equations.points.n_local)
+            equations.points.update_ghosts(x)
             start = x, start[1]
-        self._landed = system.active.accept_substep(system.x, system.step.frozen, start)
+        self._landed = equations.active.accept_substep(equations.x, equations.step.frozen, start)
 
     def keeps_first_state(self, *, failed: bool) -> bool:
         """Go back to the first state in balance, and return True, if corrections from there fail; collective.
@@ -129,9 +133,9 @@ class FrictionBalance:
         if self._start is None or not (failed or self._rounds > MAX_ROUNDS):
             return False
         x, contacts, self.lag = self._first
-        self._system.state.set(x, np.zeros_like(x))
-        transport_frames(self._system)
-        self._system.active.restore_contacts(contacts)
+        self._equations.state.set(x, np.zeros_like(x))
+        transport_frames(self._equations)
+        self._equations.active.restore_contacts(contacts)
         self.is_rough = True
         return True
 
@@ -141,15 +145,15 @@ class FrictionBalance:
         ``limited``: it may be repeated.
         """
         if self._start is not None:
-            heat, landed, force = self._system.points.global_sum(*self._landed).tolist()
+            heat, landed, force = self._equations.points.global_sum(*self._landed).tolist()
             self._landed_heat = heat
             self.lands = limited and increment > self._longest and landed > MAX_LANDED * force
 
     def _elastic_energy(self) -> float:
-        system, frozen = self._system, self._system.step.frozen
-        terms = [term for term in system.active.elastic if term not in system.active.sliding]
-        energy = sum(float(term.energies(system.x, frozen[term]).sum()) for term in terms)
-        return float(system.points.global_sum(energy)[0])
+        equations, frozen = self._equations, self._equations.step.frozen
+        terms = [term for term in equations.active.elastic if term not in equations.active.sliding]
+        energy = sum(float(term.energies(equations.x, frozen[term]).sum()) for term in terms)
+        return float(equations.points.global_sum(energy)[0])
 
     def note(self) -> str:
         """What is not known of friction at the end, or an empty text; collective."""
@@ -200,10 +204,10 @@ class FrictionBalance:
 
     def _sums(self) -> tuple[float, str]:
         """Error of the friction as in `lag`, and the text of `sliding_message`; collective."""
-        sums = self._system.active.friction_lag(self._system.x, self._system.step.frozen)
+        sums = self._equations.active.friction_lag(self._equations.x, self._equations.step.frozen)
         if not sums:
             return 0.0, ""
-        each = self._system.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)
+        each = self._equations.points.global_sum(*np.concatenate(list(sums.values()))).reshape(-1, 3)
         slides = [
             f"it slides on {name}" if name else "sheets slide on each other"
             for name, (_, friction, allowed) in zip(sums, each, strict=True)

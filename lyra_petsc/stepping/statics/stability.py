@@ -73,28 +73,30 @@ class Stability:
         } | ({"stability_unknown": self.reason} if self.reason else {})
 
 
-def add_exact_hessian(system: StageEquations, values: Array) -> FollowingLoads:
+def add_exact_hessian(equations: StageEquations, values: Array) -> FollowingLoads:
     """Add the exact Hessian [N/m] of all energies at the state to block rows (n_blocks, 3, 3).
 
     The symmetric part of the stiffness of loads that follow the shape, which are returned, is added, too.
     Prescribed unknowns are not decoupled.
     """
-    rows, active = system.discretisation.rows, system.active
+    rows, active = equations.discretisation.rows, equations.active
     for term in active.elastic:
-        rows.add_stiffness(term, system.x, system.step.frozen[term], 0.0, 1.0, values)
+        rows.add_stiffness(term, equations.x, equations.step.frozen[term], 0.0, 1.0, values)
 
     def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
         if isinstance(term, Load):
-            term.add_force_on_vertices(x, system.step.start, system.step.end, out)
+            term.add_force_on_vertices(x, equations.step.start, equations.step.end, out)
         else:
             against = np.zeros_like(out)
-            step = UpcomingStep(system.step.start, system.step.end, system.step.end, x, system.reference.at)
+            step = UpcomingStep(
+                equations.step.start, equations.step.end, equations.step.end, x, equations.reference.at
+            )
             term.add_gradient(np.zeros_like(x), term.freeze(step), against)
             out -= against
 
     following = [*active.following, *active.viscous]
-    loads = FollowingLoads(following, system.x, force_of, system.load_case.factor)
+    loads = FollowingLoads(following, equations.x, force_of, equations.load_case.factor)
     loads.add_hessian(1.0, rows.pattern, values)
     return loads
 
@@ -104,13 +106,13 @@ class Examination:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     size : float
         Diagonal of the mesh's bounding box [m].
     """
 
-    def __init__(self, system: StageEquations, size: float) -> None:
-        self._system, self._reason, points = system, "", system.points
+    def __init__(self, equations: StageEquations, size: float) -> None:
+        self._equations, self._reason, points = equations, "", equations.points
         self._inertia: Inertia | None = None
         if not PETSc.Sys.hasExternalPackage("mumps"):
             self._reason = "this PETSc has no MUMPS, whose factors give the inertia"
@@ -123,20 +125,20 @@ class Examination:
             self._inertia = self._assemble(size)
 
     def _assemble(self, size: float) -> Inertia:
-        system, points = self._system, self._system.points
+        equations, points = self._equations, self._equations.points
         n = points.n_owned
-        system.update_pattern()
-        values = system.discretisation.rows.zeros()
-        loads = add_exact_hessian(system, values)
-        held, unbalanced = system.step.prescribed.mask, system.out_of_balance()
-        sheet = next(term for term in system.active.elastic if isinstance(term, Membrane))
-        rigid = rigid_motions(points, sheet.stencil, system.x, held, size)
+        equations.update_pattern()
+        values = equations.discretisation.rows.zeros()
+        loads = add_exact_hessian(equations, values)
+        held, unbalanced = equations.step.prescribed.mask, equations.out_of_balance()
+        sheet = next(term for term in equations.active.elastic if isinstance(term, Membrane))
+        rigid = rigid_motions(points, sheet.stencil, equations.x, held, size)
         square = points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]
-        force = float(np.sqrt(square)) + LOADS * system.forces.largest_force()
+        force = float(np.sqrt(square)) + LOADS * equations.forces.largest_force()
         # forces f at vertices turned by an angle θ do the work ½ θ² f · x, at most
         doubt = force * float(np.sqrt(points.n_vertices_global)) / size
         skew = np.array([np.where(held[:n], 0.0, -loads.skew_force(motion, n)) for motion in rigid])
-        return Inertia(points, system.discretisation.rows.pattern, values, held, rigid, skew, doubt)
+        return Inertia(points, equations.discretisation.rows.pattern, values, held, rigid, skew, doubt)
 
     @cached_property
     def stability(self) -> Stability:
@@ -162,14 +164,14 @@ class Examination:
 
     def is_wrinkle(self, mode: Array) -> bool:
         """Whether a mode is mostly on vertices without bending stiffness."""
-        system = self._system
-        stiff = np.zeros(system.points.n_local, dtype=bool)
-        for term in system.active.elastic:
+        equations = self._equations
+        stiff = np.zeros(equations.points.n_local, dtype=bool)
+        for term in equations.active.elastic:
             if term.registration.bends:
                 stiff[term.stencil] = True
-        n = system.points.n_vertices
+        n = equations.points.n_vertices
         square = (mode[:n] ** 2).sum(axis=1)
-        on_stiff, total = system.points.global_sum(float(square[stiff[:n]].sum()), float(square.sum()))
+        on_stiff, total = equations.points.global_sum(float(square[stiff[:n]].sum()), float(square.sum()))
         return bool(on_stiff < MIN_BENDING * total)
 
     def __enter__(self) -> Self:

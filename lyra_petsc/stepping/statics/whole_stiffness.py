@@ -27,7 +27,7 @@ class WholeStiffness:
 
     Parameters
     ----------
-    system : StageEquations
+    equations : StageEquations
     tangent : callable
         As `Stepper.tangent`.
     examine : callable
@@ -38,48 +38,48 @@ class WholeStiffness:
 
     def __init__(
         self,
-        system: StageEquations,
+        equations: StageEquations,
         tangent: Callable[[Array], tuple[Array | None, int]],
         examine: Callable[[], Examination],
         balanced: Callable[[float, float], bool],
     ) -> None:
-        self._system, self._tangent, self._examine, self._balanced = system, tangent, examine, balanced
+        self._equations, self._tangent, self._examine, self._balanced = equations, tangent, examine, balanced
 
     def find(self, before: float, factor: float, guess: Array) -> Attempt | None:
         """Find the equilibrium at load factor ``factor`` from a guess of its positions (n_owned, 3) [m].
 
         Returns None, with the state restored, if Newton's method fails or the equilibrium is unstable.
         """
-        system, n = self._system, self._system.points.n_owned
-        if system.active.viscous or system.active.limiting or system.contact is not None:
+        equations, n = self._equations, self._equations.points.n_owned
+        if equations.active.viscous or equations.active.limiting or equations.contact is not None:
             return None
-        x = system.x[:n].copy()
-        system.begin_step(before, factor)
-        frozen, last = system.step.frozen, np.inf
-        held = system.step.prescribed
+        x = equations.x[:n].copy()
+        equations.begin_step(before, factor)
+        frozen, last = equations.step.frozen, np.inf
+        held = equations.step.prescribed
         held.overwrite(guess, held.goal)
         self._set_positions(guess)
         for iteration in range(MAX_ITERATIONS):
-            system.begin_step(before, factor)
-            unbalanced = system.out_of_balance()
-            force = float(np.sqrt(system.points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]))
+            equations.begin_step(before, factor)
+            unbalanced = equations.out_of_balance()
+            force = float(np.sqrt(equations.points.global_sum(float(np.vdot(unbalanced, unbalanced)))[0]))
             if iteration > 0 and self._balanced(force, last):
                 if not self._is_stable(factor):
                     break
-                system.evaluate_at_start()
+                equations.evaluate_at_start()
                 return Attempt(True, iteration, 0, force)
             displacement = self._displacement_by_force(unbalanced, factor) if np.isfinite(force) else None
             if displacement is None or force > MAX_GROWTH * last:
                 break
             last = force
-            self._set_positions(system.x[:n] + displacement)
-        system.state.set(x, np.zeros_like(x))
-        transport_frames(system, frozen)
+            self._set_positions(equations.x[:n] + displacement)
+        equations.state.set(x, np.zeros_like(x))
+        transport_frames(equations, frozen)
         return None
 
     def _set_positions(self, x: Array) -> None:
-        self._system.state.set(x, np.zeros_like(x))
-        transport_frames(self._system)
+        self._equations.state.set(x, np.zeros_like(x))
+        transport_frames(self._equations)
 
     def _is_stable(self, factor: float) -> bool:
         """Whether the equilibrium is stable, or stability is not known; collective."""
@@ -95,12 +95,12 @@ class WholeStiffness:
         With one negative eigenvalue of S the determinant of all of the stiffness K has the sign of uᵀK⁻¹u, as
         the rest of S, and so of K, is positive definite; collective.
         """
-        if mode is None or found.negative != 1 or self._system.active.viscous:
+        if mode is None or found.negative != 1 or self._equations.active.viscous:
             return False
         response = self._displacement_by_force(mode, factor)
         if response is None:
             return False
-        return bool(self._system.points.global_sum(float(np.vdot(mode, response)))[0] > 0.0)
+        return bool(self._equations.points.global_sum(float(np.vdot(mode, response)))[0] > 0.0)
 
     def _displacement_by_force(self, force: Array, factor: float) -> Array | None:
         """Displacement (n_owned, 3) [m] for a force (n_owned, 3) [N] by the whole stiffness; collective."""
@@ -120,7 +120,7 @@ class WholeStiffness:
         return self._newton_displacement(force, loads, solve), linear
 
     def _newton_displacement(self, force: Array, loads: FollowingLoads, solve: Solve) -> Array | None:
-        comm = self._system.points.comm
+        comm = self._equations.points.comm
         return newton_displacement(force, solve, lambda u: self.skew_force(loads, u), comm)
 
     def linearise_loads(self, before: float, factor: float) -> FollowingLoads:
@@ -129,14 +129,14 @@ class WholeStiffness:
         def force_of(load: Load, x: Array, out: Array) -> None:
             load.add_force_on_vertices(x, before, factor, out)
 
-        return FollowingLoads(self._system.active.following, self._system.x, force_of, factor)
+        return FollowingLoads(self._equations.active.following, self._equations.x, force_of, factor)
 
     def skew_force(self, loads: FollowingLoads, u: Array) -> Array:
         """Force (n_owned, 3) [N] of the skew part on free unknowns for a displacement (n_owned, 3) [m];
         collective.
         """
-        system = self._system
-        local = np.zeros_like(system.x)
+        equations = self._equations
+        local = np.zeros_like(equations.x)
         local[: len(u)] = u
-        system.points.update_ghosts(local)
-        return np.where(system.step.prescribed.free, loads.skew_force(local, len(u)), 0.0)
+        equations.points.update_ghosts(local)
+        return np.where(equations.step.prescribed.free, loads.skew_force(local, len(u)), 0.0)

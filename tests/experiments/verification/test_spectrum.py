@@ -32,10 +32,10 @@ def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
     stiffness = np.zeros((n, 3, n, 3))
     for term in problem.terms.values():
         if isinstance(term, Elastic):
-            blocks = blocks_of(term, problem.system.x, problem.system.step.frozen[term])
+            blocks = blocks_of(term, problem.equations.x, problem.equations.step.frozen[term])
             stiffness += summed(term.stencil, blocks, n)
-    free = ~problem.system.held.mask(0.0, 0.0, n).ravel()
-    root = np.sqrt(np.repeat(problem.system.mass, 3))[free]
+    free = ~problem.equations.held.mask(0.0, 0.0, n).ravel()
+    root = np.sqrt(np.repeat(problem.equations.mass, 3))[free]
     matrix = stiffness.reshape(3 * n, 3 * n)[np.ix_(free, free)] / np.outer(root, root)
     return np.linalg.eigvalsh(matrix)
 
@@ -61,14 +61,14 @@ def test_massless_edges_are_condensed(comm: MPI.Comm) -> None:
         problem = trial.simulation.problem
         n, layout = problem.points.n_owned, problem.points
         values = problem.discretisation.rows.zeros()
-        add_exact_hessian(problem.system, values)
+        add_exact_hessian(problem.equations, values)
         matrix = expanded(problem.pattern, values, n).reshape(3 * n, 3 * n)
         heights, edges = 3 * np.arange(layout.n_vertices) + 2, layout.edge_indices
         across = matrix[np.ix_(heights, edges)]
         condensed = matrix[np.ix_(heights, heights)] - across @ np.linalg.solve(
             matrix[np.ix_(edges, edges)], across.T
         )
-        root = np.sqrt(problem.system.mass[: layout.n_vertices])
+        root = np.sqrt(problem.equations.mass[: layout.n_vertices])
         exact = np.linalg.eigvalsh(condensed / np.outer(root, root))[:6]
     with Bench(comm) as bench, bench.simulation(content) as trial:
         squares, _ = lowest_squares(trial, 6, shift=10.0)

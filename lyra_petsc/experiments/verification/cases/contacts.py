@@ -277,7 +277,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
     names += ["angular momentum", "momentum", "energy"]
     largest = np.zeros(len(names))
     with bench.simulation(content) as trial:
-        system, contact = trial.simulation.problem.system, trial.simulation.problem.terms["contact"]
+        equations, contact = trial.simulation.problem.equations, trial.simulation.problem.terms["contact"]
         assert isinstance(contact, ContactBarrier)
         friction_term = trial.simulation.problem.terms.get("friction", contact)
         assert isinstance(friction_term, Elastic)
@@ -290,8 +290,8 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
             return np.stack([momentum, np.cross(trial.x, momentum)])
 
         def imbalance(term: Elastic, x: Array, points: Array) -> list[float]:
-            gradient = np.zeros((system.points.n_local, 3))
-            term.add_gradient(x, system.step.frozen[term], gradient)
+            gradient = np.zeros((equations.points.n_local, 3))
+            term.add_gradient(x, equations.step.frozen[term], gradient)
             forces = trial.gather(gradient)
             each = np.stack([forces, np.cross(points, forces)])
             resultant = np.abs(each.sum(axis=1)).max(axis=1)
@@ -302,7 +302,7 @@ def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> dict[st
         while not trial.simulation.finished:
             begin = trial.x
             trial.step()
-            x = system.evaluated.x
+            x = equations.evaluated.x
             now = imbalance(contact, x, trial.gather(x))
             now += imbalance(friction_term, x, begin) if friction else []
             momentum, angular = np.abs(momenta().sum(axis=1) - before).max(axis=1) / sizes

@@ -54,7 +54,7 @@ def hinges_of(trial: Trial) -> PlateHinges:
     problem = trial.simulation.problem
     term = next(term for term in problem.terms.values() if isinstance(term, Bending))
     n = term.n_owned
-    slopes = _slopes(problem.system.x[term.stencil[:n], :2])
+    slopes = _slopes(problem.equations.x[term.stencil[:n], :2])
     slopes *= np.sqrt(2.0 * term.elements.data["k"][:n, None])
     mine = (term.elements.index[:n], problem.points.mesh_vertex_of_local()[term.stencil[:n]], slopes)
     index, stencil, slopes = map(np.concatenate, zip(*problem.points.comm.allgather(mine), strict=True))

@@ -96,16 +96,16 @@ def _of_state(trial: Trial, gradient: Array, c: dict[str, float]) -> list[Measur
     membrane, points = problem.membrane, problem.points
     exact, stored = answer(gradient, c)
     stiffness, area = max(c["c11"], c["c22"]), BASE * HEIGHT
-    energy = trial.sum_over_ranks(membrane.energies(problem.system.x)) / area
+    energy = trial.sum_over_ranks(membrane.energies(problem.equations.x)) / area
     force = np.zeros((points.n_local, 3))
-    membrane.add_gradient(problem.system.x, None, force)
+    membrane.add_gradient(problem.equations.x, None, force)
     x, y = trial.start.T[:2]
     inner = (x > NEAR) & (x < BASE - NEAR) & (y > NEAR) & (y < HEIGHT - NEAR)
     residual = np.abs(trial.gather(force)[inner]).max(initial=0.0)
     scale = float(max(stiffness, *np.abs(exact)))
     # force [N] of one triangle of mean size on a vertex
     nodal = scale * float(np.sqrt(area / problem.whole.n_triangles))
-    mine = membrane.strain_and_stress(problem.system.x)[1][: membrane.n_owned]
+    mine = membrane.strain_and_stress(problem.equations.x)[1][: membrane.n_owned]
     stress = np.concatenate(points.comm.allgather(mine))
     measured = [
         Measured("energy per area", energy, stored, "J/m²", max(stiffness, stored)),
@@ -145,7 +145,7 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
             exact = vertices * [along, across, 0.0]
             off = float(np.abs(trial.x - exact).max())
             force = np.zeros((problem.points.n_local, 3))
-            problem.membrane.add_gradient(problem.system.x, None, force)
+            problem.membrane.add_gradient(problem.equations.x, None, force)
             end = vertices[:, 0] > BASE - NEAR
             found = float(trial.gather(force)[end, 0].sum()) / HEIGHT
         name = f"{material}, stretched by {along:g}"

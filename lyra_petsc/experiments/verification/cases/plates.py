@@ -111,7 +111,7 @@ def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
 
 def _curvatures(bench: Bench, trial: Trial) -> Array:
     """κ11, κ22, κ12 [1/m] of all triangles (F, 3); collective."""
-    term, x = trial.simulation.problem.terms["midedge"], trial.simulation.problem.system.x
+    term, x = trial.simulation.problem.terms["midedge"], trial.simulation.problem.equations.x
     assert isinstance(term, MidEdge)
     return np.concatenate(bench.comm.allgather(term.curvatures(x, term.frames)[: term.n_owned]))
 
