@@ -153,12 +153,12 @@ def verify(
     from lyra_petsc.experiments.verification.verification_case import VerificationView
 
     if listed:
-        return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
-    cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
+        return _list(comm, CASES.all(), f"{len(CASES.entries)} cases")
+    cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.entries)]
     again = command(comm, "verify", [*names, *to_arguments({"--quick": quick})])
     results = Results(comm, out, VerificationView(), ranks=comm.size, command=again, force=force)
     run = partial(verification_case.run_case, comm, quick=quick, watch=stop_check(comm))
-    return _run(comm, results, cases, run, len(CASES.modules))
+    return _run(comm, results, cases, run, len(CASES.entries))
 
 
 def stress(

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,40 +150,38 @@ def read_record(path: Path, kind: type[T]) -> T | None:
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Case names of the command line, in listing order, and the modules that define the cases.
+    """Cases by the names of the command line, in listing order, made on demand.
 
     Attributes
     ----------
-    package : str
-        The package that holds the modules.
-    modules : mapping of name → module
-        Entry ``some-name`` is the variable ``some_name`` of its module.
+    entries : mapping of name → any
+        What a case is made of.
+    make : callable (name, entry) → case
     """
 
-    package: str
-    modules: Mapping[str, str]
+    entries: Mapping[str, Any]
+    make: Callable[[str, Any], T]
 
     def load(self, name: str) -> T:
-        """The entry of that name.
+        """The case of that name.
 
         Raises
         ------
         InputError
             For an unknown name; the message suggests the nearest known one.
         """
-        if name not in self.modules:
-            raise InputError(f"unknown case, {suggest(name, self.modules)}", key=name)
-        module = import_module(f"{self.package}.{self.modules[name]}")
-        return cast(T, getattr(module, name.replace("-", "_")))
+        if name not in self.entries:
+            raise InputError(f"unknown case, {suggest(name, self.entries)}", key=name)
+        return self.make(name, self.entries[name])
 
     def all(self) -> list[T]:
-        """Every entry, in listing order."""
-        return [self.load(name) for name in self.modules]
+        """Every case, in listing order."""
+        return [self.load(name) for name in self.entries]
 
 
-def module_by_name(*modules: tuple[str, str]) -> dict[str, str]:
-    """`Registry.modules` from pairs of a module and the names that it defines, separated by blanks."""
-    return {name: module for module, names in modules for name in names.split()}
+def member(module: str, name: str) -> Any:
+    """The variable ``some_name`` of a module for the name ``some-name``; imports the module."""
+    return getattr(import_module(module), name.replace("-", "_"))
 
 
 Watch = Callable[[], None]

@@ -13,13 +13,13 @@ from lyra_petsc.experiments.verification.cases import CASES
 
 def test_list_names_every_case(tmp_path: Path) -> None:
     left = done(["verify", "--list"], tmp_path)
-    assert [line.split()[0] for line in left.out.splitlines()] == list(CASES.modules)
-    assert f"{len(CASES.modules)} cases" in left.err
+    assert [line.split()[0] for line in left.out.splitlines()] == list(CASES.entries)
+    assert f"{len(CASES.entries)} cases" in left.err
 
 
 def test_a_case_passes(tmp_path: Path) -> None:
     left = done(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, 2)
-    assert f"2 of {len(CASES.modules)} cases\n" in left.out
+    assert f"2 of {len(CASES.entries)} cases\n" in left.out
     assert "2 of 2 cases passed" in left.out
     assert "order 1.00, as expected 1" in left.out
     assert "exact [m]" in left.out

@@ -49,7 +49,7 @@ def test_passed_and_failed_outcomes() -> None:
 
 @pytest.mark.parametrize("registry", [CASES, FAMILIES])
 def test_every_name_of_a_registry_is_an_entry_of_that_name(registry: Registry[Any]) -> None:
-    assert [entry.name for entry in registry.all()] == list(registry.modules)
+    assert [entry.name for entry in registry.all()] == list(registry.entries)
 
 
 def test_an_unknown_name_is_refused_with_the_nearest() -> None:

@@ -85,7 +85,7 @@ DENSITY = 1.0
 """kg/m²"""
 
 
-def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> dict[str, Any]:
+def hinged_strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> dict[str, Any]:
     """Static scene of a strip with n square cells along it, clamped at one end.
 
     ``more`` are further keys of the scene; entries of ``material`` are added.

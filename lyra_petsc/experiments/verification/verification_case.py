@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
 from importlib.resources import files
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -60,71 +60,46 @@ class ErrorRow:
     problem: str = ""
 
 
-class Claim(ABC):
-    """A claim about the rows of one quantity."""
-
-    #: whether errors are large enough for an order of convergence
-    has_order: ClassVar[bool] = True
-
-    @abstractmethod
-    def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
-        """The verdict on one or more rows without problems, coarsest first.
-
-        ``finest`` is h of the finest resolution of the case, which a quick run does not reach.
-        """
-
-
 @dataclass(frozen=True)
-class Exact(Claim):
-    """At every resolution the error is at most ``bound``: round-off and the tolerance of the solver."""
+class Claim:
+    """A claim about the errors of one quantity.
 
-    has_order: ClassVar[bool] = False
-
-    bound: float = 1e-10
-
-    def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
-        worst = max(rows, key=_error_or_infinity)
-        good = worst.error <= self.bound
-        text = f"largest error {worst.error:.1e}, " + ("within" if good else "above")
-        return Verdict(good, f"{text} {self.bound:.0e}")
-
-
-@dataclass(frozen=True)
-class Converges(Claim):
-    """The error decreases with ``order`` in h, ± ``slack``, to at most ``bound`` at the finest resolution.
-
-    The order is that between the two finest rows; with an infinite slack no order is claimed. If a quick run
-    stops at a larger h, the bound grows with h to the power of the order.
+    Attributes
+    ----------
+    exact : float or None
+        Bound of the error at every resolution: round-off and the tolerance of the solver.
+    order : float or None
+        Order in h between the two finest resolutions, ± ``slack``.
+    within : float
+        Bound of the error at the finest resolution of the case. A quick run, which does not reach it, may
+        have the larger error of the ``order``, or of the order ``growth`` where none is claimed.
     """
 
-    order: float
-    bound: float
+    exact: float | None = None
+    order: float | None = None
     slack: float = 0.25
+    within: float = math.inf
+    growth: float = 2.0
 
     def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
+        """The verdict on one or more rows without problems, coarsest first; ``finest`` is the last h."""
         last = rows[-1]
-        bound = self.bound * max(1.0, last.h / finest) ** self.order
-        small = last.error <= bound
-        parts = [f"error {last.error:.1e} at n = {last.n:g}, {'within' if small else 'above'} {bound:.1e}"]
-        right = True
-        if len(rows) > 1 and self.slack < math.inf:
+        if self.exact is not None:
+            error = max(math.inf if math.isnan(row.error) else row.error for row in rows)
+            good = error <= self.exact
+            return Verdict(
+                good, f"largest error {error:.1e}, {'within' if good else 'above'} {self.exact:.0e}"
+            )
+        growth = self.growth if self.order is None else self.order
+        bound = self.within * max(1.0, last.h / finest) ** growth
+        good = last.error <= bound
+        text = f"error {last.error:.1e} at n = {last.n:g}, {'within' if good else 'above'} {bound:.1e}"
+        if len(rows) > 1 and self.order is not None:
             right = abs(last.order - self.order) <= self.slack
             expected = f"{'as' if right else 'not the'} expected {self.order:g} ± {self.slack:g}"
-            parts.append(f"order {last.order:.2f}, {expected}")
-        return Verdict(small and right, "; ".join(parts))
-
-
-def at_finest(bound: float) -> Converges:
-    """At the finest resolution the error is at most ``bound``; at a larger h (h / finest)² times as much.
-
-    No order is claimed: strips that bend within one or two cells, and criss-cross meshes whose membrane
-    resists the dimple in every cell, converge faster on coarse meshes than on fine ones.
-    """
-    return Converges(2.0, bound, slack=math.inf)
-
-
-def _error_or_infinity(row: ErrorRow) -> float:
-    return math.inf if math.isnan(row.error) else row.error
+            text += f"; order {last.order:.2f}, {expected}"
+            good &= right
+        return Verdict(good, text)
 
 
 def observed_order(before: ErrorRow, row: ErrorRow) -> float:
@@ -162,15 +137,15 @@ class Measured:
         return abs(self.value - self.exact) / scale
 
 
-def vector_error(quantity: str, found: Array, exact: Array, unit: str = "1") -> Measured:
+def vector_error(quantity: str, vector: Array, exact: Array, unit: str = "1") -> Measured:
     """The norm of the error of a vector, relative to the norm of the exact one."""
     size = float(np.linalg.norm(exact))
-    return Measured(quantity, size + float(np.linalg.norm(found - exact)), size, unit)
+    return Measured(quantity, size + float(np.linalg.norm(vector - exact)), size, unit)
 
 
-def worst(found: Iterable[Sequence[Measured]]) -> list[Measured]:
-    """For each quantity the measurement with the largest error; each entry of ``found`` has all of them."""
-    return [max(each, key=lambda one: one.error) for each in zip(*found, strict=True)]
+def worst(samples: Iterable[Sequence[Measured]]) -> list[Measured]:
+    """For each quantity the measurement with the largest error; every sample has all of them."""
+    return [max(values, key=lambda one: one.error) for values in zip(*samples, strict=True)]
 
 
 Measure = Callable[[Bench, float], Iterable[Measured]]
@@ -178,7 +153,7 @@ Measure = Callable[[Bench, float], Iterable[Measured]]
 
 @dataclass(frozen=True)
 class VerificationCase(Case):
-    """A problem with a known solution; the decorator `case` makes one from a function that measures it.
+    """A problem with a known solution, an entry of ``cases.yaml``.
 
     Attributes
     ----------
@@ -188,36 +163,25 @@ class VerificationCase(Case):
     source : str
         Source of the solution.
     resolutions : sequence of float
-        Resolutions n, coarsest first.
-    claim : Claim
-        Claim about every quantity.
-    claims : mapping of quantity → Claim
-        Exceptions from ``claim``.
+        Resolutions n, coarsest first; orders of convergence are with respect to h = 1/n.
+    claims : mapping of pattern → Claim
+        Claims about quantities; the first pattern that fits counts.
     quick : int
         Number of resolutions of ``--quick``, from the coarsest.
     counts : str
         What n counts.
-    size : callable n → h
-        The length or time h; orders of convergence are with respect to it.
     """
 
     measure: Measure
     source: str
     resolutions: Sequence[float]
-    claim: Claim
-    claims: Mapping[str, Claim] = field(default_factory=dict)
+    claims: Mapping[str, Claim]
     quick: int = 2
     counts: str = "cells along the side"
-    size: Callable[[float], float] = lambda n: 1.0 / n
 
     def claim_of(self, quantity: str) -> Claim:
         """The claim about a quantity."""
-        return self.claims.get(quantity, self.claim)
-
-
-def case(title: str, **more: Any) -> Callable[[Measure], VerificationCase]:
-    """Decorator that makes a case of a function, named as the function; ``more`` as of `VerificationCase`."""
-    return lambda measure: VerificationCase(measure.__name__.replace("_", "-"), title, measure, **more)
+        return next(claim for pattern, claim in self.claims.items() if fnmatchcase(quantity, pattern))
 
 
 def load_data(name: str) -> dict[str, Any]:
@@ -269,10 +233,10 @@ class VerificationOutcome(Outcome[VerificationCase]):
 
     def tables(self) -> dict[str, list[ErrorRow]]:
         """The rows of each quantity, in the order of measurement."""
-        found: dict[str, list[ErrorRow]] = {}
+        tables: dict[str, list[ErrorRow]] = {}
         for row in self.rows:
-            found.setdefault(row.quantity, []).append(row)
-        return found
+            tables.setdefault(row.quantity, []).append(row)
+        return tables
 
 
 def run_case(
@@ -308,13 +272,13 @@ def run_case(
                 problems.append(row)
                 continue
             table = tables.setdefault(row.quantity, [])
-            if table and case.claim_of(row.quantity).has_order:
+            if table and case.claim_of(row.quantity).exact is None:
                 row.order = observed_order(table[-1], row)
             table.append(row)
     outcome = VerificationOutcome(case)
     for quantity, table in tables.items():
         outcome.rows += table
-        outcome.verdicts[quantity] = case.claim_of(quantity).judge(table, case.size(case.resolutions[-1]))
+        outcome.verdicts[quantity] = case.claim_of(quantity).judge(table, 1.0 / case.resolutions[-1])
     if problems:
         outcome.rows += problems
         outcome.verdicts[problems[0].quantity] = Verdict(
@@ -329,7 +293,7 @@ def _measure_rows(
 ) -> list[ErrorRow]:
     """The rows of one resolution; if it cannot run to its end, also a row with the reason."""
     comm.Barrier()
-    began, h = time.perf_counter(), case.size(n)
+    began, h = time.perf_counter(), 1.0 / n
     rows: list[ErrorRow] = []
     problem, seen, spent = "", (0, 0), (0, 0.0)
     with Bench(comm, watch) as bench:
@@ -438,7 +402,7 @@ def _figures(report: Report, outcome: VerificationOutcome) -> None:
     tables = {
         quantity: rows
         for quantity, rows in outcome.tables().items()
-        if case.claim_of(quantity).has_order and len(rows) > 1 and not any(row.problem for row in rows)
+        if case.claim_of(quantity).exact is None and len(rows) > 1 and not any(row.problem for row in rows)
     }
     drawn: tuple[tuple[str, str, str, Callable[..., Drawing]], ...] = (
         ("h", "h", "h", convergence), ("wall_seconds", "run time", "run time [s]", work_precision),

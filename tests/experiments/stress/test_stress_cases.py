@@ -47,10 +47,10 @@ def scene(tmp_path: Path) -> Path:
 
 def test_names_are_unique_and_cases_have_titles() -> None:
     found = FAMILIES.all()
-    assert [family.name for family in found] == list(FAMILIES.modules)
+    assert [family.name for family in found] == list(FAMILIES.entries)
     names = [case.name for family in found for case in family.cases]
     assert len(names) == len(set(names))
-    assert not set(names) & set(FAMILIES.modules)
+    assert not set(names) & set(FAMILIES.entries)
     assert all(family.title and all(case.title for case in family.cases) for family in found)
 
 
@@ -59,7 +59,7 @@ def test_levels_are_nested_and_the_usual_one_has_every_family() -> None:
         [case.name for case in selected([], level)] for level in (Scope.QUICK, Scope.USUAL, Scope.FULL)
     )
     assert set(quick) < set(usual) < set(full)
-    assert {case.family for case in selected([], Scope.USUAL)} == set(FAMILIES.modules) - {"products"}
+    assert {case.family for case in selected([], Scope.USUAL)} == set(FAMILIES.entries) - {"products"}
 
 
 def test_a_case_is_found_by_name_at_any_level_and_a_family_by_level() -> None:

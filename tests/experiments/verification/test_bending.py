@@ -16,7 +16,7 @@ from lyra_petsc.experiments.verification.cases.hinges import (
     hinges_of,
     strip_stiffness,
 )
-from lyra_petsc.experiments.verification.flat_plates import strip
+from lyra_petsc.experiments.verification.flat_plates import hinged_strip
 from lyra_petsc.experiments.verification.rods import (
     cantilever,
     column_shape,
@@ -93,7 +93,7 @@ def test_a_tall_cantilever_tips_at_the_published_load() -> None:
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("pattern", hinges.PATTERNS)
 def test_bending_over_the_factor_of_the_mesh_gives_b(comm: MPI.Comm, pattern: str) -> None:
-    scene: dict[str, Any] = strip(
+    scene: dict[str, Any] = hinged_strip(
         pattern, 8, material={"bending": 1.0, "bending_scale": 1.0 / expected(pattern)}
     )
     with Bench(comm).simulation(scene) as trial:
@@ -105,7 +105,7 @@ def test_bending_over_the_factor_of_the_mesh_gives_b(comm: MPI.Comm, pattern: st
 @pytest.mark.parallel(2)
 def test_a_stiffness_other_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hinges, "expected", lambda pattern, ratio=1.0: 1.0)
-    outcome = run_case(comm, hinges.hinge_strip, quick=True, warm=False)
+    outcome = run_case(comm, CASES.load("hinge-strip"), quick=True, warm=False)
     verdicts = {quantity: verdict.passed for quantity, verdict in outcome.verdicts.items()}
     assert not verdicts["B_effective / B, diagonal, square cells"]
     assert verdicts["B_effective / B, criss-cross, square cells"]

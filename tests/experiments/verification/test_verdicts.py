@@ -14,12 +14,9 @@ from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.cases import CASES
 from lyra_petsc.experiments.verification.verification_case import (
     Claim,
-    Converges,
     ErrorRow,
-    Exact,
     Measured,
     VerificationCase,
-    at_finest,
     observed_order,
     run_case,
 )
@@ -51,20 +48,20 @@ def test_orders_follow_from_errors() -> None:
 @pytest.mark.parametrize(
     ("claim", "errors", "good"),
     [
-        (Exact(1e-10), (1e-11, 1e-12), True),
-        (Exact(1e-10), (2e-10, 1e-12), False),
-        (Exact(1e-10), (1e-12, math.nan), False),
-        (at_finest(1e-3), (1.0, 9e-4), True),
-        (at_finest(1e-3), (1e-4, 2e-3), False),
-        (at_finest(1e-3), (1e-4, math.nan), False),
-        (Converges(2.0, 1e-3), (3.6e-3, 9e-4), True),
-        (Converges(2.0, 1e-3), (4.8e-3, 1.2e-3), False),  # right order, too large
-        (Converges(2.0, 1e-3), (1.8e-3, 9e-4), False),  # small, but first order
-        (Converges(2.0, 1e-3), (9e-4, 9e-4), False),
-        (Converges(2.0, 1e-3), (3.6e-3, 3e-5), False),  # an order too good to be true
-        (Converges(2.0, 1e-3), (3.6e-3, math.nan), False),
-        (Converges(2.0, 1e-3), (3.6e-3, 0.0), False),
-        (Converges(1.0, 1e-3, slack=0.1), (1.6e-3, 8.1e-4), True),
+        (Claim(exact=1e-10), (1e-11, 1e-12), True),
+        (Claim(exact=1e-10), (2e-10, 1e-12), False),
+        (Claim(exact=1e-10), (1e-12, math.nan), False),
+        (Claim(within=1e-3), (1.0, 9e-4), True),
+        (Claim(within=1e-3), (1e-4, 2e-3), False),
+        (Claim(within=1e-3), (1e-4, math.nan), False),
+        (Claim(order=2.0, within=1e-3), (3.6e-3, 9e-4), True),
+        (Claim(order=2.0, within=1e-3), (4.8e-3, 1.2e-3), False),  # right order, too large
+        (Claim(order=2.0, within=1e-3), (1.8e-3, 9e-4), False),  # small, but first order
+        (Claim(order=2.0, within=1e-3), (9e-4, 9e-4), False),
+        (Claim(order=2.0, within=1e-3), (3.6e-3, 3e-5), False),  # an order too good to be true
+        (Claim(order=2.0, within=1e-3), (3.6e-3, math.nan), False),
+        (Claim(order=2.0, within=1e-3), (3.6e-3, 0.0), False),
+        (Claim(order=1.0, within=1e-3, slack=0.1), (1.6e-3, 8.1e-4), True),
     ],
 )
 def test_claims(claim: Claim, errors: tuple[float, ...], good: bool) -> None:
@@ -76,8 +73,9 @@ def test_claims(claim: Claim, errors: tuple[float, ...], good: bool) -> None:
 
 def test_the_bound_of_a_quick_run_grows_with_h() -> None:
     rows = table(6e-2, 1.5e-2)
-    assert Converges(2.0, 1e-3).judge(rows, finest(rows) / 4.0).passed  # 16e-3
-    assert not Converges(2.0, 1e-3).judge(rows, finest(rows) / 2.0).passed  # 4e-3
+    assert Claim(order=2.0, within=1e-3).judge(rows, finest(rows) / 4.0).passed  # 16e-3
+    assert not Claim(order=2.0, within=1e-3).judge(rows, finest(rows) / 2.0).passed  # 4e-3
+    assert not Claim(within=1e-3, growth=1.0).judge(rows, finest(rows) / 4.0).passed
 
 
 def test_errors_are_relative_to_their_scale() -> None:
@@ -89,9 +87,8 @@ def made(**changes: object) -> VerificationCase:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         return [Measured("a", 1.0 + n**-2, 1.0, "m"), Measured("b", 2.0, 2.0)]
 
-    case = VerificationCase(
-        "made-up", "title", measure, "source", (4, 8, 16), Converges(2.0, 1e-2), claims={"b": Exact(1e-12)}
-    )
+    claims = {"b": Claim(exact=1e-12), "*": Claim(order=2.0, within=1e-2)}
+    case = VerificationCase("made-up", "title", measure, "source", (4, 8, 16), claims)
     return dataclasses.replace(case, **changes)  # type: ignore[arg-type]
 
 
@@ -160,7 +157,7 @@ QUICK_AND_EXACT = ("patch-states", "free-fall", "oscillator", "rigid-rotation", 
 def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -> None:
     case = CASES.load(name)
     outcome = run_case(comm, wrong_by(case, 1e-9), quick=True, warm=False)
-    exact = [q for q in outcome.tables() if case.claim_of(q) == Exact(1e-10)]
+    exact = [q for q in outcome.tables() if case.claim_of(q) == Claim(exact=1e-10)]
     assert exact
     for quantity in exact:
         assert not outcome.verdicts[quantity].passed, quantity
@@ -177,7 +174,7 @@ def test_a_missing_package_is_named() -> None:
     def measure(bench: Bench, n: float) -> list[Measured]:
         raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
 
-    case = VerificationCase("a", "b", measure, "c", (1.0,), Exact())
+    case = VerificationCase("a", "b", measure, "c", (1.0,), {"*": Claim(exact=0.0)})
     [verdict] = run_case(MPI.COMM_SELF, case).verdicts.values()
     assert not verdict.passed
     assert "scipy is not installed; get the extra" in verdict.message

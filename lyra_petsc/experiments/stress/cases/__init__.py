@@ -5,20 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lyra_petsc.errors import InputError, suggest
-from lyra_petsc.experiments.case import Registry, module_by_name
+from lyra_petsc.experiments.case import Registry, member
 from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase
 
-FAMILIES: Registry[CaseFamily] = Registry(
-    "lyra_petsc.experiments.stress.cases",
-    module_by_name(
-        ("sheets", "stiff-steps membrane bending time-step density anisotropy damping wind gravity"),
-        ("sheets", "handles start elements free compression"),
-        ("contact", "contact"),
-        ("sheets", "directors"),
-        ("limits", "rigid-plate chain paper"),
-        ("sheets", "products"),
-    ),
-)
+MODULES = {
+    "stiff-steps membrane bending time-step density anisotropy damping wind gravity": "sheets",
+    "handles start elements free compression": "sheets",
+    "contact": "contact",
+    "directors": "sheets",
+    "rigid-plate chain paper": "limits",
+    "products": "sheets",
+}
+"""Modules of the families."""
+
+
+def _family(name: str, module: str) -> CaseFamily:
+    family: CaseFamily = member(f"{__name__}.{module}", name)
+    return family
+
+
+FAMILIES = Registry({name: module for names, module in MODULES.items() for name in names.split()}, _family)
 
 
 def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
@@ -32,14 +38,14 @@ def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
     everything = [case for family in FAMILIES.all() for case in family.cases]
     if not only:
         return [case for case in everything if case.level <= level]
-    known = dict.fromkeys([*FAMILIES.modules, *(case.name for case in everything)])
+    known = dict.fromkeys([*FAMILIES.entries, *(case.name for case in everything)])
     for name in only:
         if name not in known:
             raise InputError(f"unknown case or family, {suggest(name, known)}; --list names all", key=name)
-    found = [
+    cases = [
         case for case in everything if case.name in only or (case.family in only and case.level <= level)
     ]
     for name in only:
-        if not any(name in (case.family, case.name) for case in found):
+        if not any(name in (case.family, case.name) for case in cases):
             raise InputError("has cases only with --full", key=name)
-    return found
+    return cases

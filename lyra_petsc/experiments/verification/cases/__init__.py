@@ -1,30 +1,37 @@
-"""The cases of ``verify`` by name, in the order in which they run, and the modules that they are in."""
+"""The cases of ``verify``: the table ``cases.yaml`` and the modules with their measurements."""
 
 from __future__ import annotations
 
-from lyra_petsc.experiments.case import Registry, module_by_name
-from lyra_petsc.experiments.verification.verification_case import VerificationCase
+from collections.abc import Callable
+from importlib.resources import files
+from typing import Any
 
-CASES: Registry[VerificationCase] = Registry(
-    "lyra_petsc.experiments.verification.cases",
-    module_by_name(
-        ("membranes", "patch-states"),
-        ("motions", "free-fall oscillator rigid-rotation wind-drag"),
-        ("membranes", "uniaxial-pull"),
-        ("hanging", "hanging-strip-chain hanging-strip catenary catenary-unequal catenary-elastic"),
-        ("membranes", "circular-membrane stretched-membrane hanging-chain released-mode"),
-        ("hinges", "hinge-strip wide-strip hinge-sheet hinge-plate"),
-        ("plates", "plate"),
-        ("shells", "sze-end-shear sze-end-moment clamped-disc supported-disc pressed-strip"),
-        ("shells", "pinched-cylinder open-hemisphere hyperbolic-paraboloid twisted-beam open-cylinder"),
-        ("shells", "slit-annulus scordelis-lo-roof hinged-roof"),
-        ("sections", "frames sections"),
-        ("plates", "plate-curvature plate-vibration"),
-        ("cantilevers", "column post-buckling lateral-buckling elastica-tip elastica-weight"),
-        ("cantilevers", "elastica-roll-up elastica-overhang tip-load roll-up heavy-cantilever"),
-        ("cantilevers", "coiling-strip cloth-overhang"),
-        ("hinges", "strip-vibration"),
-        ("contacts", "incline sheets rest capstan collision layers"),
-        ("drapes", "ruck pole table-edge cusick"),
-    ),
-)
+from lyra_petsc.experiments.case import Registry, member
+from lyra_petsc.experiments.verification.verification_case import Claim, VerificationCase, load_data
+from lyra_petsc.scene.text import parse_yaml
+
+
+def _case(name: str, entry: dict[str, Any]) -> VerificationCase:
+    source = entry.get("source")
+    if source is None:
+        table, *keys = entry["source_of"]
+        data = load_data(table)
+        for key in keys:
+            data = data[key]
+        source = data["source"]
+    claims = {pattern: Claim(**claim) for pattern, claim in entry["claims"].items()}
+    counts = entry.get("n", VerificationCase.counts)
+    quick = entry.get("quick", VerificationCase.quick)
+    measure: Callable[..., Any] = member(f"{__name__}.{entry['module']}", name)
+    return VerificationCase(
+        name, entry["title"], measure, source, entry["resolutions"], claims, quick, counts
+    )
+
+
+def _table() -> dict[str, dict[str, Any]]:
+    path = files("lyra_petsc.experiments.verification") / "cases.yaml"
+    table: dict[str, dict[str, Any]] = parse_yaml(path.read_text(encoding="utf-8"), file=path)
+    return table
+
+
+CASES: Registry[VerificationCase] = Registry(_table(), _case)

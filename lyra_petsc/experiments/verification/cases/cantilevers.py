@@ -20,9 +20,9 @@ from lyra_petsc.experiments.verification.flat_plates import (
     DENSITY,
     KINDS,
     MEMBRANE,
+    hinged_strip,
     lowest_squares,
     plate_material,
-    strip,
     strip_mesh,
 )
 from lyra_petsc.experiments.verification.rods import (
@@ -36,20 +36,11 @@ from lyra_petsc.experiments.verification.rods import (
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
-    Claim,
-    Converges,
-    Exact,
     Measured,
-    at_finest,
-    case,
     isotropic,
     scene,
 )
 from lyra_petsc.parallel import on_root
-
-COUNTS: dict[str, Any] = {"quick": 1, "counts": "cells along the strip"}
-HINGED = COUNTS | {"resolutions": (16, 32, 64)}
-DIRECTED = COUNTS | {"resolutions": (25, 50, 100), "claim": at_finest(3e-3)}
 
 PATTERNS = ("alternating", "criss-cross")
 """Mesh patterns on which bending by hinges is not coupled to twist."""
@@ -83,27 +74,24 @@ class Strip:
 
 def hinged(n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
     """Pairs of a strip of square cells with hinges and a load, for the loads of each pattern."""
-    for pattern, some in loads.items():
-        made = Strip(pattern, 1.0 / n, expected(pattern), partial(strip, pattern, n))
-        yield from ((made, load) for load in some)
+    for pattern, values in loads.items():
+        hinges = Strip(pattern, 1.0 / n, expected(pattern), partial(hinged_strip, pattern, n))
+        yield from ((hinges, load) for load in values)
 
 
 def directed(bench: Bench, n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
     """Pairs of a strip with directors and a load, for every kind of mesh and the loads of each width."""
     for kind in KINDS:
-        for label, some in loads.items():
-            scene = partial(_directed, bench, kind, n, WIDTHS[label])
-            made = Strip(f"{kind}, {label} wide", WIDTHS[label] or 1.0 / n, 1.0, scene)
-            yield from ((made, load) for load in some)
+        for label, values in loads.items():
 
+            def content(
+                length: float = 1.0, kind: str = kind, width: float = WIDTHS[label], **more: Any
+            ) -> dict[str, Any]:
+                mesh, material = strip_mesh(bench, kind, n, width, length), plate_material(MEMBRANE)
+                return scene(mesh, material, handles=[{"group": "left", "clamp": True}]) | more
 
-def _directed(
-    bench: Bench, kind: str, n: float, width: float, length: float = 1.0, **more: Any
-) -> dict[str, Any]:
-    given: dict[str, Any] = {"material": plate_material(MEMBRANE)} | more
-    return scene(
-        strip_mesh(bench, kind, n, width, length), handles=[{"group": "left", "clamp": True}], **given
-    )
+            directors = Strip(f"{kind}, {label} wide", WIDTHS[label] or 1.0 / n, 1.0, content)
+            yield from ((directors, load) for load in values)
 
 
 def _tip(trial: Trial) -> tuple[float, float]:
@@ -122,85 +110,44 @@ def _compared(bench: Bench, scene: dict[str, Any], exact: Cantilever, label: str
     yield Measured(f"reach / L, {label}", reach, exact.reach, scale=tip_displacement)
 
 
-TIP_LOAD = (
-    "elastica by collocation; K. E. Bisshopp and D. C. Drucker, Quart. Appl. Math. 3 (1945) 272-275, with "
-    "T = C (λ³ − λ)/2 for the stretch"
-)
-
-
 def _tip_loads(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[Measured]:
-    for each, load in strips:
+    for strip, load in strips:
         # the scene's force is the total over the width
-        force = [{"group": "right", "force": [0, 0, -load * each.stiffness * each.width]}]
-        exact = cantilever(0.0, tip_load=load, stretch=each.stiffness / MEMBRANE)
-        yield from _compared(bench, each.scene(loads=force), exact, f"{each.label}, α = {load:g}")
+        force = [{"group": "right", "force": [0, 0, -load * strip.stiffness * strip.width]}]
+        exact = cantilever(0.0, tip_load=load, stretch=strip.stiffness / MEMBRANE)
+        yield from _compared(bench, strip.scene(loads=force), exact, f"{strip.label}, α = {load:g}")
 
 
-@case(
-    "Clamped strip with a load at the tip, α = P L²/B_effective: tip against the elastica with the "
-    "strip's stretch; error over the displacement of the tip",
-    claim=at_finest(2e-3),
-    source=TIP_LOAD,
-    **HINGED,
-)
-def tip_load(bench: Bench, n: float) -> Sequence[Measured]:
+def tip_load(bench: Bench, n: float) -> Iterator[Measured]:
     """α = P L² / B_effective, P per width."""
-    return [*_tip_loads(bench, hinged(n, dict.fromkeys(PATTERNS, (0.25, 1.0, 4.0, 10.0, 50.0))))]
+    return _tip_loads(bench, hinged(n, dict.fromkeys(PATTERNS, (0.25, 1.0, 4.0, 10.0, 50.0))))
 
 
-@case(
-    "Strip that bends by directors, with a load at the tip, α = P L²/B: tip against the elastica with the "
-    "strip's stretch; error over the displacement of the tip",
-    source=TIP_LOAD,
-    **DIRECTED,
-)
 def elastica_tip(bench: Bench, n: float) -> Iterator[Measured]:
     """α = P L²/B for each width, P per width."""
     loads = {"one cell": (1.0, 50.0), "0.1 L": (4.0,), "0.25 L": (10.0,)}
-    yield from _tip_loads(bench, directed(bench, n, loads))
-
-
-WEIGHT = (
-    "heavy elastica by collocation; test of Romero et al., ACM Trans. Graph. 40(4):66 (2021); with "
-    "T = C (λ³ − λ)/2 for the stretch"
-)
+    return _tip_loads(bench, directed(bench, n, loads))
 
 
 def _weights(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[Measured]:
-    for each, weight in strips:
-        exact = cantilever(weight, stretch=each.stiffness / MEMBRANE)
-        scene = each.scene(gravity=[0, 0, -weight * each.stiffness / DENSITY])
-        yield from _compared(bench, scene, exact, f"{each.label}, Γ = {weight:g}")
+    for strip, weight in strips:
+        exact = cantilever(weight, stretch=strip.stiffness / MEMBRANE)
+        scene = strip.scene(gravity=[0, 0, -weight * strip.stiffness / DENSITY])
+        yield from _compared(bench, scene, exact, f"{strip.label}, Γ = {weight:g}")
 
 
-@case(
-    "Clamped strip under its own weight, Γ = w L³/B_effective: tip against the heavy elastica with the "
-    "strip's stretch; error over the displacement of the tip",
-    claim=at_finest(2e-3),
-    source=WEIGHT,
-    **HINGED,
-)
-def heavy_cantilever(bench: Bench, n: float) -> Sequence[Measured]:
+def heavy_cantilever(bench: Bench, n: float) -> Iterator[Measured]:
     """Γ = w L³ / B_effective."""
-    return [*_weights(bench, hinged(n, dict.fromkeys(PATTERNS, (0.1, 1.0, 10.0, 100.0, 1e3, 1e4))))]
+    return _weights(bench, hinged(n, dict.fromkeys(PATTERNS, (0.1, 1.0, 10.0, 100.0, 1e3, 1e4))))
 
 
-@case(
-    "Strip that bends by directors, under its own weight, Γ = w L³/B: tip against the heavy elastica with "
-    "the strip's stretch; error over the displacement of the tip",
-    source=WEIGHT,
-    **DIRECTED,
-)
 def elastica_weight(bench: Bench, n: float) -> Iterator[Measured]:
     """Γ = w L³/B for each width."""
     weights = {"one cell": (1.0, 1000.0), "0.1 L": (10.0,), "0.25 L": (100.0,)}
-    yield from _weights(bench, directed(bench, n, weights))
+    return _weights(bench, directed(bench, n, weights))
 
 
 # -- rolled up -------------------------------------------------------------------------------------------
-
-TURNS = {"diagonal": (0.25, 1.0), "alternating": (0.25, 0.5), "criss-cross": (0.25, 0.5)}
-"""Turns (parts of a full circle) for each pattern of mesh."""
 
 
 def _arc(turns: float) -> Cantilever:
@@ -209,84 +156,40 @@ def _arc(turns: float) -> Cantilever:
     return Cantilever(math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle, angle, angle)
 
 
-ROLLED: dict[str, Claim] = {
-    # bending to an arc dimples every cell, which costs membrane energy
-    f"{side} / L, criss-cross, {turns:g} of a circle": at_finest(5e-3)
-    for turns in TURNS["criss-cross"]
-    for side in ("drop", "reach")
-} | dict.fromkeys(
-    # the polygon of the cells ends exactly at the tip of the arc
-    (
-        "reach / L, alternating, 0.5 of a circle",
-        "drop / L, diagonal, 1 of a circle",
-        "reach / L, diagonal, 1 of a circle",
-    ),
-    Exact(1e-6),
-)
-
-
-@case(
-    "Clamped strip that its rest curvature rolls up: tip against the arc; error over its displacement",
-    source="closed form; the shape of K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551",
-    claim=Converges(2.0, 1e-4),
-    claims=ROLLED,
-    **HINGED,
-)
-def roll_up(bench: Bench, n: float) -> Sequence[Measured]:
-    found: list[Measured] = []
-    for each, turns in hinged(n, TURNS):
+def roll_up(bench: Bench, n: float) -> Iterator[Measured]:
+    """Turns are parts of a full circle."""
+    turns_of = {"diagonal": (0.25, 1.0), "alternating": (0.25, 0.5), "criss-cross": (0.25, 0.5)}
+    for strip, turns in hinged(n, turns_of):
         curved = {"rest_curvature": [-2.0 * math.pi * turns, 0.0, 0.0]}
         # without tension or weight the membrane does not stretch; a softer one needs fewer iterations
-        scene = each.scene(membrane=1e4, material=curved)
-        found += _compared(bench, scene, _arc(turns), f"{each.label}, {turns:g} of a circle")
-    return found
+        scene = strip.scene(membrane=1e4, material=curved)
+        yield from _compared(bench, scene, _arc(turns), f"{strip.label}, {turns:g} of a circle")
 
 
-@case(
-    "Strip that bends by directors, rolled up by the moment 2π f B/L at its end: tip against the arc; "
-    "error over the displacement of the tip",
-    source="closed form; K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551, section 3.2",
-    # facets of criss-cross cells are nearly flat only in finer meshes
-    claims={
-        f"{side} / L, criss-cross, one cell wide, f = 1": Converges(4.0, 3e-3, slack=math.inf)
-        for side in ("drop", "reach")
-    },
-    **DIRECTED,
-)
 def elastica_roll_up(bench: Bench, n: float) -> Iterator[Measured]:
     """f = M L/(2π B) for each width: parts of a full circle."""
-    for each, turns in directed(bench, n, {"one cell": (0.25, 1.0), "0.1 L": (0.5,), "0.25 L": (0.5,)}):
-        scene = each.scene(loads=[{"group": "right", "moment": -2.0 * math.pi * turns}])
-        yield from _compared(bench, scene, _arc(turns), f"{each.label}, f = {turns:g}")
+    for strip, turns in directed(bench, n, {"one cell": (0.25, 1.0), "0.1 L": (0.5,), "0.25 L": (0.5,)}):
+        scene = strip.scene(loads=[{"group": "right", "moment": -2.0 * math.pi * turns}])
+        yield from _compared(bench, scene, _arc(turns), f"{strip.label}, f = {turns:g}")
 
 
 # -- strips that twist -----------------------------------------------------------------------------------
 
 
-@case(
-    "Clamped strip of single diagonals under its own weight, Γ = w L³/(0.8 B): tip against the rod whose "
-    "bending twists it; error over the displacement of the tip",
-    source="Kirchhoff rod with bend-twist coupling, its stiffness by hand from the hinges of a cell",
-    claim=at_finest(2e-3),
-    **HINGED,
-)
-def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
+def coiling_strip(bench: Bench, n: float) -> Iterator[Measured]:
     # C L²/B, so high that a strip of width 1/64 hardly bends in its own plane
     stiff = 1e7
-    found: list[Measured] = []
-    # w L³ / (0.8 B)
-    for weight in (0.1, 1.0, 10.0, 100.0):
+    for weight in (0.1, 1.0, 10.0, 100.0):  # w L³ / (0.8 B)
         nominal = 0.8 * weight
-        scene = strip("diagonal", n, stiff, gravity=[0, 0, -nominal / DENSITY])
+        scene = hinged_strip("diagonal", n, stiff, gravity=[0, 0, -nominal / DENSITY])
         with bench.simulation(scene) as trial:
-            x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0)
+            x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0).tolist()
         exact = partial(heavy_coupled_strip, nominal, 1.0 / stiff)
         reach, sideways, drop = on_root(bench.comm, exact)
         size = math.hypot(1.0 - reach, sideways, drop)
-        tip = {"drop": (-z, drop), "reach": (x, reach), "sideways": (y - 0.5 / n, sideways)}
-        for name, (value, of) in tip.items():
-            found.append(Measured(f"{name} / L, Γ = {weight:g}", float(value), of, scale=size))
-    return found
+        yield Measured(f"drop / L, Γ = {weight:g}", -z, drop, scale=size)
+        yield Measured(f"reach / L, Γ = {weight:g}", x, reach, scale=size)
+        yield Measured(f"sideways / L, Γ = {weight:g}", y - 0.5 / n, sideways, scale=size)
 
 
 # -- cantilever test of cloth ----------------------------------------------------------------------------
@@ -296,55 +199,40 @@ BENDING_LENGTH, CLOTH_DENSITY, GRAVITY = 0.02, 0.15, 9.81
 
 RIGIDITY = CLOTH_DENSITY * GRAVITY * BENDING_LENGTH**3
 
-OVERHANG = "ASTM D1388, option A, and ISO 9073-7 (angle, G = w c³); overhangs from the exact heavy elastica"
-
 
 def _overhangs(
     bench: Bench, strips: Iterator[tuple[Strip, float]], cloth: Callable[[Strip, float], dict[str, Any]]
 ) -> Iterator[Measured]:
     """Angles [°] of the chord from clamp to tip below the horizontal; the standard prescribes 41.5°."""
-    for each, angle in strips:
-        with bench.simulation(cloth(each, BENDING_LENGTH * overhang_weight(angle) ** (1.0 / 3.0))) as trial:
+    for strip, angle in strips:
+        with bench.simulation(cloth(strip, BENDING_LENGTH * overhang_weight(angle) ** (1.0 / 3.0))) as trial:
             reach, drop = _tip(trial.run())
         reached = math.degrees(math.atan2(drop, reach))
-        yield Measured(f"angle of the chord, {each.label}, overhang for {angle:g}°", reached, angle, "°")
+        yield Measured(f"angle of the chord, {strip.label}, overhang for {angle:g}°", reached, angle, "°")
 
 
-@case(
-    "Cantilever test of cloth: with B = w c³, corrected for the mesh, the chord must reach the angle "
-    "that belongs to the overhang (41.5° at 2.0003 c)",
-    claim=at_finest(2e-3),
-    source=OVERHANG,
-    **HINGED,
-)
-def cloth_overhang(bench: Bench, n: float) -> Sequence[Measured]:
-    def cloth(each: Strip, overhang: float) -> dict[str, Any]:
+def cloth_overhang(bench: Bench, n: float) -> Iterator[Measured]:
+    def cloth(strip: Strip, overhang: float) -> dict[str, Any]:
         material = {
             "density": CLOTH_DENSITY,
             "membrane": isotropic(MEMBRANE * RIGIDITY / overhang**2),
             # corrects the known effective stiffness of the mesh
-            "bending": RIGIDITY / each.stiffness,
+            "bending": RIGIDITY / strip.stiffness,
         }
-        scene = each.scene(material=material, gravity=[0, 0, -GRAVITY])
-        scene["mesh"]["grid"] |= {"width": overhang, "height": overhang * each.width}
+        scene = strip.scene(material=material, gravity=[0, 0, -GRAVITY])
+        scene["mesh"]["grid"] |= {"width": overhang, "height": overhang * strip.width}
         return scene
 
-    return [*_overhangs(bench, hinged(n, dict.fromkeys(PATTERNS, (7.1, 41.5, 45.0))), cloth)]
+    return _overhangs(bench, hinged(n, dict.fromkeys(PATTERNS, (7.1, 41.5, 45.0))), cloth)
 
 
-@case(
-    "Cantilever test of cloth that bends by directors: with B = w c³ the chord must reach the angle that "
-    "belongs to the overhang (41.5° at 2.0003 c)",
-    source=OVERHANG,
-    **DIRECTED,
-)
 def elastica_overhang(bench: Bench, n: float) -> Iterator[Measured]:
-    def cloth(each: Strip, overhang: float) -> dict[str, Any]:
+    def cloth(strip: Strip, overhang: float) -> dict[str, Any]:
         material = plate_material(MEMBRANE * RIGIDITY / overhang**2, RIGIDITY) | {"density": CLOTH_DENSITY}
-        return each.scene(length=overhang, material=material, gravity=[0, 0, -GRAVITY])
+        return strip.scene(length=overhang, material=material, gravity=[0, 0, -GRAVITY])
 
     angles = {"one cell": (7.1, 41.5), "0.1 L": (45.0,), "0.25 L": (41.5,)}
-    yield from _overhangs(bench, directed(bench, n, angles), cloth)
+    return _overhangs(bench, directed(bench, n, angles), cloth)
 
 
 COLUMNS: dict[str, tuple[list[dict[str, Any]], float]] = {
@@ -371,15 +259,6 @@ def critical(lowest: Callable[[float], float], first: float, second: float) -> f
     return float(newton(lowest, first, x1=second, tol=1e-300, rtol=1e-5))
 
 
-@case(
-    "Columns that bend by directors: load at which the lowest eigenvalue of the compressed column changes "
-    "its sign, against Euler's",
-    source="L. Euler, De curvis elasticis (1744), closed form",
-    resolutions=(10, 20, 40, 80),
-    claim=at_finest(2e-3),
-    quick=2,
-    counts="cells along the column",
-)
 def column(bench: Bench, n: float) -> Iterator[Measured]:
     for label, (ends, exact) in COLUMNS.items():
         for kind in KINDS:
@@ -400,19 +279,6 @@ def column(bench: Bench, n: float) -> Iterator[Measured]:
 # -- beyond the critical load ----------------------------------------------------------------------------
 
 
-LOADS = {"below": 0.95, "above": 1.2}
-"""Loads over the critical load"""
-
-
-@case(
-    "Columns beyond the critical load: force and height when the ends approach each other to 0.6 L and go "
-    "back to 0.9 L, and the height under a load below and above the critical one, against the elastica",
-    source="elastica: A. E. H. Love, A Treatise on the Mathematical Theory of Elasticity, 4th ed., § 262-263",
-    resolutions=(20, 40, 60),
-    claim=at_finest(1e-2),
-    quick=1,
-    counts="cells along the column",
-)
 def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
     # shortenings over the length, in this order: the second is reached from above
     shortenings = (0.4, 0.1)
@@ -421,8 +287,8 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
         strip = partial(scene, strip_mesh(bench, kind, n, COLUMN), plate_material(1e5))
         for label in ("pinned", "clamped"):
             frames: list[dict[str, Any]] = [{"time": 0.0}, {"time": 0.1, "translate": [-0.02, 0.0, 0.0]}]
-            for at, each in zip((0.5, 1.0), shortenings, strict=True):
-                frames.append({"time": at, "translate": [-each, 0.0, 0.0]})
+            for at, shortening in zip((0.5, 1.0), shortenings, strict=True):
+                frames.append({"time": at, "translate": [-shortening, 0.0, 0.0]})
             left, right = COLUMNS[label][0]
             shortened = strip(
                 STATIC | {"step": 0.1},
@@ -439,17 +305,16 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                     name = f"{label}, {kind}, shortened by {shortening:g} L"
                     yield Measured(f"P L²/B, {name}", _push(trial), load)
                     yield Measured(f"height / L, {name}", _height(trial), height)
-        for label, part in LOADS.items():
+        for label, part in {"below": 0.95, "above": 1.2}.items():
             load = part * math.pi**2
             held = [{"group": "left"}, {"group": "right", "axes": ["y", "z"]}]
             pushed = [{"group": "right", "force": [-load * COLUMN, 0.0, 0.0]}]
             with bench.simulation(strip(handles=held, loads=pushed)) as trial:
-                found = _height(trial.run())
+                risen = _height(trial.run())
                 assert trial.simulation.stability["stable"] is not False
             height = column_shape(load=load)[1] if part > 1.0 else 0.0
-            yield Measured(
-                f"height / L, pinned, {kind}, {label} the critical load", found, height, scale=height or 1.0
-            )
+            name = f"height / L, pinned, {kind}, {label} the critical load"
+            yield Measured(name, risen, height, scale=height or 1.0)
 
 
 def _push(trial: Trial) -> float:
@@ -465,20 +330,6 @@ def _height(trial: Trial) -> float:
 # -- lateral buckling ------------------------------------------------------------------------------------
 
 
-@case(
-    "Tall cantilever with a load at its tip, in its plane, D and ν of a plate: the load at which the lowest "
-    "eigenvalue of the plane state changes its sign, and the mode",
-    source=(
-        "Prandtl and Michell 1899; S. Timoshenko and J. Gere, Theory of Elastic Stability (1961), 6.3: "
-        "P L² = 4.013 √(EI GJ), with EI = (1 − ν²) D b, GJ = 2 (1 − ν) D b; 4.10 and 4.05 at b = L/20 and "
-        "L/50 with the warping that the clamp suppresses, EΓ = (1 − ν²) D b³/12 (E. Reissner and M. Stein, "
-        "NACA TN 2369, 1951)"
-    ),
-    resolutions=(2, 4),
-    claim=at_finest(1e-2),
-    quick=1,
-    counts="cells across",
-)
 def lateral_buckling(bench: Bench, n: float) -> Iterator[Measured]:
     # depths over the length
     for depth in (1.0 / 20.0, 1.0 / 50.0):

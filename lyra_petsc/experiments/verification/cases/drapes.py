@@ -24,11 +24,7 @@ from lyra_petsc.experiments.verification.cases.contacts import placed
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.verification_case import (
     FLOOR,
-    Converges,
-    Exact,
     Measured,
-    at_finest,
-    case,
     grid,
     isotropic,
     load_data,
@@ -56,16 +52,6 @@ def _small_ruck(s: Array, half_length: float, height: float) -> Array:
     return np.column_stack([np.interp(s, along, x) + beyond, np.interp(s, along, w)])
 
 
-@case(
-    "Ruck of a heavy sheet on a plane without friction, its end pushed in steps, bending_model: midedge, a "
-    "half: force per width, height, and half length of the lifted part by its height^(1/3)",
-    source=RUCK["source"],
-    resolutions=(20, 40),
-    claim=at_finest(1e-2),
-    claims={f"half length / l, P = {row[0]:g} B/l²": at_finest(2e-2) for row in RUCK["rows"]},
-    counts="cells along half of the sheet",
-    quick=1,
-)
 def ruck(bench: Bench, n: float) -> Iterator[Measured]:
     # half the length of the sheet over l, gap over l, C l²/B
     half, ruck_gap, membrane = 3.0, 1e-4, 1e4
@@ -166,25 +152,12 @@ def _refined(
         yield Measured(f"change of the ends, {label} halved", change, 0.0, "m", scale=length)
 
 
-REFINED: dict[str, Any] = {
-    "source": "order of backward Euler, and of the distance at which the barrier holds",
-    "resolutions": (2, 4, 8),
-    "claim": Converges(1.0, 1e-2, slack=0.4),
-    # no order: the corners of the polygonal strip touch the obstacle one by one
-    "claims": {"change of the ends, h halved": Converges(1.0, 5e-3, slack=math.inf)},
-    "counts": "refinements",
-    "quick": 1,
-}
-
-
-@case("Hanging strip that swings against a pole: ends, when Δt, h or the gap is halved", **REFINED)
 def pole(bench: Bench, n: float) -> Iterator[Measured]:
     low, high = ([-0.03, y, -0.15] for y in ALONG_Y)
     obstacles = {"pole": {"capsule": {"from": low, "to": high, "radius": 0.02}}}
     yield from _refined(bench, n, 0.3, lambda gap: [0.0, 0.0, 0.0], 30.0, [{"group": "left"}], obstacles)
 
 
-@case("Strip that slides off a table's edge with friction: ends, when Δt, h or the gap is halved", **REFINED)
 def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
     low, high = ALONG_Y
     obstacles = {"table": {"box": {"min": [-1.0, low, -0.5], "max": [0.0, high, 0.0]}}}
@@ -256,18 +229,6 @@ def scatter_of_means(samples: Sequence[Sequence[float]]) -> float:
     return float(np.std(means, ddof=1) / (2.0 * np.sqrt(square)))
 
 
-@case(
-    "Denim (11oz-black-denim) of 30 cm over a disc of 18 cm, bending_model: midedge, as stiff as its table "
-    "says (bending_scale: 4), five wavy starts on each of four kinds of meshes: drape coefficients against "
-    "the middle of those published of denims, 70 to 90 %; standard deviation of the kinds' means over twice "
-    "their standard error",
-    source="G. E. Cusick, Journal of the Textile Institute 59 (1968) 253-260; agreement of meshes",
-    resolutions=(8, 24, 32),
-    claim=Exact(0.1),
-    claims={"scatter of the kinds": at_finest(1.0)},
-    counts="cells along the diameter",
-    quick=1,
-)
 def cusick(bench: Bench, n: float) -> Iterator[Measured]:
     samples = []
     for kind in MESHES:

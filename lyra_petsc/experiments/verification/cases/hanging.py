@@ -12,10 +12,7 @@ from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
 from lyra_petsc.experiments.verification.rods import stretches
 from lyra_petsc.experiments.verification.verification_case import (
-    Converges,
-    Exact,
     Measured,
-    case,
     grid,
     isotropic,
     load_data,
@@ -23,14 +20,7 @@ from lyra_petsc.experiments.verification.verification_case import (
     worst_value,
 )
 
-ALONG = "cells along the strip"
-
 # -- by one end ------------------------------------------------------------------------------------------
-
-HANGING = (
-    "closed form: lam^3 - lam = 2 e at the support, u = (3/4 (lam^4 - 1) - 1/2 (lam^2 - 1))/(2 e) - 1; "
-    "the chain bar by bar from the same law"
-)
 
 STIFFNESS = 100.0
 """N/m"""
@@ -53,14 +43,6 @@ def of_strip(e: float) -> float:
     return float((0.75 * (largest**4 - 1.0) - 0.5 * (largest**2 - 1.0)) / (2.0 * e) - 1.0)
 
 
-@case(
-    "A strip hanging by one end, its weight in equal rows, static: the chain of n equal bars",
-    source=HANGING,
-    resolutions=(1, 2, 4, 8, 16, 32, 64),
-    claim=Exact(1e-10),
-    quick=4,
-    counts=ALONG,
-)
 def hanging_strip_chain(bench: Bench, n: float) -> Iterator[Measured]:
     bars = int(n)
     rows = [{"nodes": [i, bars + 1 + i]} for i in range(bars + 1)]
@@ -78,13 +60,6 @@ def hanging_strip_chain(bench: Bench, n: float) -> Iterator[Measured]:
         yield Measured(f"elongation, weight {e:g} of c11", end, exact, "m", LENGTH)
 
 
-@case(
-    "A strip hanging by one end under its own weight, static: elongation against the continuum",
-    source=HANGING,
-    resolutions=(32, 64, 128),
-    claim=Converges(2.0, 1e-3),
-    counts=ALONG,
-)
 def hanging_strip(bench: Bench, n: float) -> Iterator[Measured]:
     for e in (0.01, 0.1, 1.0, 10.0):
         density, held = e * STIFFNESS / (G * LENGTH), {"group": "left"}
@@ -98,10 +73,6 @@ def hanging_strip(bench: Bench, n: float) -> Iterator[Measured]:
 # -- catenaries ------------------------------------------------------------------------------------------
 
 CATENARY = load_data("catenary")
-CONVERGING: dict[str, Any] = {
-    "resolutions": (8, 16, 32, 64), "claim": Converges(2.0, 1e-3), "counts": ALONG,
-}  # fmt: skip
-
 STRETCHES = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
 """Weight over c11 by span, which bounds the stretch; its effect is larger the less the strip sags."""
 
@@ -113,22 +84,12 @@ def _middle(bench: Bench, n: float, e: float, dx: float, dz: float = 0.0) -> tup
     return float(x), float(z)
 
 
-@case(
-    "A stiff strip hung by both ends at one height, static: sag of the inextensible catenary",
-    source=CATENARY["source"],
-    **CONVERGING,
-)
 def catenary(bench: Bench, n: float) -> Iterator[Measured]:
     for span, sag in CATENARY["inextensible"]["rows"]:
         low = -_middle(bench, n, STRETCHES[span], span)[1]
         yield Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m")
 
 
-@case(
-    "A stiff strip hung at two heights, static: its middle against the inextensible catenary",
-    source="closed form",
-    **CONVERGING,
-)
 def catenary_unequal(bench: Bench, n: float) -> Iterator[Measured]:
     for dx, dz, a, lowest, _, _ in CATENARY["unequal_heights"]["rows"]:
         # weight over c11, which bounds the stretch
@@ -148,11 +109,6 @@ def middle(a: float, lowest: float) -> tuple[float, float]:
     return x, a * (math.cosh((x - lowest) / a) - math.cosh(lowest / a))
 
 
-@case(
-    "A strip hung by both ends that stretches under its own weight, static: sag",
-    source=CATENARY["source"],
-    **CONVERGING,
-)
 def catenary_elastic(bench: Bench, n: float) -> Iterator[Measured]:
     for e, span, sag, _, _ in CATENARY["elastic"]["rows"]:
         name = f"sag, weight {e:g} of c11, span {span:g} of the length"

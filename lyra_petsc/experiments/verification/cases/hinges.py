@@ -10,7 +10,7 @@ part, and over curvatures that are free, gives the effective stiffness.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +19,16 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.flat_plates import DENSITY, held, lowest_modes, small_motions, strip
+from lyra_petsc.experiments.verification.flat_plates import (
+    DENSITY,
+    held,
+    hinged_strip,
+    lowest_modes,
+    small_motions,
+)
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
-    Converges,
-    Exact,
     Measured,
-    case,
     grid,
     load_data,
     scene,
@@ -174,28 +177,15 @@ def expected(pattern: str, ratio: float = 1.0) -> float:
     return square / (square + ratio**4)
 
 
-@case(
-    "Bending stiffness of a strip with free edges over B, on each pattern of mesh",
-    source=(
-        "closed form from the hinges of one cell (lateral curvature, twist and vertex heights relaxed); for "
-        "square cells 4.8 k and 6 k with k = B/6 by an independent program too"
-    ),
-    resolutions=(1, 2, 3, 4, 8, 16),
-    claim=Exact(1e-10),
-    counts="cells across the strip",
-)
-def hinge_strip(bench: Bench, n: float) -> Sequence[Measured]:
-    found = []
+def hinge_strip(bench: Bench, n: float) -> Iterator[Measured]:
     for label, ratio in RATIOS.items():
         for pattern in PATTERNS:
             with bench.simulation(_plate(grid(6.0, round(n) * ratio, 6, round(n), pattern))) as trial:
                 hinges, points = hinges_of(trial), trial.x[:, :2]
             value = strip_stiffness(hinges, points, start=2.0, period=2.0, width=n * ratio)
-            found.append(Measured(f"B_effective / B, {pattern}, {label}", value, expected(pattern, ratio)))
-    return found
+            yield Measured(f"B_effective / B, {pattern}, {label}", value, expected(pattern, ratio))
 
 
-SHEET = load_data("hinge_sheet")
 CELLS = 8
 """Along each side of the meshes."""
 
@@ -214,27 +204,16 @@ def _equilateral(bench: Bench) -> dict[str, Any]:
     return bench.mesh(vertices, triangles)
 
 
-@case(
-    "Bending stiffness of infinite sheets, energy per area ½ κᵀDκ, κ = (κ11, κ22, 2κ12), over k = B/6",
-    source=SHEET["source"],
-    resolutions=(2, 4, 6),
-    claim=Exact(1e-10),
-    counts="cells in the period",
-)
-def hinge_sheet(bench: Bench, n: float) -> Sequence[Measured]:
-    found = []
-    for mesh, wanted in SHEET["D_over_k"].items():
-        made = _equilateral(bench) if mesh == "equilateral" else grid(CELLS, CELLS, CELLS, CELLS, mesh)
-        with bench.simulation(_plate(made)) as trial:
+def hinge_sheet(bench: Bench, n: float) -> Iterator[Measured]:
+    for mesh, rows in load_data("hinge_sheet")["D_over_k"].items():
+        block = _equilateral(bench) if mesh == "equilateral" else grid(CELLS, CELLS, CELLS, CELLS, mesh)
+        with bench.simulation(_plate(block)) as trial:
             hinges, points = hinges_of(trial), trial.x[:, :2]
         # k = B/6
         value = 6.0 * sheet_stiffness(hinges, points, (1.0 / n, 1.0 / n), n * _lattice(mesh))
-        exact = np.array(wanted)
-        found += [
-            Measured(f"{name} / k, {mesh}", value[at], exact[at], scale=exact[0, 0])
-            for name, at in ENTRIES.items()
-        ]
-    return found
+        exact = np.array(rows)
+        for name, at in ENTRIES.items():
+            yield Measured(f"{name} / k, {mesh}", value[at], exact[at], scale=exact[0, 0])
 
 
 # -- deflections and frequencies -------------------------------------------------------------------------
@@ -245,33 +224,18 @@ def heights(trial: Trial, force: Array) -> Array:
     return small_motions(trial).displacements(force[:, None] * [0.0, 0.0, 1.0])[:, 2]
 
 
-def _wide(pattern: str, across: int) -> str:
-    return f"deflection over that with B_effective, {pattern}, {across} cells wide"
-
-
-@case(
-    "Clamped strips 2 and 4 square cells wide under a small uniform load: mean deflection of the end "
-    "against the beam's with B_effective",
-    source="Euler-Bernoulli beam, closed form: w = q L⁴/(8 B)",
-    resolutions=(32, 64, 128),
-    # near the clamp, over about the width of the strip, lateral curvature is suppressed
-    claim=Converges(1.0, 1.3e-2),
-    claims={_wide("alternating", 2): Converges(2.0, 1e-4)},
-    counts="cells along the strip",
-)
-def wide_strip(bench: Bench, n: float) -> Sequence[Measured]:
+def wide_strip(bench: Bench, n: float) -> Iterator[Measured]:
     """The clamp suppresses the lateral curvature that bending by hinges causes."""
-    found = []
     along = round(n)
     for across in (2, 4):
         for pattern in PATTERNS:
             mesh = grid(1.0, across / along, along, across, pattern)
-            with bench.simulation(strip(pattern, n) | {"mesh": mesh}) as trial:
+            with bench.simulation(hinged_strip(pattern, n) | {"mesh": mesh}) as trial:
                 height = heights(trial, trial.mass / DENSITY)
             tips = [row * (along + 1) + along for row in range(across + 1)]
             beam = 1.0 / (8.0 * expected(pattern))
-            found.append(Measured(_wide(pattern, across), float(height[tips].mean() / beam), 1.0))
-    return found
+            name = f"deflection over that with B_effective, {pattern}, {across} cells wide"
+            yield Measured(name, float(height[tips].mean() / beam), 1.0)
 
 
 PLATES, EXACT = load_data("hinge_plate"), load_data("linear_plate")["deflection"]
@@ -282,15 +246,7 @@ def square_plate(edges: str, pattern: str, n: int) -> dict[str, Any]:
     return _plate(grid(1.0, 1.0, n, n, pattern), handles=held(edges))
 
 
-@case(
-    "Linear plates (C clamped, S supported, F free edges) with hinges under uniform load: error of the "
-    "deflection against the error that is predicted for the mesh",
-    source=PLATES["source"],
-    resolutions=(8, 16, 32, 64),
-    claim=Exact(1e-7),  # round-off: the condition number grows with n⁴
-)
-def hinge_plate(bench: Bench, n: float) -> Sequence[Measured]:
-    found = []
+def hinge_plate(bench: Bench, n: float) -> Iterator[Measured]:
     for edges, pattern, *errors in PLATES["rows"]:
         with bench.simulation(square_plate(edges, pattern, round(n))) as trial:
             height, points = heights(trial, trial.mass), trial.x[:, :2]
@@ -298,29 +254,18 @@ def hinge_plate(bench: Bench, n: float) -> Sequence[Measured]:
         exact = EXACT.get(f"{edges} 0") or EXACT[f"{edges} 0.3"]
         at = int(np.argmin(np.linalg.norm(points - exact["place"], axis=1)))
         error = height[at] / exact["at"] - 1.0
-        predicted = errors[hinge_plate.resolutions.index(n)]
-        found.append(Measured(f"error of the deflection, {edges} {pattern}", error, predicted, scale=1.0))
-    return found
+        predicted = errors[(8, 16, 32, 64).index(round(n))]  # the columns of the table
+        yield Measured(f"error of the deflection, {edges} {pattern}", error, predicted, scale=1.0)
 
 
-@case(
-    "Clamped strip: frequencies from the assembled K and M against the beam's with B_effective",
-    source="Euler-Bernoulli beam, closed form: ω = (βL)² √(B/(ρ L⁴))",
-    resolutions=(16, 32, 64),
-    claim=Converges(2.0, 2e-3),
-    quick=3,
-    counts="cells along the strip",
-)
-def strip_vibration(bench: Bench, n: float) -> Sequence[Measured]:
+def strip_vibration(bench: Bench, n: float) -> Iterator[Measured]:
     # roots of cos βL cosh βL = −1
     beta_l = (1.8751040687119611, 4.694091132974175, 7.854757438237613)
-    found = []
     for pattern in PATTERNS:
-        across = strip(pattern, n)
+        across = hinged_strip(pattern, n)
         across["handles"].append({"group": "sheet", "axes": ["x", "y"]})
         with bench.simulation(across) as trial:
             omegas, _ = lowest_modes(trial, len(beta_l))
         for number, (omega, beta) in enumerate(zip(omegas, beta_l, strict=True), 1):
             exact = beta**2 * np.sqrt(expected(pattern) / DENSITY)
-            found.append(Measured(f"ω{number}, {pattern}", float(omega), float(exact), "rad/s"))
-    return found
+            yield Measured(f"ω{number}, {pattern}", float(omega), float(exact), "rad/s")

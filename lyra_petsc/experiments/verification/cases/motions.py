@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.verification_case import (
-    Converges,
-    Exact,
     Measured,
-    case,
     grid,
     isotropic,
     scene,
@@ -35,14 +32,6 @@ def _sheet(nx: int, n: float, end: float, density: float, **more: Any) -> dict[s
     return scene(grid(1.0, 0.6, nx, 3, "alternating"), material, time, **more)
 
 
-@case(
-    "Free fall of a sheet, backward Euler: z against −g Δt² n(n+1)/2 and against −g t²/2",
-    source="closed form",
-    resolutions=(10, 100, 1000),
-    claim=Exact(1e-10),
-    claims={"mean z, continuous answer": Converges(1.0, 1.1e-2, slack=1e-6)},
-    counts="steps per second",
-)
 def free_fall(bench: Bench, n: float) -> Sequence[Measured]:
     end = 0.1
     with bench.simulation(_sheet(5, n, end, 0.2, gravity=[0, 0, -G])) as trial:
@@ -76,20 +65,6 @@ def level_fall(n: float, end: float) -> tuple[float, float]:
     return v, z
 
 
-@case(
-    "Sheets falling in still air, level (force ρ A v²) and edge-on (drag A v), backward Euler",
-    source=(
-        "closed form v = vt tanh(g t/vt), z = -(vt^2/g) ln cosh(g t/vt), vt = sqrt(rho g/rho_air); backward "
-        "Euler solves its quadratic"
-    ),
-    resolutions=(50, 100, 200, 400),
-    claim=Exact(1e-10),
-    claims={
-        "depth of a level sheet, exact in time": Converges(1.0, 2e-3, slack=0.1),
-        "speed of a sheet edge-on, exact in time": Converges(1.0, 1e-2, slack=0.3),
-    },
-    counts="steps per second",
-)
 def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
     def scene(gravity: list[float], air: float, drag: float) -> dict[str, Any]:
         wind = {"velocity": [0, 0, 0], "density": air, "drag": drag}
@@ -141,14 +116,6 @@ def _states(trial: Trial) -> NDArray[np.complex128]:
     return np.asarray(trial.x[:, 2] + 1j * trial.v[:, 2] / OMEGA)
 
 
-@case(
-    "A sheet on springs, backward Euler: amplification 1/√(1 + ω²Δt²) and phase atan ωΔt of a step",
-    source="closed form",
-    resolutions=(0.1, 1, 10, 100, 1000),
-    claim=Exact(1e-10),
-    quick=3,
-    counts="1/(ωΔt)",
-)
 def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
     spring_steps = 3
     amplification, phase = 1.0 / math.hypot(1.0, 1.0 / n), math.atan(1.0 / n)
@@ -171,9 +138,6 @@ def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
 STEPS = 10
 TRIANGLE_DENSITY, RADIUS, DT = 0.2, 1.0, 1e-2
 """Density [kg/m²], radius [m], Δt [s]"""
-
-
-RIGID = "angle of a step, of a rigid body"
 
 
 def _stiffness(n: float) -> float:
@@ -209,15 +173,6 @@ def _backward_euler(n: float) -> tuple[float, float]:
     return angle, abs(x)
 
 
-@case(
-    "A stiff triangle spinning freely, backward Euler: angle of the tenth step",
-    source="closed form, from x_next cross (x_next - 2 x + x_before) = 0",
-    resolutions=(1, 2, 10, 100, 1000),
-    claim=Exact(1e-10),
-    claims={RIGID: Exact(1e-5)},
-    quick=3,
-    counts="1/(ωΔt)",
-)
 def rigid_rotation(bench: Bench, n: float) -> Sequence[Measured]:
     corners = 0.5 * np.pi + 2.0 / 3.0 * np.pi * np.arange(3)
     vertices = RADIUS * np.column_stack([np.cos(corners), np.sin(corners), np.zeros(3)])
@@ -242,5 +197,5 @@ def rigid_rotation(bench: Bench, n: float) -> Sequence[Measured]:
     return [
         Measured("angle of a step, of the elastic triangle", angle, exact, "rad"),
         Measured("radius at the end", float(np.linalg.norm(x, axis=1).max()), radius, "m"),
-        Measured(RIGID, angle, rigid, "rad"),
+        Measured("angle of a step, of a rigid body", angle, rigid, "rad"),
     ]

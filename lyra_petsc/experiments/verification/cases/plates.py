@@ -23,11 +23,7 @@ from lyra_petsc.experiments.verification.flat_plates import (
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
-    Converges,
-    Exact,
     Measured,
-    at_finest,
-    case,
     load_data,
     scene,
     worst_value,
@@ -42,13 +38,6 @@ FINE_ENOUGH = {"force_tolerance": 1e-6, "step_tolerance": 1e-6}
 iterations, while two give nine digits."""
 
 
-@case(
-    "Plates (C clamped, S supported, F free edges) under a small uniform load, bending_model: midedge: "
-    "deflection against Kirchhoff's plate",
-    source=EXACT["source"],
-    resolutions=(8, 16, 32, 64, 128),
-    claim=Converges(2.0, 2e-3, slack=0.4),
-)
 def plate(bench: Bench, n: float) -> Iterator[Measured]:
     # deflection over the side. Stretching changes the relative deflection by 220 times its square
     largest = 1e-4
@@ -78,17 +67,6 @@ def _at(x: float, y: float) -> dict[str, Any]:
     return {"box": [[x - 1e-6, y - 1e-6, -1.0], [x + 1e-6, y + 1e-6, 1.0]]}
 
 
-@case(
-    "Free plates bent by moments along two sides, and twisted by forces at the corners, bending_model: "
-    "midedge: curvatures of the triangle farthest off over the largest; across they are −ν, hinges give "
-    "+0.2 to +0.5 (alternating, criss-cross), and on single diagonals twist what is bent",
-    source=(
-        "Kirchhoff's plate, closed form: κ11 = M/(D (1 − ν²)), κ22 = −ν κ11, κ12 = 0; under forces F at the "
-        "corners κ12 = F/(2 D (1 − ν)) alone"
-    ),
-    resolutions=(2, 4, 8),
-    claim=Exact(1e-7),
-)
 def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
     # curvature × side
     small = 1e-5
@@ -103,9 +81,9 @@ def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
                 mesh = flat_mesh(bench, kind, round(n), round(n))
                 body = [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS]
                 with bench.simulation(scene(mesh, material, AT_ONCE, loads=load, handles=body)) as trial:
-                    found = _curvatures(bench, trial.run()) / small
+                    curvatures = _curvatures(bench, trial.run()) / small
                 for k, name in enumerate(("κ11", "κ22", "κ12")):
-                    value = worst_value(found[:, k], exact[k])
+                    value = worst_value(curvatures[:, k], exact[k])
                     yield Measured(f"{name}, {label}, ν = {poisson:g}, {kind}", value, exact[k], scale=1.0)
 
 
@@ -122,15 +100,6 @@ SHAPES = {"square": (1.0, 1), "strip": (0.2, 2)}
 """Height of plates of length 1 m, and number of cells along the length over n."""
 
 
-@case(
-    "Vibrating plates and strips (C clamped, F free edges), bending_model: midedge: the first three "
-    "frequencies of the assembled K and M, without those of rigid motions",
-    source=VIBRATIONS["source"],
-    resolutions=(20, 40, 80),
-    claim=at_finest(5e-3),
-    quick=1,
-    counts="cells along the square, twice as many along the strip",
-)
 def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
     for shape, (height, finer) in SHAPES.items():
         for label, exact in VIBRATIONS[shape].items():
@@ -143,7 +112,7 @@ def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
                 with bench.simulation(scene(mesh, material, ASSEMBLED, handles=across)) as trial:
                     # shift [1/s²] of the order of the lowest square, needed for the three rigid-body modes of
                     # a free plate
-                    found, _ = lowest_modes(trial, rigid + len(exact), shift=400.0 if rigid else 0.0)
-                for number, (omega, wanted) in enumerate(zip(found[rigid:], exact, strict=True), 1):
+                    omegas, _ = lowest_modes(trial, rigid + len(exact), shift=400.0 if rigid else 0.0)
+                for number, (omega, known) in enumerate(zip(omegas[rigid:], exact, strict=True), 1):
                     name = f"λ{number}, {shape}, {edges}, ν = {poisson}, {kind}"
-                    yield Measured(name, float(omega), float(wanted))
+                    yield Measured(name, float(omega), float(known))

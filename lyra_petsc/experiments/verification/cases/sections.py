@@ -14,9 +14,7 @@ from lyra_petsc.experiments.verification.flat_plates import lowest_squares, plat
 from lyra_petsc.experiments.verification.verification_case import (
     ASSEMBLED,
     STATIC,
-    Converges,
     Measured,
-    case,
     scene,
 )
 
@@ -42,14 +40,6 @@ FRAMES: dict[str, tuple[Section, int, float]] = {
 end of the second strip, and the displacement of this end over P L³/B."""
 
 
-@case(
-    "Frames of two or three strips that bend by directors, ν = 0, with a small force at an end: its "
-    "displacement against that of beams",
-    source="theory of beams, closed form",
-    resolutions=(8, 16, 32),
-    claim=Converges(2.0, 2e-3),
-    counts="cells along each strip",
-)
 def frames(bench: Bench, n: float) -> Iterator[Measured]:
     width, force = 0.25, 1e-5
     for label, (section, axis, exact) in FRAMES.items():
@@ -72,7 +62,7 @@ def frames(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 def _legs(*degrees: float) -> Section:
-    return [(FOOT, (math.cos(math.radians(each)), math.sin(math.radians(each)))) for each in degrees]
+    return [(FOOT, (math.cos(angle), math.sin(angle))) for angle in map(math.radians, degrees)]
 
 
 LENGTH, POISSON = 2.0, 0.3
@@ -104,17 +94,6 @@ def flange(length: float, poisson: float) -> float:
     return float(brentq(condition, lower * (1.0 + 1e-9), lower + 1.0))
 
 
-@case(
-    "Columns of thin walls that meet at an angle, two, three or four at an edge, bending_model: midedge: "
-    "compression at which the lowest eigenvalue changes its sign, against the buckling load of one wall as a "
-    "plate that is supported by the others",
-    source="S. P. Timoshenko, J. M. Gere, Theory of Elastic Stability, 2nd ed. 1961, §§ 9.2, 9.3",
-    resolutions=(4, 8, 16),
-    claim=Converges(2.0, 5e-3),
-    claims={"N b²/D, square tube": Converges(2.0, 2e-2)},
-    quick=2,
-    counts="cells across each wall",
-)
 def sections(bench: Bench, n: float) -> Iterator[Measured]:
     for label, (section, length, straight) in SECTIONS.items():
         rows = round(n * length)

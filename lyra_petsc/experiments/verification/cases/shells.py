@@ -15,10 +15,7 @@ from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.experiments.verification.rods import cantilever, pressed_tip
 from lyra_petsc.experiments.verification.verification_case import (
     STATIC,
-    Converges,
     Measured,
-    at_finest,
-    case,
     grid,
     load_data,
     scene,
@@ -71,12 +68,12 @@ def worst_of_table(
     ``measure`` compares a probe with the row of the table.
     """
     rows = {round(row[0], 6): np.array(row[1:]) for row in TABLES[table]["rows"]}
-    found, value = [], np.empty(0)
+    compared, value = [], np.empty(0)
     for factor, trial in increments(bench, content, INCREMENT):
         value, exact = probe(trial), rows.get(round(factor, 6))
         if exact is not None:
-            found.append(measure(value, exact))
-    return worst(found), value
+            compared.append(measure(value, exact))
+    return worst(compared), value
 
 
 def of_points(points: str, label: str, unit: str) -> Callable[[Array, Array], list[Measured]]:
@@ -107,61 +104,34 @@ def _tips(bench: Bench, n: float, kind: str, loads: list[dict[str, Any]]) -> tup
     return worst_of_table(bench, strip, f"cantilever_end_{kind}", tip(LENGTHS[kind]), measure)
 
 
-@case(
-    "Cantilever under a shear force at its end, bending_model: midedge: displacement of the tip at 20 loads "
-    "against the table, and at full load against the elastica with the strip's stretch",
-    source=f"{TABLES['cantilever_end_shear']['source']}; elastica by collocation",
-    resolutions=(10, 20, 40, 80),
-    claim=at_finest(2e-3),
-    claims={"displacement of the tip at full load": Converges(2.0, 1e-3, slack=0.5)},
-    counts="cells along the strip",
-)
 def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
     loads = [{"group": "right", "force": [0.0, 0.0, 4.0]}]
-    found, end = _tips(bench, n, "shear", loads)
+    tips, end = _tips(bench, n, "shear", loads)
     length, membrane = LENGTHS["shear"], 1.2e6 * 0.1
     exact = cantilever(0.0, 4.0 * length**2 / STIFFNESS, STIFFNESS / (membrane * length**2))
     u = np.array([1.0 - exact.reach, exact.drop]) * length
-    return [*found, vector_error("displacement of the tip at full load", end, u, "m")]
+    return [*tips, vector_error("displacement of the tip at full load", end, u, "m")]
 
 
-@case(
-    "Cantilever that a moment at its end rolls up into a full circle, bending_model: midedge: displacement "
-    "of the tip at 20 loads against the table, and at full load against the circle",
-    source=f"{TABLES['cantilever_end_moment']['source']}; closed form",
-    resolutions=(12, 24, 48, 96),
-    claim=at_finest(1e-2),
-    claims={"−U at full load": Converges(2.0, 5e-3, slack=0.5)},
-    counts="cells along the strip",
-)
 def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
     length = LENGTHS["moment"]
     loads = [{"group": "right", "moment": 2.0 * math.pi * STIFFNESS / length}]
-    found, end = _tips(bench, n, "moment", loads)
-    return [*found, Measured("−U at full load", float(end[0]), length, "m")]
+    tips, end = _tips(bench, n, "moment", loads)
+    return [*tips, Measured("−U at full load", float(end[0]), length, "m")]
 
 
-@case(
-    "Cantilever under a follower pressure, bending_model: midedge: displacement of the tip against the rod",
-    source="equations of an inextensible rod, integrated from the tip",
-    resolutions=(20, 40, 80),
-    claim=Converges(2.0, 3e-3, slack=0.3),
-    counts="cells along the strip",
-)
-def pressed_strip(bench: Bench, n: float) -> Sequence[Measured]:
+def pressed_strip(bench: Bench, n: float) -> Iterator[Measured]:
     # pressures q L³/B; the second one bends the strip by more than half a circle
     pressures = (6.0, 30.0)
     mesh = grid(1.0, 0.1, round(n), round(0.1 * n), "alternating")
     strip = scene(mesh, plate_material(1e6), handles=[{"group": "left", "clamp": True}])
     content = strip | {"loads": [{"pressure": pressures[-1]}]}
-    found: list[Measured] = []
     for factor, trial in increments(bench, content, 0.1):
-        load = next((each for each in pressures if math.isclose(each, factor * pressures[-1])), None)
+        load = next((load for load in pressures if math.isclose(load, factor * pressures[-1])), None)
         if load is not None:
             x, z = pressed_tip(load)
             name, exact = f"displacement of the tip, q L³/B = {load:g}", np.array([1.0 - x, z])
-            found.append(vector_error(name, tip(1.0)(trial), exact, "m"))
-    return found
+            yield vector_error(name, tip(1.0)(trial), exact, "m")
 
 
 def _line_load(ends: Sequence[int], force: Array) -> list[dict[str, Any]]:
@@ -182,9 +152,9 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
     edge = [j * (around + 1) for j in range(n + 1)]
     loads = _line_load(edge, np.array([0.0, 0.0, 3.2]))  # 0.8 N/m on 4 m
     material = {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0}
-    held = [{"nodes": [each + around for each in edge], "clamp": True}]
-    made = scene(bench.mesh(vertices, faces[:, ::-1]), material, handles=held, loads=loads)
-    return made, (edge[0], edge[-1])
+    held = [{"nodes": [vertex + around for vertex in edge], "clamp": True}]
+    content = scene(bench.mesh(vertices, faces[:, ::-1]), material, handles=held, loads=loads)
+    return content, (edge[0], edge[-1])
 
 
 DISC = {"young": 1e7, "poisson": 0.3, "thickness": 0.01, "density": 1.0}
@@ -216,48 +186,19 @@ def _disc(bench: Bench, n: float, load: float, step: float, **held: Any) -> floa
         return float(trial.run().x[middle, 2])
 
 
-@case(
-    "Round plate with a clamped rim under a uniform load, whose deflection exceeds its thickness, "
-    "bending_model: midedge: deflection in the middle",
-    source="von Kármán's equations of round plates, by collocation",
-    resolutions=(8, 16, 32),
-    claim=at_finest(5e-3),
-    counts="edges along the radius",
-    quick=2,
-)
 def clamped_disc(bench: Bench, n: float) -> Iterator[Measured]:
     for load, exact in DEFLECTIONS.items():
-        found = _disc(bench, n, load, 0.25, clamp=True) / DISC["thickness"]
-        yield Measured(f"deflection over thickness, load {load:g} E h⁴/a⁴", found, exact)
+        deflection = _disc(bench, n, load, 0.25, clamp=True) / DISC["thickness"]
+        yield Measured(f"deflection over thickness, load {load:g} E h⁴/a⁴", deflection, exact)
 
 
-@case(
-    "Round plate on a supported rim under a small uniform load, bending_model: midedge: deflection in the "
-    "middle. The rim is a polygon: elements with continuous slopes would converge to a deflection that is "
-    "26 % smaller (paradox of I. Babuška)",
-    source="Kirchhoff's plate, closed form: w = (5 + ν)/(1 + ν) q a⁴/(64 D)",
-    resolutions=(8, 16, 32),
-    claim=Converges(2.0, 1e-3, slack=0.3),
-    counts="edges along the radius",
-    quick=2,
-)
 def supported_disc(bench: Bench, n: float) -> Iterator[Measured]:
     load, poisson = 1e-4, DISC["poisson"]
-    found = _disc(bench, n, load, 1.0) / DISC["thickness"] / load
+    deflection = _disc(bench, n, load, 1.0) / DISC["thickness"] / load
     exact = 12.0 * (1.0 - poisson**2) / 64.0 * (5.0 + poisson) / (1.0 + poisson)
-    yield Measured("deflection over q a⁴/(E h³)", found, exact)
+    yield Measured("deflection over q a⁴/(E h³)", deflection, exact)
 
 
-@case(
-    "Slit annular plate under a lifting line force, bending_model: midedge: height of the free slit's ends A "
-    "(inner) and B at 20 loads against the table, and at full load against Kirchhoff-Love shells",
-    source=TABLES["slit_annulus"]["source"],
-    resolutions=(6, 12, 24),
-    claim=Converges(1.8, 5e-3, slack=0.6),
-    claims={f"height of {end}, worst load of the table": at_finest(1e-2) for end in "AB"},
-    counts="cells across, 6.7 n around",
-    quick=1,
-)
 def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
     plate, ends = slit_annulus_scene(bench, round(n))
     measure = of_points("AB", "height of {}, worst load of the table", "m")
@@ -265,9 +206,9 @@ def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
     def heights(trial: Trial) -> Array:
         return trial.x[list(ends), 2]
 
-    found, height = worst_of_table(bench, plate, "slit_annulus", heights, measure)
+    worst_errors, height = worst_of_table(bench, plate, "slit_annulus", heights, measure)
     full = np.array(TABLES["slit_annulus"]["kirchhoff_love"])
-    return found + of_points("AB", "height of {} at full load", "m")(height, full)
+    return worst_errors + of_points("AB", "height of {} at full load", "m")(height, full)
 
 
 # -- curved shells, linear -----------------------------------------------------------------------------
@@ -281,8 +222,8 @@ def plane_box(axis: str, at: float, size: float) -> list[list[float]]:
     # tolerance of a coordinate over the size of the shell within which vertices count as on a plane
     beside = 1e-6
     return [
-        [at - beside * size if each == axis else -far for each in "xyz"],
-        [at + beside * size if each == axis else far for each in "xyz"],
+        [at - beside * size if direction == axis else -far for direction in "xyz"],
+        [at + beside * size if direction == axis else far for direction in "xyz"],
     ]
 
 
@@ -309,8 +250,8 @@ def _curved(
     """Displacements (V, 3) [m] of n × n cells on a surface; collective."""
     mesh, vertices = curved_mesh(bench, (n, n), pattern, surface)
     tight = {"solver": {"force_tolerance": 1e-8}, "petsc": {"ksp_rtol": 1e-8}}
-    given = {"gravity": [0, 0, 0]} | tight | more
-    with bench.simulation(scene(mesh, material, STATIC | {"step": 1.0}, **given)) as trial:
+    content = scene(mesh, material, STATIC | {"step": 1.0}, gravity=[0, 0, 0]) | tight | more
+    with bench.simulation(content) as trial:
         return trial.run().x - vertices
 
 
@@ -323,14 +264,6 @@ def cylinder(radius: float, angle: float, length: float) -> Surface:
     return surface
 
 
-@case(
-    "Scordelis-Lo roof under its weight, a quarter of it, bending_model: midedge: deflection in the middle "
-    "of the free edge",
-    source=LINEAR["source"],
-    resolutions=(8, 16, 32, 64),
-    claim=at_finest(1e-2),
-    claims={f"deflection, {pattern}, deep shell": Converges(1.7, 5e-3, slack=0.4) for pattern in PATTERNS},
-)
 def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
     part, half = 1e-3, 25.0  # part of the load, so small that the response is linear to 1e-5
     for pattern in PATTERNS:
@@ -339,47 +272,28 @@ def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
         held = [*symmetric("xy", 25.0), {"box": plane_box("y", half, 25.0), "axes": ["x", "z"]}]
         surface = cylinder(25.0, math.radians(40.0), half)
         u = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
-        found = float(-u[round(n), 2]) / part
-        yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
-        yield Measured(f"deflection, {pattern}, deep shell", found, LINEAR["deep_roof"], "m")
+        deflection = float(-u[round(n), 2]) / part
+        yield Measured(f"deflection, {pattern}", deflection, LINEAR["roof"], "m")
+        yield Measured(f"deflection, {pattern}, deep shell", deflection, LINEAR["deep_roof"], "m")
 
 
-ORDER = 1.5
-"""Order of the deflection under a point load, where curvatures are unbounded."""
-
-
-@case(
-    "Pinched cylinder between rigid diaphragms, an eighth of it, bending_model: midedge: deflection under "
-    "the load, and what it is extrapolated to from half as many cells",
-    source=LINEAR["source"],
-    resolutions=(32, 64, 128),
-    claim=Converges(ORDER, 3e-2, slack=0.3),
-    claims={f"deflection, {pattern}, extrapolated": at_finest(1e-2) for pattern in PATTERNS},
-    quick=1,
-)
 def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
     force = 100.0
     for pattern in PATTERNS:
         material = {"young": 3e6, "poisson": 0.3, "thickness": 3.0, "density": 1.0}
         loads = [{"nodes": [0], "force": [0.0, 0.0, -force / 4.0]}]
         held = [{"box": plane_box("y", 300.0, 300.0), "axes": ["x", "z"]}, *symmetric("xyz", 300.0)]
-        given = (cylinder(300.0, 0.5 * math.pi, 300.0), material)
+        shell = (cylinder(300.0, 0.5 * math.pi, 300.0), material)
         coarse, fine = (
-            float(-_curved(bench, cells, pattern, *given, loads=loads, handles=held)[0, 2]) / force
+            float(-_curved(bench, cells, pattern, *shell, loads=loads, handles=held)[0, 2]) / force
             for cells in (round(n) // 2, round(n))
         )
-        last = fine + (fine - coarse) / (2.0**ORDER - 1.0)
+        # the order 1.5 of the deflection under a point load, where curvatures are unbounded
+        last = fine + (fine - coarse) / (2.0**1.5 - 1.0)
         yield Measured(f"deflection, {pattern}", fine, LINEAR["cylinder"], "m/N")
         yield Measured(f"deflection, {pattern}, extrapolated", last, LINEAR["cylinder"], "m/N")
 
 
-@case(
-    "Hemisphere with a hole of 18°, pulled and pressed at its equator, a quarter of it, bending_model: "
-    "midedge: mean displacement of the loads",
-    source=LINEAR["source"],
-    resolutions=(8, 16, 32, 64),
-    claim=at_finest(1e-2),
-)
 def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
     part, cells = 0.02, round(n)  # part of the load; quadratic terms cancel in the mean of both loads
     for pattern in PATTERNS:
@@ -397,13 +311,6 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
         yield Measured(f"displacement of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
 
 
-@case(
-    "Hyperbolic paraboloid z = x² − y² that is clamped at one side, a thousandth as thick as wide, under its "
-    "weight, a half of it, bending_model: midedge: deflection in the middle of the opposite side",
-    source=TABLES["hyperbolic_paraboloid"]["source"],
-    resolutions=(16, 32, 64),
-    claim=at_finest(1e-2),
-)
 def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
     part, cells = 1e-2, round(n)  # part of the load, for a linear response
     for pattern in PATTERNS:
@@ -420,14 +327,6 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
         yield Measured(f"deflection, {pattern}", float(-u[cells, 2]) / part, exact, "m")
 
 
-@case(
-    "Beam twisted by a right angle, very thin, with a force at its end in its plane there or across it, "
-    "bending_model: midedge: displacement of the force",
-    source=TABLES["twisted_beam"]["source"],
-    resolutions=(48, 96, 192),
-    claim=at_finest(5e-3),
-    counts="cells along the beam",
-)
 def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
     length, width, force = 12.0, 1.1, 1e-6
 
@@ -468,14 +367,6 @@ def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, A
     return scene(mesh, material, handles=symmetric("xyz", radius), loads=loads), vertices, n
 
 
-@case(
-    "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: displacements of the "
-    "load (A) and of the middle (B) and the end (C) of its side at 20 loads against the table",
-    source=TABLES["open_cylinder"]["source"],
-    resolutions=(16, 32, 64),
-    claim=at_finest(1e-2),
-    quick=1,
-)
 def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
     for pattern in PATTERNS:
         content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
@@ -488,15 +379,6 @@ def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
         yield from worst_of_table(bench, content, "open_cylinder", displacements, measure)[0]
 
 
-@case(
-    "Shallow cylindrical roof, hinged at its straight edges, whose middle is pushed through, a quarter, "
-    "bending_model: midedge: distance of the table from the computed curve of load over deflection, "
-    "relative to its extent, and the largest and the smallest load",
-    source=TABLES["hinged_roof"]["source"],
-    resolutions=(8, 16, 32),
-    claim=at_finest(1e-2),
-    quick=2,
-)
 def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
     # final deflection at the centre of the roof [mm]
     deflection = 30.0
@@ -520,11 +402,11 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
             curve.append((factor * deflection, -4.0 * push / 3000.0))  # over the largest load [N]
         extent = deflections.max(), loads.max()
         distance = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
-        found = np.interp(deflections, *np.array(curve).T)
+        computed = np.interp(deflections, *np.array(curve).T)
         up, down = loads[:16], slice(16, 25)  # before and after snap-through
         yield Measured(f"distance of the table from the curve, {pattern}", 1.0 + float(distance.max()), 1.0)
-        yield Measured(f"largest load, {pattern}", float(found[: len(up)].max()), float(up.max()))
-        yield Measured(f"smallest load, {pattern}", float(found[down].min()), float(loads[down].min()))
+        yield Measured(f"largest load, {pattern}", float(computed[: len(up)].max()), float(up.max()))
+        yield Measured(f"smallest load, {pattern}", float(computed[down].min()), float(loads[down].min()))
 
 
 def _distance(points: Array, line: Array) -> Array:
