@@ -1,9 +1,9 @@
-"""Errors of a run against a reference at the sample times.
+"""Errors of a run against a reference at the sample times, computed on one rank.
 
-Each rank compares a slab of vertices, so that no rank holds a whole state. Between different meshes of the
-same sheets each vertex gets the barycentric coordinates of the closest point of its sheet in the other mesh's
-rest shape. On flat sheets this is linear interpolation in material coordinates; where two meshes approximate
-a curved outline or surface differently, vertices are projected onto the closest triangle.
+Between different meshes of the same sheets each vertex gets the barycentric coordinates of the closest point
+of its sheet in the other mesh's rest shape. On flat sheets this is linear interpolation in material
+coordinates; where two meshes approximate a curved outline or surface differently, vertices are projected onto
+the closest triangle.
 """
 
 from __future__ import annotations
@@ -11,31 +11,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from mpi4py import MPI
-from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, StudyQuantity
 from lyra_petsc.mesh.measures import bounding_diagonal
-from lyra_petsc.output.file_operations import on_every_rank
-from lyra_petsc.output.read_run import ENERGIES, Columns, read_table, stored_states
-from lyra_petsc.output.stored import StoredMesh, open_stored
-from lyra_petsc.parallel import on_root
-
-ROWS_AT_ONCE = 1 << 16
-"""Rows of a file that a rank reads at once."""
+from lyra_petsc.output.read_run import ENERGIES, Columns, StoredRun, read_table
+from lyra_petsc.output.stored import StoredMesh
 
 
 @dataclass
 class RestSurface:
-    """The rest shape of a run's mesh, on rank 0.
+    """The rest shape of a run's mesh.
 
     Attributes
     ----------
@@ -64,18 +55,15 @@ class RestSurface:
 
 @dataclass
 class Samples:
-    """Data of a run at the sample times; the same on all ranks.
+    """Data of a run or an exact motion at the sample times.
 
     Attributes
     ----------
-    folder : Path
-    times : tuple of float
+    times : sequence of float
         [s].
-    files : tuple of (str, str)
-        File and dataset of the positions at each time.
-    n_vertices : int
-    size : float
-        Diagonal [m] of the bounding box of the rest shape.
+    positions : callable
+        Positions (V, 3) [m] by the number of a sample.
+    surface : RestSurface
     energies : (T, 4) float64
         Kinetic, membrane, bending and potential energy [J] at each time.
     exchanged : float
@@ -86,70 +74,17 @@ class Samples:
         Number of vertices of each mesh source; needed for runs on different meshes.
     """
 
-    folder: Path
-    times: tuple[float, ...]
-    files: tuple[tuple[str, str], ...]
-    n_vertices: int
-    size: float
+    times: Sequence[float]
+    positions: Callable[[int], Array]
+    surface: RestSurface
     energies: Array
     exchanged: float
     probes: dict[str, Array]
     sheets: Sequence[int] = ()
 
-    def rows(self, comm: MPI.Comm, sample: int, wanted: Ints | None = None) -> Array:
-        """Positions (n, 3) [m] of this rank's slab of vertices, or of the vertices ``wanted``; collective.
-
-        Parameters
-        ----------
-        comm : MPI.Comm
-        sample : int
-        wanted : (n,) int, optional
-            Ascending vertex numbers.
-
-        Raises
-        ------
-        InputError
-            On every rank, if the file cannot be read.
-        """
-        file, dataset = self.files[sample]
-
-        def read() -> Array:
-            with open_stored(self.folder / file) as opened:
-                stored = opened[dataset]
-                if wanted is not None:
-                    return _read_rows(stored, wanted)
-                return stored[slice(*slab(comm, self.n_vertices))]
-
-        return on_every_rank(comm, read)
-
-
-def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:
-    """First row and the row after the last of a rank's share of n rows; by default of this rank."""
-    rank = comm.rank if rank is None else rank
-    return rank * n // comm.size, (rank + 1) * n // comm.size
-
-
-def scatter(comm: MPI.Comm, rows: NDArray[Any] | None) -> NDArray[Any]:
-    """Distribute rows (n, …) of rank 0; returns this rank's slab; collective."""
-    pieces: list[NDArray[Any]] = []
-    if rows is not None:
-        pieces = [rows[slice(*slab(comm, len(rows), rank))] for rank in range(comm.size)]
-    return np.asarray(comm.scatter(pieces, root=0))
-
-
-def _read_rows(stored: Any, wanted: Ints) -> Array:
-    """Some rows of a dataset, read in pieces so that a rank never holds all of it."""
-    out = np.empty((len(wanted), 3))
-    for start in range(0, stored.shape[0], ROWS_AT_ONCE):
-        first, last = np.searchsorted(wanted, [start, start + ROWS_AT_ONCE])
-        if last > first:
-            piece = stored[start : start + ROWS_AT_ONCE]
-            out[first:last] = piece[wanted[first:last] - start]
-    return out
-
 
 def read_surface(folder: Path) -> RestSurface:
-    """Read the rest shape of a run. For rank 0.
+    """Read the rest shape of a run.
 
     Raises
     ------
@@ -164,10 +99,8 @@ def read_surface(folder: Path) -> RestSurface:
     return RestSurface(rest, triangles, areas)
 
 
-def read_samples(
-    comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()
-) -> Samples:
-    """Read the data of a run at the sample times; collective.
+def read_samples(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
+    """Read the data of a run at the sample times.
 
     Parameters
     ----------
@@ -182,40 +115,29 @@ def read_samples(
     Raises
     ------
     InputError
-        On every rank, if a state, the mesh or the history is missing.
+        If a state, the mesh or the history is missing.
     """
-    return on_root(comm, lambda: read_local(folder, times, spacing, sheets))
-
-
-def read_local(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
-    """As ``read_samples``, on one rank only."""
-    states = stored_states(folder)
-    at = np.array([state.time for state in states])
-    files = []
-    for time in times:
-        nearest = int(np.abs(at - time).argmin())
-        # fraction of the time between samples by which the time of a state may differ from a sample time
-        if abs(at[nearest] - time) > 1e-6 * spacing:
+    run = StoredRun(folder)
+    states = [run.at(time) for time in times]
+    for time, state in zip(times, states, strict=True):
+        if abs(run.times[state] - time) > 1e-6 * spacing:
             raise InputError(
                 f"has no state at t = {time:g} s, which is a sample time (its states run from "
-                f"{at.min():g} to {at.max():g} s); run it with output.every = {spacing:g}",
+                f"{run.times.min():g} to {run.times.max():g} s); run it with output.every = {spacing:g}",
                 file=folder,
             )
-        number = states[nearest].number
-        files.append((states[nearest].file, f"states/{number:06d}/position"))
-    surface = read_surface(folder)
-    history, at_samples = _table(folder / "history.csv", times)
+    history, rows = _table(folder / "history.csv", times)
     energies = np.column_stack([history[name] for name in ENERGIES])
     probes = {}
     if (folder / "probes.csv").is_file():
-        table, chosen = _table(folder / "probes.csv", times)
+        table, at_samples = _table(folder / "probes.csv", times)
         for name in (name.removesuffix("_x") for name in table if name.endswith("_x")):
-            probes[name] = np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[chosen]
+            probes[name] = np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[at_samples]
     exchanged = float(np.abs(energies - energies[0]).max())
+    surface = read_surface(folder)
     return Samples(
-        folder, tuple(times), tuple(files), len(surface.rest), surface.size, energies[at_samples], exchanged,
-        probes, sheets,
-    )  # fmt: skip
+        times, lambda i: run.positions[states[i]], surface, energies[rows], exchanged, probes, sheets
+    )
 
 
 def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
@@ -226,63 +148,38 @@ def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
     return columns, [int(np.abs(columns["time"] - time).argmin()) for time in times]
 
 
-@dataclass
-class Interpolation:
-    """Interpolation from another mesh at this rank's slab of points.
+def samples_of_motion(motion: ExactMotion, run: Samples) -> Samples:
+    """An exact motion at the vertices, probes and sample times of a run."""
+    start = run.positions(0)
+    forms = [motion.energies(t) for t in run.times]
+    energies = np.array([[form.kinetic, form.membrane, 0.0, form.potential] for form in forms])
+    return replace(
+        run,
+        positions=lambda i: motion.positions(start, run.times[i]),
+        energies=energies,
+        exchanged=float(np.abs(energies - energies[0]).max()),
+        probes={
+            name: np.concatenate([motion.positions(path[:1], t) for t in run.times])
+            for name, path in run.probes.items()
+        },
+    )
 
-    Attributes
-    ----------
-    wanted : (m,) int64
-        Vertices of the other mesh that this rank reads, ascending.
-    corner : (n, 3) int64
-        Corners of the triangle of each point, as indices into ``wanted``.
-    weight : (n, 3) float64
-        Barycentric coordinates.
+
+def interpolation(
+    points: RestSurface, point_sheets: Sequence[int], other: RestSurface, other_sheets: Sequence[int]
+) -> tuple[Ints, Array]:
+    """Corners (V, 3) in ``other`` and their weights (V, 3) for the vertices of ``points``.
+
+    The sheets are numbers of vertices; the vertices of a sheet are numbered consecutively.
     """
-
-    wanted: Ints
-    corner: Ints
-    weight: Array
-
-    def rows(self, comm: MPI.Comm, samples: Samples, sample: int) -> Array:
-        """Positions (n, 3) [m] of the other mesh's surface at this rank's points; collective."""
-        found = samples.rows(comm, sample, self.wanted)
-        return np.einsum("nc,nci->ni", self.weight, found[self.corner])
-
-
-def make_interpolation(
-    comm: MPI.Comm,
-    points: RestSurface | None,
-    point_sheets: Sequence[int],
-    other: RestSurface | None,
-    other_sheets: Sequence[int],
-) -> Interpolation:
-    """Make the interpolation from ``other`` to the vertices of ``points``; collective, computed on rank 0.
-
-    Parameters
-    ----------
-    points, other : RestSurface
-        Needed on rank 0 only.
-    point_sheets, other_sheets : sequence of int
-        Number of vertices of each sheet; the vertices of a sheet are numbered consecutively.
-    """
-
-    def locate() -> tuple[Ints, Array]:
-        assert points is not None
-        assert other is not None
-        corner = np.empty((len(points.rest), 3), dtype=np.int64)
-        weight = np.empty((len(points.rest), 3))
-        ends, others = np.cumsum([0, *point_sheets]), np.cumsum([0, *other_sheets])
-        for sheet in range(len(point_sheets)):
-            mine = slice(ends[sheet], ends[sheet + 1])
-            first = other.triangles[:, 0]
-            triangles = other.triangles[(first >= others[sheet]) & (first < others[sheet + 1])]
-            corner[mine], weight[mine] = _nearest_triangles(points.rest[mine], other.rest, triangles)
-        return corner, weight
-
-    corner, weight = (scatter(comm, rows) for rows in on_root(comm, locate, share=False) or (None, None))
-    wanted, inverse = np.unique(corner, return_inverse=True)
-    return Interpolation(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
+    corner, weight = np.empty((len(points.rest), 3), dtype=np.int64), np.empty((len(points.rest), 3))
+    ends, others = np.cumsum([0, *point_sheets]), np.cumsum([0, *other_sheets])
+    first = other.triangles[:, 0]
+    for sheet in range(len(point_sheets)):
+        mine = slice(ends[sheet], ends[sheet + 1])
+        triangles = other.triangles[(first >= others[sheet]) & (first < others[sheet + 1])]
+        corner[mine], weight[mine] = _nearest_triangles(points.rest[mine], other.rest, triangles)
+    return corner, weight
 
 
 def _nearest_triangles(points: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
@@ -291,8 +188,8 @@ def _nearest_triangles(points: Array, vertices: Array, triangles: Ints) -> tuple
     corners = vertices[triangles]
     # number of triangles with the nearest centroids among which the closest triangle is searched
     count = min(12, len(triangles))
-    _, found = cKDTree(corners.mean(axis=1)).query(points, k=count)
-    near = np.asarray(found).ravel()
+    _, nearest = cKDTree(corners.mean(axis=1)).query(points, k=count)
+    near = np.asarray(nearest).ravel()
     repeated = np.repeat(points, count, axis=0)
     weights = barycentric(repeated, corners[near])
     distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[near]) - repeated, axis=1)
@@ -333,97 +230,55 @@ Errors = dict[str, float]
 """Relative errors by the name of the quantity; NaN where an error is unknown."""
 
 History = dict[str, Array]
-"""Relative errors at each sample after the start, by the name of the quantity."""
-
-Rows = Callable[[int], Array]
-"""Positions (n, 3) [m] of this rank's points at a sample."""
+"""Relative errors at each sample after the start, by the name of the quantity; empty where unknown."""
 
 
-def motion_errors(
-    comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[StudyQuantity]
-) -> Errors:
-    """Errors of a run against an exact motion; collective."""
-    start, times = samples.rows(comm, 0), samples.times
-    forms = [motion.energies(t) for t in times]
-    exact = np.array([[form.kinetic, form.membrane, 0.0, form.potential] for form in forms])
-    probes = {
-        name: np.concatenate([motion.positions(path[:1], t) for t in times])
-        for name, path in samples.probes.items()
-    }
-    whole = replace(samples, energies=exact, exchanged=float(np.abs(exact - exact[0]).max()), probes=probes)
-
-    def positions() -> History:
-        surface = on_root(comm, lambda: read_surface(samples.folder), share=False)
-        return _distances(comm, samples, lambda i: motion.positions(start, times[i]), surface, samples.size)
-
-    return overall(_errors(samples, whole, quantities, positions))
-
-
-def run_errors(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[StudyQuantity]) -> Errors:
-    """Errors of a run against another, over all samples; collective."""
-    return overall(history_against_run(comm, mine, other, quantities))
-
-
-def history_against_run(
-    comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[StudyQuantity]
-) -> History:
-    """Errors of a run against another at each sample; collective.
+def error_history(run: Samples, reference: Samples, quantities: Sequence[StudyQuantity]) -> History:
+    """Errors of a run against a reference at each sample, by quantity.
 
     On different meshes the finer solution is interpolated at the rest positions of the coarser mesh's
     vertices.
     """
-    return _errors(mine, other, quantities, lambda: _errors_between(comm, mine, other))
-
-
-def _errors(
-    mine: Samples, other: Samples, quantities: Sequence[StudyQuantity], positions: Callable[[], History]
-) -> History:
-    """Errors of the quantities in their order; empty where they are unknown."""
-    found: History = {}
+    errors: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
-        found |= positions()
-    if other.exchanged > 0.0:  # the error of the total over the largest energy exchanged
-        totals = mine.energies.sum(axis=1), other.energies.sum(axis=1)
-        found["energy"] = np.abs(totals[0] - totals[1]) / other.exchanged
+        errors |= _position_errors(run, reference)
+    if reference.exchanged > 0.0:  # the error of the total over the largest energy exchanged
+        totals = run.energies.sum(axis=1), reference.energies.sum(axis=1)
+        errors["energy"] = np.abs(totals[0] - totals[1]) / reference.exchanged
     for quantity in quantities:
         name = quantity.probe
-        if name in mine.probes and name in other.probes:
-            error = mine.probes[name] - other.probes[name]
-            found[quantity.name] = np.asarray(np.linalg.norm(error, axis=1) / other.size)
-    return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
+        if name in run.probes and name in reference.probes:
+            error = run.probes[name] - reference.probes[name]
+            errors[quantity.name] = np.asarray(np.linalg.norm(error, axis=1) / reference.surface.size)
+    return {quantity.name: errors.get(quantity.name, np.empty(0)) for quantity in quantities}
 
 
 def overall(history: History) -> Errors:
     """The error over all samples: root mean square of L2 norms, maximum of other quantities."""
-    found = dict.fromkeys(history, math.nan)
-    for name, errors in history.items():
-        if len(errors):
-            mean = name == MEAN_SQUARE
-            found[name] = math.sqrt(float(np.mean(errors**2))) if mean else float(errors.max())
-    return found
+
+    def one(name: str, errors: Array) -> float:
+        if not len(errors):
+            return math.nan
+        return math.sqrt(float(np.mean(errors**2))) if name == MEAN_SQUARE else float(errors.max())
+
+    return {name: one(name, errors) for name, errors in history.items()}
 
 
-def _errors_between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
-    coarse, fine = (reference, run) if run.n_vertices > reference.n_vertices else (run, reference)
-    found = on_root(comm, lambda: [read_surface(each.folder) for each in (coarse, fine)], share=False)
-    points, other = found or (None, None)
-    same = comm.bcast(points is not None and other is not None and points.same_as(other), root=0)
-    rows: Rows = partial(fine.rows, comm)
+def _position_errors(run: Samples, reference: Samples) -> History:
+    """Largest and area-weighted L2 error at each sample after the start."""
+    coarse, fine = run, reference
+    if len(run.surface.rest) > len(reference.surface.rest):
+        coarse, fine = reference, run
+    areas = coarse.surface.areas / coarse.surface.areas.sum()
+    same = coarse.surface.same_as(fine.surface)
     if not same:
-        rows = partial(make_interpolation(comm, points, coarse.sheets, other, fine.sheets).rows, comm, fine)
-    return _distances(comm, coarse, rows, points, reference.size)
-
-
-def _distances(
-    comm: MPI.Comm, samples: Samples, exact: Rows, surface: RestSurface | None, size: float
-) -> History:
-    """Largest and area-weighted L2 error at each sample after the start; ``surface`` is on rank 0."""
-    areas = scatter(comm, None if surface is None else surface.areas)
-    whole = comm.allreduce(float(areas.sum()))
-    count = len(samples.times) - 1
-    largest, squares = np.empty(count), np.empty(count)
-    for i in range(count):
-        distance = np.linalg.norm(samples.rows(comm, i + 1) - exact(i + 1), axis=1)
-        largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
-        squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
-    return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}
+        corner, weight = interpolation(coarse.surface, coarse.sheets, fine.surface, fine.sheets)
+    largest, squares = [], []
+    for i in range(1, len(run.times)):
+        x = fine.positions(i)
+        x = x if same else np.einsum("nc,nci->ni", weight, x[corner])
+        distance = np.linalg.norm(coarse.positions(i) - x, axis=1)
+        largest.append(distance.max())
+        squares.append(areas @ distance**2)
+    size = reference.surface.size
+    return {"position_max": np.array(largest) / size, MEAN_SQUARE: np.sqrt(squares) / size}

@@ -18,11 +18,11 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from lyra_petsc.errors import InputError, OutputError, SolverError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import failure_message, open_simulation
 from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
-from lyra_petsc.output.file_operations import make_folder, open_output, reason, writing
+from lyra_petsc.output.file_operations import make_folder, writing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, existing_files
 from lyra_petsc.parallel import on_root
@@ -33,6 +33,9 @@ RESULT_FILE = "result.json"
 
 PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
 """Timed phases of a run; ``balance`` is the energy balance; writing files is not timed."""
+
+COUNTS = ("rejected", "newton_iterations", "linear_iterations")
+"""Counts of a run's steps that are summed up."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +158,8 @@ class Result:
 
 def read_result(folder: Path, fingerprint: str) -> Result | None:
     """Read the result of a finished case; None if there is none with this fingerprint."""
-    found = read_record(folder / RESULT_FILE, Result)
-    return found if found is not None and found.fingerprint == fingerprint else None
+    result = read_record(folder / RESULT_FILE, Result)
+    return result if result is not None and result.fingerprint == fingerprint else None
 
 
 CASES = "cases"
@@ -186,13 +189,11 @@ def prepare_folder(folder: Path) -> None:
     ------
     OutputError
     """
-    try:
+    with writing(folder):
         make_folder(folder.parent)
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir()
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be prepared: {reason(error)}") from error
 
 
 Watch = Callable[[float], None]
@@ -207,7 +208,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm_up: bool) -> Result
     comm : MPI.Comm
     job : Job
     watch : callable
-    warm : bool
+    warm_up : bool
         Take one untimed step first, so that the times do not include compiling and loading kernels.
 
     Returns
@@ -257,7 +258,7 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
         recorder, whole = None, simulation.problem.whole
         if repeat == 0:
             result.vertices, result.triangles = whole.n_vertices, whole.n_triangles
-            result.spacing, result.sheets = whole.spacing, [each.n_vertices for each in whole.sources]
+            result.spacing, result.sheets = whole.spacing, [source.n_vertices for source in whole.sources]
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)
@@ -282,9 +283,8 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
         if repeat == 0:
             stack.close()
             result.steps, lengths = len(reports), [report.dt for report in reports]
-            result.rejected = sum(report.rejected for report in reports)
-            result.newton_iterations = sum(report.newton_iterations for report in reports)
-            result.linear_iterations = sum(report.linear_iterations for report in reports)
+            for count in COUNTS:
+                setattr(result, count, sum(getattr(report, count) for report in reports))
             result.shortest, result.longest = min(lengths, default=0.0), max(lengths, default=0.0)
             result.end, result.linear_solver = simulation.time, simulation.stepper.preset
             for path in checkpoint_files(folder) if comm.rank == 0 else ():
@@ -298,10 +298,7 @@ def _run_repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Res
         result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
 
 
-PROGRESS_FILE = "progress"
-
-
-def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
+def launch(launcher: Launcher, job: Job, watch: Callable[[], None], lock: int) -> Result:
     """Run a job in processes of its own.
 
     Parameters
@@ -309,21 +306,19 @@ def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
     launcher : Launcher
     job : Job
     watch : callable
-        Called repeatedly with the completed fraction; if it raises, the processes are terminated.
+        Called repeatedly; if it raises, the processes are terminated.
     lock : int
         File descriptor that the processes keep open, so that the folder stays locked while they run.
     """
     folder = Path(job.folder)
-    job_file, progress = folder.with_name(f"{folder.name}.job.json"), folder / PROGRESS_FILE
-    with writing(folder.parent):
-        make_folder(folder.parent)
+    job_file = folder.with_name(f"{folder.name}.job.json")
+    with writing(folder):
+        make_folder(folder)
     save_record(job_file, job)
     try:
-        _, message = launcher(["--job", str(job_file)], lambda: watch(_read_progress(progress)), (lock,))
-        watch(1.0)
+        _, message = launcher(["--job", str(job_file)], watch, (lock,))
     finally:
         job_file.unlink(missing_ok=True)
-        progress.unlink(missing_ok=True)
     result = read_result(folder, job.fingerprint)
     if result is None:
         result = Result(job.fingerprint, problem=message)
@@ -333,22 +328,8 @@ def launch(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
     return result
 
 
-def _read_progress(progress: Path) -> float:
-    try:
-        return min(1.0, float(progress.read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        return 0.0
-
-
 def run_job(comm: MPI.Comm, path: Path, check_stop: Callable[[], None]) -> None:
-    """Run the job in a file, and report its progress a few times a second; collective.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    path : Path
-    check_stop : callable
-        Called after every step on all ranks; may raise.
+    """Run the job in a file; collective. ``check_stop`` is called after every step and may raise.
 
     Raises
     ------
@@ -358,14 +339,4 @@ def run_job(comm: MPI.Comm, path: Path, check_stop: Callable[[], None]) -> None:
     job = on_root(comm, lambda: read_record(path, Job))
     if job is None:
         raise InputError("is no job of a study", file=path, key="--job")
-    progress, last = Path(job.folder) / PROGRESS_FILE, 0.0
-
-    def watch(fraction: float) -> None:
-        nonlocal last
-        check_stop()
-        if comm.rank == 0 and time.monotonic() - last > 0.3:
-            last = time.monotonic()
-            with writing(progress), open_output(progress) as file:
-                file.write(f"{fraction:.6f}".encode())
-
-    run_case(comm, job, watch, warm_up=True)
+    run_case(comm, job, lambda fraction: check_stop(), warm_up=True)

@@ -8,16 +8,17 @@ import os
 import platform
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from lyra_petsc.experiments.case import Outcome
 from lyra_petsc.experiments.results import View
-from lyra_petsc.experiments.study.jobs import PHASES
+from lyra_petsc.experiments.study.jobs import COUNTS, PHASES
 from lyra_petsc.experiments.study.plan import (
     MEAN_SQUARE,
     Axis,
@@ -47,14 +48,14 @@ def spacing(row: StudyRow, axis: Axis) -> float:
 
 def families(rows: Sequence[StudyRow], axis: Axis | None) -> dict[str, list[StudyRow]]:
     """Rows that ran, grouped so that rows of a group differ in one axis only; coarsest first, by label."""
-    found: dict[str, list[StudyRow]] = {}
+    groups: dict[str, list[StudyRow]] = {}
     for row in rows:
         if row.passed:
-            found.setdefault(shared_label(row, axis), []).append(row)
+            groups.setdefault(shared_label(row, axis), []).append(row)
     if axis is not None:
-        for group in found.values():
+        for group in groups.values():
             group.sort(key=lambda row: -spacing(row, axis))
-    return found
+    return groups
 
 
 def shared_label(row: StudyRow, axis: Axis | None) -> str:
@@ -85,21 +86,20 @@ class Order:
 
 def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: Sequence[str]) -> list[Order]:
     """Observed orders along every numeric axis; orders between neighbours are also stored in the rows."""
-    found = []
-    for axis in (axis for axis in axes if axis.refines):
+    orders = []
+    for axis, name in itertools.product((axis for axis in axes if axis.refines), quantities):
         for label, group in families(rows, axis).items():
-            for name in quantities:
-                known = [row for row in group if row.resolved(name) > 0.0]
-                for coarse, fine in itertools.pairwise(known):
-                    a, b = spacing(coarse, axis), spacing(fine, axis)
-                    if a > b > 0.0:
-                        order = math.log(coarse.resolved(name) / fine.resolved(name)) / math.log(a / b)
-                        fine.orders[axis.key, name] = order
-                if len(known) >= 2:
-                    slope = fitted_slope([spacing(r, axis) for r in known], [r.resolved(name) for r in known])
-                    between = tuple(r.orders.get((axis.key, name), math.nan) for r in known[1:])
-                    found.append(Order(axis.key, name, label, slope, between))
-    return found
+            known = [row for row in group if row.resolved(name) > 0.0]
+            sizes = [spacing(row, axis) for row in known]
+            errors = [row.resolved(name) for row in known]
+            for k, row in enumerate(known[1:], 1):
+                if sizes[k - 1] > sizes[k] > 0.0:
+                    ratio = sizes[k - 1] / sizes[k]
+                    row.orders[axis.key, name] = math.log(errors[k - 1] / errors[k]) / math.log(ratio)
+            if len(known) >= 2:
+                between = tuple(row.orders.get((axis.key, name), math.nan) for row in known[1:])
+                orders.append(Order(axis.key, name, label, fitted_slope(sizes, errors), between))
+    return orders
 
 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
@@ -211,38 +211,33 @@ def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
     return row
 
 
-COUNTS = ("steps", "rejected", "newton_iterations", "linear_iterations")
-
-
 def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
-    """A row of ``study.csv`` by its columns; None where a value is missing."""
+    """A row of ``study.csv`` by its columns; None or NaN where a value is missing."""
     result, settings = row.result, row.case.settings
     names = [quantity.name for quantity in plan.quantities]
     keys = {axis.path: axis.key for axis in plan.axes}
     varied = [axis.key for axis in plan.axes if axis.path not in ("time.integrator", "time.step", "mesh")]
     refined = [axis.key for axis in plan.axes if axis.refines]
-
-    def tolerance(name: str) -> Any:
-        key = keys.get(f"solver.{name}")
-        return settings[key] if key else getattr(plan.base.solver, name)
-
+    tolerances = {
+        name: settings.get(keys.get(f"solver.{name}", ""), getattr(plan.base.solver, name))
+        for name in ("force_tolerance", "step_tolerance")
+    }
     step = "auto" if "time.tolerance" in keys else plan.base.time.step
-    columns = {
+    return {
         "combination": row.case.name,
         "status": "done" if row.passed else "failed",
         "reason": result.problem,
         "integrator": row.integrator,
         "dt": settings.get(keys.get("time.step", ""), step),
-        "dt_mean": result.mean_step,
-        "dt_min": result.shortest,
-        "dt_max": result.longest,
+        "dt_mean": result.mean_step or None,
+        "dt_min": result.shortest or None,
+        "dt_max": result.longest or None,
         "mesh": settings.get(keys.get("mesh", "")),
-        "h": result.spacing,
-        "vertices": result.vertices,
-        "triangles": result.triangles,
+        "h": result.spacing or None,
+        "vertices": result.vertices or None,
+        "triangles": result.triangles or None,
         **{key: settings[key] for key in varied},
-        "force_tolerance": tolerance("force_tolerance"),
-        "step_tolerance": tolerance("step_tolerance"),
+        **tolerances,
         "linear_solver": result.linear_solver,
         **{f"error_{name}": row.resolved(name) for name in names},
         **{f"reference_error_{name}": row.own_errors.get(name) for name in names},
@@ -255,25 +250,21 @@ def csv_row(plan: Plan, row: StudyRow) -> dict[str, Any]:
         "run_seconds_max": max(result.run_seconds, default=None),
         "total_seconds": row.total_time,
         **{f"seconds_{phase}": result.phase_seconds.get(phase) for phase in PHASES},
-        **{name: getattr(result, name) for name in COUNTS},
+        **{name: getattr(result, name) if row.passed else None for name in ("steps", *COUNTS)},
         "pareto": row.on_front,
         "recommended": row.recommended,
     }
-    missing = set() if row.passed else {"dt_mean", "dt_min", "dt_max", *COUNTS}
-    missing |= set() if result.vertices else {"h", "vertices", "triangles"}
-    missing |= {key for key, value in columns.items() if value in (math.inf, -math.inf) or value != value}
-    return columns | dict.fromkeys(missing)
 
 
 BELOW = "below what the reference can tell"
 
 
 def _write_advice(
-    report: Report, plan: Plan, physics: Physics, known: Reference, advice: Sequence[Advice]
+    report: Report, plan: Plan, physics: Physics, reference: Reference, advice: Sequence[Advice]
 ) -> None:
     report.heading("Recommendation" + (f" for {describe_settings(physics)}" if physics else ""))
     if not advice:
-        report.paragraph(f"None can be given: {known.description or 'no errors are known'}.")
+        report.paragraph(f"None can be given: {reference.description or 'no errors are known'}.")
         return
     main, over = plan.quantities[0], "the largest at any sample time"
     if main.name == MEAN_SQUARE:
@@ -281,40 +272,39 @@ def _write_advice(
     report.paragraph(
         f"Errors are meant as: {main.title}, {over}. Run times are medians of the steps alone, "
         "without set-up and output. Nothing is extrapolated: only what ran is recommended. "
-        + _excluded_error(plan, known)
+        + _excluded_error(plan, reference)
     )
     report.bullets([one.text for one in advice])
 
 
-def _excluded_error(plan: Plan, known: Reference) -> str:
+def _excluded_error(plan: Plan, reference: Reference) -> str:
     """Sentence on the error that all runs share with their reference and that is not measured therefore."""
-    if known.kind == "exact":
+    if reference.kind == "exact":
         return "The errors are whole: the reference is exact on any mesh."
     if plan.axis("mesh") is None:
         return "All runs and the reference share one mesh: its own error is not in these numbers."
-    if known.kind == "finer" and not plan.base.time.static and not refines_time(plan):
-        return (
-            "All runs and the reference share the time integration: its error is not in these numbers, "
-            "which are those of the mesh."
-        )
+    if reference.kind == "finer" and not plan.base.time.static and not refines_time(plan):
+        return "All runs and the reference share the time integration: the numbers are errors of the mesh."
     return "The errors are those of the mesh and of all else that is solved."
 
 
 def _describe_runs(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str]:
     done = [row for row in rows if row.passed]
-    values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
-    varied = "; ".join(f"{key} = {', '.join(texts)}" for key, texts in values.items())
-    end = f"every {seconds(plan.interval)} to {seconds(plan.end)}"
-    meshes = dict.fromkeys((row.result.vertices, row.result.triangles) for row in done)
-    count = len(plan.sample_times()) - 1
-    static = plan.base.time.static
+    varied = "; ".join(
+        f"{axis.key} = " + ", ".join(f"{v:g}" if isinstance(v, float) else v for v in axis.values)
+        for axis in plan.axes
+    )
+    meshes = dict.fromkeys(
+        f"{row.result.vertices} vertices, {row.result.triangles} triangles" for row in done
+    )
+    times = f"Compared at {len(plan.sample_times()) - 1} times, every {seconds(plan.interval)} to "
     return [
         f"Scene: {plan.request.scene}" + (f" ({plan.base.title})" if plan.base.title else ""),
         f"{len(rows)} combinations of {varied}; {len(rows) - len(done)} failed",
         f"Repeats of each: {plan.request.repeats}, one at a time, on {ranks} MPI rank(s) of {machine()}; "
         "after a warm-up step; median and range",
-        "Mesh: " + "; ".join(f"{v} vertices, {t} triangles" for v, t in meshes),
-        "Compared at the full load" if static else f"Compared at {count} times, {end}",
+        "Mesh: " + "; ".join(meshes),
+        "Compared at the full load" if plan.base.time.static else times + seconds(plan.end),
     ]
 
 
@@ -322,22 +312,28 @@ def _describe_runs(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str
 
 
 def _write_tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
-    names = [quantity.name for quantity in plan.quantities]
-    head = ["setting", *(_short_title(quantity) for quantity in plan.quantities)]
-    head += ["run time", "fastest – slowest", "with set-up", "steps", "rejected", "Newton", "linear"]
     done = [row for row in rows if row.passed]
-    body = []
-    for row in done:
-        result, times = row.result, row.result.run_seconds
-        body.append(
-            [setting(row) + (" ★" if row.recommended else ""), *(_error_cell(row, name) for name in names),
-             seconds(row.run_time), f"{seconds(min(times))} – {seconds(max(times))}", seconds(row.total_time),
-             result.steps, result.rejected, result.newton_iterations, result.linear_iterations]
-        )  # fmt: skip
+    columns: dict[str, Callable[[StudyRow], Any]] = {
+        "setting": lambda row: setting(row) + (" ★" if row.recommended else ""),
+        **{_short_title(q): partial(_error_cell, name=q.name) for q in plan.quantities},
+        "run time": lambda row: seconds(row.run_time),
+        "fastest – slowest": lambda row: " – ".join(
+            seconds(end(row.result.run_seconds)) for end in (min, max)
+        ),
+        "with set-up": lambda row: seconds(row.total_time),
+        "steps": lambda row: row.result.steps,
+        "rejected": lambda row: row.result.rejected,
+        "Newton": lambda row: row.result.newton_iterations,
+        "linear": lambda row: row.result.linear_iterations,
+    }
     starred = any(row.recommended for row in done)
-    star = f" ★: recommended for {percent(DEFAULT_TARGET)}." if starred else ""
-    front = [row.on_front for row in done]
-    report.table(head, body, caption="Bold: on the Pareto front." + star, marked=front)
+    report.table(
+        list(columns),
+        [[cell(row) for cell in columns.values()] for row in done],
+        caption="Bold: on the Pareto front."
+        + (f" ★: recommended for {percent(DEFAULT_TARGET)}." if starred else ""),
+        marked=[row.on_front for row in done],
+    )
     if any(row.unresolved for row in rows):
         report.paragraph(
             f"“< x” stands where an error is below {SAFETY:g} times the reference's own and not resolved."
@@ -362,38 +358,20 @@ def _error_cell(row: StudyRow, name: str) -> str:
     return short(error) if math.isfinite(error) else ""
 
 
-def _write_orders(report: Report, orders: Sequence[Order]) -> None:
-    if not orders:
-        return
-    report.heading("Observed orders")
-    report.table(
-        ["along", "quantity", "line", "fitted", "between neighbours"],
-        [
-            [one.axis, one.quantity, one.family, f"{one.fitted:.2f}",
-             ", ".join(f"{value:.2f}" for value in one.neighbours)]
-            for one in orders
-        ],
-    )  # fmt: skip
-
-
-def _write_references(report: Report, known: Mapping[Physics, Reference]) -> None:
+def _write_references(report: Report, references: Mapping[Physics, Reference]) -> None:
     report.heading("Reference")
-    for physics, one in known.items():
+    for physics, reference in references.items():
         where = f"{describe_settings(physics)}: " if physics else ""
-        took = f"; its steps took {seconds(one.seconds)}" if math.isfinite(one.seconds) else ""
-        report.paragraph(f"{where}{one.description}{took}.")
-        if one.kind == "finer" and one.own_errors:
+        took = f"; its steps took {seconds(reference.seconds)}" if math.isfinite(reference.seconds) else ""
+        report.paragraph(f"{where}{reference.description}{took}.")
+        if reference.kind == "finer" and reference.own_errors:
+            rows = [
+                [name, own.error, f"{own.order:.2f}" if math.isfinite(own.order) else "", own.trusted]
+                for name, own in reference.own_errors.items()
+            ]
             report.table(
                 ["quantity", "own error", "observed order", "converges"],
-                [
-                    [
-                        name,
-                        short(own.error),
-                        f"{own.order:.2f}" if math.isfinite(own.order) else "",
-                        own.trusted,
-                    ]
-                    for name, own in one.own_errors.items()
-                ],
+                rows,
                 caption="The reference's own error, estimated from coarser runs (Richardson)",
             )
 
@@ -408,47 +386,44 @@ def main_axis(axes: Sequence[Axis]) -> Axis | None:
     return min(able, key=lambda axis: order.index(axis.path) if axis.path in order else 3, default=None)
 
 
-def drawings(plan: Plan, rows: Sequence[StudyRow], known: Reference, mark: str) -> list[Drawing]:
+def drawings(plan: Plan, rows: Sequence[StudyRow], reference: Reference, mark: str) -> list[Drawing]:
     """Work-precision diagrams of every quantity, then convergence along every numeric axis."""
-    found = []
     axis = main_axis(plan.axes)
-    for quantity in plan.quantities:
-        if any(0.0 < row.resolved(quantity.name) < math.inf for row in rows):
-            found.append(_work_precision(plan, rows, known, quantity, axis, mark))
-    for one in (axis for axis in plan.axes if axis.refines):
-        for quantity in plan.quantities:
-            found += _convergence(rows, known, quantity, one, mark)
-    return found
+    figures = [
+        _work_precision(plan, rows, reference, quantity, axis, mark)
+        for quantity in plan.quantities
+        if any(0.0 < row.resolved(quantity.name) < math.inf for row in rows)
+    ]
+    refined = [axis for axis in plan.axes if axis.refines]
+    for axis, quantity in itertools.product(refined, plan.quantities):
+        figures += _convergence(rows, reference, quantity, axis, mark)
+    return figures
 
 
-def _error_floor(known: Reference, quantity: StudyQuantity) -> float | None:
-    own = known.own_errors.get(quantity.name)
+def _error_floor(reference: Reference, quantity: StudyQuantity) -> float | None:
+    own = reference.own_errors.get(quantity.name)
     return None if own is None or not own.error > 0.0 else SAFETY * own.error
 
 
 def _work_precision(
     plan: Plan,
     rows: Sequence[StudyRow],
-    known: Reference,
+    reference: Reference,
     quantity: StudyQuantity,
     axis: Axis | None,
     mark: str,
 ) -> Drawing:
-    name = quantity.name
+    name, main = quantity.name, quantity == plan.quantities[0]
     lines = []
     for label, group in families(rows, axis).items():
         times = [row.result.run_seconds for row in group]
         points = [row.run_time for row in group], [row.resolved(name) for row in group]
         labels = [_point_label(row, axis) for row in group]
         lines.append(Series(label, *points, [*map(min, times)], [*map(max, times)], labels))
-    hidden = [row for row in rows if row.passed and name in row.unresolved]
-    main, place, stars = quantity == plan.quantities[0], None, ""
-    for star in (row for row in rows if row.recommended and main):
-        stars = f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
-        place = (
-            star.run_time,
-            SAFETY * star.own_errors[name] if name in star.unresolved else star.errors[name],
-        )
+    hidden = {
+        row.case.name: SAFETY * row.own_errors[name] for row in rows if row.passed and name in row.unresolved
+    }
+    star = next((row for row in rows if row.recommended and main), None)
     return work_precision(
         lines,
         name=("work-precision" if main else f"work-precision-{_file_name(name)}") + mark,
@@ -456,10 +431,10 @@ def _work_precision(
         f"{plan.request.repeats}",
         y_label=quantity.title,
         front=[(row.run_time, row.resolved(name)) for row in rows if row.on_front] if main else (),
-        bounds=[(row.run_time, SAFETY * row.own_errors[name]) for row in hidden],
-        recommended=place,
-        recommendation=stars,
-        floor=_error_floor(known, quantity),
+        bounds=[(row.run_time, hidden[row.case.name]) for row in rows if row.case.name in hidden],
+        recommended=star and (star.run_time, hidden.get(star.case.name, star.errors[name])),
+        recommendation=f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})" if star else "",
+        floor=_error_floor(reference, quantity),
         floor_label=BELOW,
     )
 
@@ -471,7 +446,7 @@ def _point_label(row: StudyRow, axis: Axis | None) -> str:
 
 
 def _convergence(
-    rows: Sequence[StudyRow], known: Reference, quantity: StudyQuantity, axis: Axis, mark: str
+    rows: Sequence[StudyRow], reference: Reference, quantity: StudyQuantity, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
         Series(label, [spacing(row, axis) for row in group], [row.resolved(quantity.name) for row in group])
@@ -483,7 +458,7 @@ def _convergence(
     drawing = convergence(
         lines, name=f"convergence-{_file_name(axis.key)}-{_file_name(quantity.name)}{mark}",
         caption=f"{quantity.title} along {axis.key}", x_label=label, y_label=quantity.title,
-        floor=_error_floor(known, quantity), floor_label=BELOW,
+        floor=_error_floor(reference, quantity), floor_label=BELOW,
     )  # fmt: skip
     return [drawing]
 
@@ -540,15 +515,15 @@ class StudyView(View[Outcome[Any]]):
             yield csv_row(self.plan, outcome)
 
     def csv_cell(self, value: Any) -> str:
-        if value is None:
-            return ""
         if isinstance(value, bool):
             return "yes" if value else "no"
-        return repr(float(value)) if isinstance(value, float) else str(value)
+        if isinstance(value, float):
+            return repr(value) if math.isfinite(value) else ""
+        return "" if value is None else str(value)
 
     def content(self, outcomes: Sequence[Outcome[Any]], ranks: int, command: Sequence[str]) -> dict[str, Any]:
         """Content of the JSON file: the table with all repeats, references, orders and advice."""
-        plan, known = self.plan, self.runner.references
+        plan = self.plan
         return {
             "scene": plan.request.scene,
             "title": plan.base.title,
@@ -564,22 +539,16 @@ class StudyView(View[Outcome[Any]]):
             "references": [
                 {
                     "scene": dict(physics),
-                    "kind": one.kind,
-                    "reference": one.description,
-                    "run_seconds": one.seconds,
-                    "own_error": {name: asdict(own) for name, own in one.own_errors.items()},
-                    "notes": one.notes,
+                    "kind": reference.kind,
+                    "reference": reference.description,
+                    "run_seconds": reference.seconds,
+                    "own_error": {name: asdict(own) for name, own in reference.own_errors.items()},
+                    "notes": reference.notes,
                 }
-                for physics, one in known.items()
+                for physics, reference in self.runner.references.items()
             ],
             "combinations": [
-                {
-                    **{key: value for key, value in csv_row(plan, row).items() if value not in ("", None)},
-                    "errors": {name: row.resolved(name) for name in row.errors},
-                    "not_resolved": sorted(row.unresolved),
-                    "timings": [asdict(timing) for timing in row.result.timings],
-                    "notes": row.result.notes,
-                }
+                csv_row(plan, row) | {"timings": [asdict(timing) for timing in row.result.timings]}
                 for row in self.runner.rows
             ],
             "orders": [asdict(order) for order in self.orders],
@@ -596,21 +565,37 @@ class StudyView(View[Outcome[Any]]):
         }
 
     def fill(self, report: Report, outcomes: Sequence[Outcome[Any]], summary: str, *, plots: bool) -> None:
-        plan, rows, known = self.plan, self.runner.rows, self.runner.references
-        for physics, one in known.items():
-            _write_advice(report, plan, physics, one, self.advice[physics])
+        plan, rows, references = self.plan, self.runner.rows, self.runner.references
+        for physics, reference in references.items():
+            _write_advice(report, plan, physics, reference, self.advice[physics])
         report.heading("What was run")
         report.bullets(_describe_runs(plan, rows, self.ranks))
-        report.bullets([*plan.notes, *(note for one in known.values() for note in one.notes)])
-        for number, (physics, one) in enumerate(known.items(), start=1):
+        report.bullets(
+            [*plan.notes, *(note for reference in references.values() for note in reference.notes)]
+        )
+        for number, (physics, reference) in enumerate(references.items(), start=1):
             report.heading("Diagrams" + (f" for {describe_settings(physics)}" if physics else ""))
-            mark = "" if len(known) == 1 else f"-{number}"
-            for drawing in drawings(plan, self.runner.rows_of(physics), one, mark):
+            mark = "" if len(references) == 1 else f"-{number}"
+            for drawing in drawings(plan, self.runner.rows_of(physics), reference, mark):
                 report.figure(drawing)
         report.heading("Errors and run times")
         _write_tables(report, plan, rows)
-        _write_orders(report, self.orders)
-        _write_references(report, known)
+        if self.orders:
+            report.heading("Observed orders")
+            report.table(
+                ["along", "quantity", "line", "fitted", "between neighbours"],
+                [
+                    [
+                        o.axis,
+                        o.quantity,
+                        o.family,
+                        f"{o.fitted:.2f}",
+                        ", ".join(f"{v:.2f}" for v in o.neighbours),
+                    ]
+                    for o in self.orders
+                ],
+            )
+        _write_references(report, references)
         failed = [[row.case.title, row.result.problem] for row in rows if not row.passed]
         if failed:
             report.heading("What failed")
@@ -626,11 +611,11 @@ class StudyView(View[Outcome[Any]]):
 
 def all_versions() -> dict[str, str]:
     """Versions of the program and of the packages that it uses."""
-    found = library_versions()
+    versions = library_versions()
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            versions[name] = version(name)
+    return versions
 
 
 def processor() -> str:

@@ -15,7 +15,7 @@ import itertools
 import json
 import math
 import statistics
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,16 @@ import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict
 from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
-from lyra_petsc.experiments.study import comparison
-from lyra_petsc.experiments.study.comparison import Errors, History, RestSurface, Samples
+from lyra_petsc.experiments.study.comparison import (
+    Errors,
+    History,
+    RestSurface,
+    Samples,
+    error_history,
+    overall,
+    read_samples,
+    samples_of_motion,
+)
 from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, launch, read_result, run_case
 from lyra_petsc.experiments.study.plan import (
     ASSUMED_STEPS,
@@ -160,14 +168,14 @@ def _reference_run(plan: Plan, folder: Path, key: str) -> Reference:
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, key=key)
     try:
-        samples = comparison.read_local(folder, plan.sample_times(), plan.interval)
-        stored = comparison.read_surface(folder)
+        samples = read_samples(folder, plan.sample_times(), plan.interval)
     except InputError as error:
         raise InputError(error.message, file=error.file, key=key) from None
     axis = plan.axis("mesh")
     for chosen in [[(axis, value)] for value in axis.values] if axis is not None else [[]]:
         mesh = build_scene_mesh(plan.request.with_changes(overrides(plan.base, chosen)))
         built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+        stored = samples.surface
         if not built.same_as(stored):
             raise InputError(
                 f"is a run of another mesh ({len(stored.rest)} vertices, {len(stored.triangles)} triangles; "
@@ -175,24 +183,21 @@ def _reference_run(plan: Plan, folder: Path, key: str) -> Reference:
                 file=folder,
                 key=key,
             )
-    missing = [each.probe for each in plan.quantities if each.probe and each.probe not in samples.probes]
+    missing = [name for name in (q.probe for q in plan.quantities) if name and name not in samples.probes]
     if missing and plan.request.quantities:
         raise InputError(f"has no probe '{missing[0]}'", file=folder, key=key)
     notes = [f"the reference run has no probe '{name}': its error is not known" for name in missing]
     return Reference("run", f"run {folder}", folder=folder, notes=[*notes, *_scene_differences(plan, folder)])
 
 
-def _scene_differences(plan: Plan, folder: Path) -> Sequence[str]:
+def _scene_differences(plan: Plan, folder: Path) -> list[str]:
     """Notes on physical differences between the scene of a run and that of the study."""
     try:
         other = load_scene(folder / "scene.yaml")
     except InputError:
         return ["the reference run's scene cannot be read, so it is unknown whether it is the same"]
-    keys = [
-        name
-        for name in type(plan.base).model_fields
-        if name not in NUMERICAL_BLOCKS and getattr(plan.base, name) != getattr(other, name)
-    ]
+    names = type(plan.base).model_fields.keys() - NUMERICAL_BLOCKS
+    keys = sorted(name for name in names if getattr(plan.base, name) != getattr(other, name))
     return [f"the reference run is of another scene: {', '.join(keys)} differ"] if keys else []
 
 
@@ -291,23 +296,23 @@ def reference_integrators(plan: Plan) -> list[str]:
 
 def _tolerances(plan: Plan, tighter: float) -> list[str]:
     """Overrides of solver tolerances: the tightest of the study over ``tighter``."""
-    found = []
+    tolerances = []
     for name, minimum in MINIMUM_TOLERANCES.items():
         axis = plan.axis(f"solver.{name}")
         values = [float(v) for v in axis.values] if axis else [float(getattr(plan.base.solver, name))]
-        found.append(f"solver.{name}={max(minimum, min(values) / tighter)!r}")
+        tolerances.append(f"solver.{name}={max(minimum, min(values) / tighter)!r}")
     for axis in plan.axes:
         if axis.path.startswith("petsc.") and axis.numeric and axis.path.endswith(("tol", "_atol")):
             tightest = min(float(value) for value in axis.values)
-            found.append(f"{axis.path}={max(1e-13, tightest / tighter)!r}")
-    return found
+            tolerances.append(f"{axis.path}={max(1e-13, tightest / tighter)!r}")
+    return tolerances
 
 
 # -- error of the reference ------------------------------------------------------------------------------
 
 
-def richardson(first: float, second: float, ratio: float, order: int) -> EstimatedError:
-    """Error of the finest of three runs.
+def richardson(first: float, second: float, order: int) -> EstimatedError:
+    """Error of the finest of three runs, each with half the Δt or element size of the one before.
 
     Differences that decrease faster than the expected order do so by chance, as errors of several causes may
     cancel or the place of the maximum may change. The estimate is therefore at least that of the coarser
@@ -317,8 +322,6 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
     ----------
     first, second : float
         Difference between the two finest runs, and between the second and the third.
-    ratio : float
-        Ratio of Δt or element size between neighbouring runs.
     order : int
         Expected order; the observed one is used if it is smaller.
     """
@@ -330,28 +333,27 @@ def richardson(first: float, second: float, ratio: float, order: int) -> Estimat
         return EstimatedError(0.0, math.nan, True)
     observed = math.inf if first == 0.0 else -math.inf
     if first > 0.0 < second:
-        observed = math.log(second / first) / math.log(ratio)
+        observed = math.log2(second / first)
     used = min(float(order), max(observed, minimum_order))
     trusted = observed >= minimum_order
     largest = first if trusted else max(first, second)
-    error = largest / (ratio**used - 1.0)
+    error = largest / (2.0**used - 1.0)
     if order > 0:
-        error = max(error, second / ratio**order / (ratio**order - 1.0))
+        error = max(error, second / 2.0**order / (2.0**order - 1.0))
     return EstimatedError(error, observed, trusted)
 
 
 def sum_estimates(estimates: Sequence[dict[str, EstimatedError]]) -> dict[str, EstimatedError]:
     """Sum of the errors of time integration and mesh, by quantity."""
-    names = dict.fromkeys(name for estimate in estimates for name in estimate)
-    found = {}
-    for name in names:
+    total = {}
+    for name in estimates[0]:
         parts = [estimate[name] for estimate in estimates]
-        found[name] = EstimatedError(
+        total[name] = EstimatedError(
             math.fsum(part.error for part in parts),
             parts[0].order if len(parts) == 1 else math.nan,
             all(part.trusted for part in parts),
         )
-    return found
+    return total
 
 
 def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, EstimatedError]:
@@ -370,24 +372,20 @@ def estimate_chain(differences: Sequence[History], chain: Chain) -> dict[str, Es
     ----------
     .. [1] P. J. Roache, Verification and Validation in Computational Science and Engineering, 1998, ch. 5.
     """
-    # ratio of Δt or element size between neighbours of a chain
-    refinement = 2.0
-    sums = [comparison.overall(history) for history in differences]
-    found = {}
-    for name, first in sums[0].items():
+    estimates = {}
+    for name, history in differences[0].items():
+        first = overall({name: history})[name]
         if len(differences) == 1:
-            found[name] = EstimatedError(first, math.nan, True)
+            estimates[name] = EstimatedError(first, math.nan, True)
             continue
-        found[name] = whole = richardson(first, sums[1][name], refinement, chain.order)
+        coarser = differences[1][name]
+        estimates[name] = whole = richardson(first, overall({name: coarser})[name], chain.order)
         if name != MEAN_SQUARE and not math.isnan(whole.error):
-            pairs = zip(differences[0][name], differences[1][name], strict=True)
-            each = [
-                richardson(float(fine), float(coarse), refinement, chain.order).error
-                for fine, coarse in pairs
-            ]
+            pairs = zip(history.tolist(), coarser.tolist(), strict=True)
+            largest = max(richardson(fine, coarse, chain.order).error for fine, coarse in pairs)
             # safety factor on the estimates of maximum errors
-            found[name] = replace(whole, error=1.25 * max(whole.error, *each))
-    return found
+            estimates[name] = replace(whole, error=1.25 * max(whole.error, largest))
+    return estimates
 
 
 class StudyObserver(Protocol):
@@ -521,7 +519,7 @@ class StudyRunner:
         self._total_cost = sum(case.weight for case in self.plan.combinations)
         for physics in (physics for physics, one in self.planned.items() if one.kind == "finer"):
             chains = self._chains(physics, self._smallest_step([]), reference_integrators(self.plan)[0])
-            weights = {each.name: each.weight for chain in chains for each in chain.levels}
+            weights = {level.name: level.weight for chain in chains for level in chain.levels}
             self._total_cost += sum(weights.values())
 
     def rows_of(self, physics: Physics) -> list[StudyRow]:
@@ -542,35 +540,34 @@ class StudyRunner:
 
         def find_result() -> tuple[Job, Result | None, bool]:
             digest, request = self._fingerprint(case), self.plan.request
-            found = read_result(folder, digest)
             job = Job(request.scene, case.overrides, str(folder), case.repeats, digest, request.trust_mesh)
-            return job, found, found is None and (folder / RESULT_FILE).exists()
+            return job, read_result(folder, digest), (folder / RESULT_FILE).exists()
 
         def watch(fraction: float) -> None:
             self.observer.progress(begun + case.weight * fraction, self._total_cost)
 
-        job, found, stale = on_root(self.comm, find_result)
-        self.observer.case(case.title, resumed=found is not None)
-        if stale:
-            self.observer.note(
-                f"{case.title} was finished with another scene, program, options, repeats or ranks: it runs "
-                "again"
-            )
-        if found is None:
+        job, result, exists = on_root(self.comm, find_result)
+        self.observer.case(case.title, resumed=result is not None)
+        if result is None:
+            if exists:
+                self.observer.note(
+                    f"{case.title} was finished with another scene, program, options, repeats or ranks: it "
+                    "runs again"
+                )
             if self.launcher is not None:
                 # launched processes always warm up
-                found = launch(self.launcher, job, watch, self.lock)
+                result = launch(self.launcher, job, partial(watch, 0.0), self.lock)
             else:
-                found = run_case(self.comm, job, watch, warm_up=case.kernels not in self._warmed_up)
+                result = run_case(self.comm, job, watch, warm_up=case.kernels not in self._warmed_up)
             self._warmed_up.add(case.kernels)
-            if found.problem:
-                self.observer.note(f"{case.title} failed: {found.problem}")
+            if result.problem:
+                self.observer.note(f"{case.title} failed: {result.problem}")
         watch(1.0)
         self._cost_done += case.weight
-        self._results[case.name] = found
+        self._results[case.name] = result
         if not isinstance(case, Combination):
-            return Outcome(case, {"done": Verdict(not found.problem, found.problem)})
-        self.rows.append(StudyRow(case, result=found))
+            return Outcome(case, {"done": Verdict(not result.problem, result.problem)})
+        self.rows.append(StudyRow(case, result=result))
         return self.rows[-1]
 
     def _fingerprint(self, case: StudyCase) -> str:
@@ -591,39 +588,43 @@ class StudyRunner:
 
         A row without a state at some sample time counts as failed.
         """
-        found, rows = self.planned[physics], [row for row in self.rows_of(physics) if row.passed]
+        reference, rows = self.planned[physics], [row for row in self.rows_of(physics) if row.passed]
         if not rows:
             return Reference("none", "no reference: no combination ran to its end")
-        if found.kind == "finer":
-            found = yield from self._run_finer_reference(physics, rows)
-        if found.kind == "none":
-            return found
-        if found.kind == "run":
-            found.notes.append("the own error of the reference run is not known")
-        quantities = self.plan.quantities
-        if found.motion is not None:
-            found.own_errors = {
-                # error of an exact reference
-                quantity.name: EstimatedError(1e-13, math.nan, True)
-                for quantity in quantities
-            }
-            errors_of: Callable[..., Errors] = partial(
-                comparison.motion_errors, self.comm, motion=found.motion
-            )
-        else:
-            assert found.folder is not None
-            other = self._samples(found.folder, found.sheets)
-            errors_of = partial(comparison.run_errors, self.comm, other=other)
+        if reference.kind == "finer":
+            reference = yield from self._run_finer_reference(physics, rows)
+        if reference.kind == "none":
+            return reference
+        if reference.kind == "run":
+            reference.notes.append("the own error of the reference run is not known")
+        if reference.motion is not None:
+            exact = EstimatedError(1e-13, math.nan, True)
+            reference.own_errors = dict.fromkeys((quantity.name for quantity in self.plan.quantities), exact)
+        errors = on_root(self.comm, lambda: self._errors(reference, rows))
+        for row, result in zip(rows, errors, strict=True):
+            if isinstance(result, str):
+                row.result.fail(result)
+                continue
+            row.errors = result
+            row.own_errors = {name: estimate.error for name, estimate in reference.own_errors.items()}
+            mark_unresolved(row)
+        return reference
+
+    def _errors(self, reference: Reference, rows: Sequence[StudyRow]) -> list[Errors | str]:
+        """The errors of each row, or why it has none. On rank 0."""
+        errors: list[Errors | str] = []
+        other = reference.folder and self._samples(reference.folder, reference.sheets)
         for row in rows:
             try:
-                mine = self._samples_of(row.case)
+                samples = self._samples_of(row.case)
             except InputError as error:
-                row.result.fail(" ".join(str(error).split()))
+                errors.append(" ".join(str(error).split()))
                 continue
-            row.errors = errors_of(mine, quantities=quantities)
-            row.own_errors = {name: estimate.error for name, estimate in found.own_errors.items()}
-            mark_unresolved(row)
-        return found
+            if reference.motion is not None:
+                other = samples_of_motion(reference.motion, samples)
+            assert other is not None
+            errors.append(overall(error_history(samples, other, self.plan.quantities)))
+        return errors
 
     def _run_finer_reference(self, physics: Physics, rows: Sequence[StudyRow]) -> Runs[Reference]:
         """Run a finer reference with the first integrator that reaches the end."""
@@ -662,13 +663,17 @@ class StudyRunner:
             yield replace(level, title=f"reference: {level.title}")
         return self._results[level.name]
 
+    def _estimate_chain(self, chain: Chain) -> dict[str, EstimatedError]:
+        samples = [self._samples_of(level) for level in chain.levels]
+        pairs = itertools.pairwise(samples)
+        differences = [error_history(coarse, fine, self.plan.quantities) for fine, coarse in pairs]
+        return estimate_chain(differences, chain)
+
     def _samples_of(self, case: StudyCase) -> Samples:
         return self._samples(self.folder / CASES / case.name, self._results[case.name].sheets)
 
     def _samples(self, folder: Path, sheets: Sequence[int]) -> Samples:
-        return comparison.read_samples(
-            self.comm, folder, self.plan.sample_times(), self.plan.interval, sheets
-        )
+        return read_samples(folder, self.plan.sample_times(), self.plan.interval, sheets)
 
     def _estimate_errors(self, chains: list[Chain], known: Reference) -> Runs[dict[str, EstimatedError]]:
         """Estimate the error of a reference from its chains."""
@@ -680,12 +685,7 @@ class StudyRunner:
                 if self._results[level.name].problem:
                     known.notes.append(f"the own error of the reference is not known: {level.title} failed")
                     return {}
-            samples = [self._samples_of(level) for level in chain.levels]
-            differences = [
-                comparison.history_against_run(self.comm, coarse, fine, self.plan.quantities)
-                for fine, coarse in itertools.pairwise(samples)
-            ]
-            estimates.append(estimate_chain(differences, chain))
+            estimates.append(on_root(self.comm, partial(self._estimate_chain, chain)))
         errors = sum_estimates(estimates)
         doubtful = [name for name, estimate in errors.items() if not estimate.trusted]
         if doubtful:
