@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,9 +40,6 @@ class Scope(IntEnum):
     QUICK = 0
     USUAL = 1
     FULL = 2
-
-
-QUICK, USUAL, FULL = Scope
 
 
 @dataclass(frozen=True)
@@ -149,11 +146,6 @@ class CaseFamily:
     cases: tuple[StressCase, ...]
 
 
-def family(name: str, title: str, *cases: StressCase) -> CaseFamily:
-    """Make a family of these cases."""
-    return CaseFamily(name, title, tuple(replace(case, family=name) for case in cases))
-
-
 CELLS = {Scope.QUICK: 20, Scope.USUAL: 40, Scope.FULL: 40}
 """Cells along a side of the sheet."""
 
@@ -210,19 +202,19 @@ KEPT = ("group", "damping", "warp_degrees", "rest_curvature")
 """Keys of a material block that `anisotropic` keeps."""
 
 
-def base_with(*changes: Callable[..., Content], **numbers: Any) -> Maker:
-    """The scene function of a case: the base scene with these changes; the last one receives ``numbers``."""
+def changed_base(changes: Sequence[Callable[[Content], Content]]) -> Maker:
+    """The scene function of a case: the base scene with these changes, one after another."""
 
     def scene(setting: Setting, bench: Bench) -> Content:
         content = setting.content()
-        for change in changes[:-1]:
+        for change in changes:
             content = change(content)
-        return changes[-1](content, **numbers) if changes else content
+        return content
 
     return scene
 
 
-base_scene = base_with()
+base_scene = changed_base(())
 """The base scene without changes."""
 
 
@@ -254,7 +246,7 @@ def set_material(content: Content, **values: Any) -> Content:
 
 def anisotropic(content: Content, ratio: float) -> Content:
     """Set c11/c22 to ``ratio`` and c12 to 0; the geometric mean of c11 and c22, and c33, stay."""
-    base_with = []
+    blocks = []
     for block in materials(content):
         shell, _ = resolve_material(Material.model_validate(block))
         mean = (shell.c11 * shell.c22) ** 0.5
@@ -264,8 +256,8 @@ def anisotropic(content: Content, ratio: float) -> Content:
         if shell.model == "midedge":
             plate = dict(zip(("d11", "d12", "d22", "d33"), shell.plate, strict=True))
             bending = {"bending": plate, "bending_model": shell.model}
-        base_with.append({"density": shell.density, "membrane": membrane, **bending, **kept})
-    content["material"] = base_with
+        blocks.append({"density": shell.density, "membrane": membrane, **bending, **kept})
+    content["material"] = blocks
     return content
 
 

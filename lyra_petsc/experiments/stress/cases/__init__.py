@@ -1,30 +1,50 @@
-"""The families of cases of ``stress`` by name, in the order in which they run, and their modules."""
+"""The cases of ``stress``: the table ``cases.yaml`` and the modules with their functions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
+from importlib.resources import files
+from typing import Any
 
 from lyra_petsc.errors import InputError, suggest
-from lyra_petsc.experiments.case import Registry, member
-from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase
-
-MODULES = {
-    "stiff-steps membrane bending time-step density anisotropy damping wind gravity": "sheets",
-    "handles start elements free compression": "sheets",
-    "contact": "contact",
-    "directors": "sheets",
-    "rigid-plate chain paper": "limits",
-    "products": "sheets",
-}
-"""Modules of the families."""
+from lyra_petsc.experiments.case import Registry
+from lyra_petsc.experiments.stress import stress_scenes
+from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase, changed_base
+from lyra_petsc.scene.text import parse_yaml
 
 
-def _family(name: str, module: str) -> CaseFamily:
-    family: CaseFamily = member(f"{__name__}.{module}", name)
-    return family
+def _family(name: str, entry: dict[str, Any]) -> CaseFamily:
+    module, cases = import_module(f"{__name__}.{entry['module']}"), entry["cases"]
+    if isinstance(cases, str):
+        cases = getattr(module, cases)()
+    common = entry.get("each", {})
+    return CaseFamily(
+        name, entry["title"], tuple(_case(module, name, case, common | own) for case, own in cases.items())
+    )
 
 
-FAMILIES = Registry({name: module for names, module in MODULES.items() for name in names.split()}, _family)
+def _case(module: Any, family: str, name: str, entry: dict[str, Any]) -> StressCase:
+    def function(named: str, arguments: dict[str, Any]) -> Callable[..., Any]:
+        return partial(getattr(module, named, None) or getattr(stress_scenes, named), **arguments)
+
+    changes = entry.pop("changes", {})
+    for key in {"scene", "shape", "observe", "judge"} & entry.keys():
+        named = entry[key]
+        entry[key] = function(*(next(iter(named.items())) if isinstance(named, dict) else (named, {})))
+    entry.setdefault("scene", changed_base([function(*change) for change in changes.items()]))
+    level = Scope[entry.pop("level", "usual").upper()]
+    return StressCase(name, family=family, level=level, **entry)
+
+
+def _table() -> dict[str, dict[str, Any]]:
+    path = files("lyra_petsc.experiments.stress") / "cases.yaml"
+    table: dict[str, dict[str, Any]] = parse_yaml(path.read_text(encoding="utf-8"), file=path)
+    return table
+
+
+FAMILIES: Registry[CaseFamily] = Registry(_table(), _family)
 
 
 def selected(only: Sequence[str], level: Scope) -> list[StressCase]:

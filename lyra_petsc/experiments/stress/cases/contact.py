@@ -9,7 +9,6 @@ import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,9 @@ from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle, resample_polyline
 from lyra_petsc.experiments.stress.stress_scenes import (
-    FULL,
-    QUICK,
     STEP,
     Content,
     Setting,
-    StressCase,
-    family,
     scale,
 )
 from lyra_petsc.experiments.stress.verdicts import RunRecord
@@ -39,14 +34,6 @@ MAX_NEWTON = 12
 CELLS, RADIUS = 12, 0.3
 """Cells along a side of the sheet, and radius of the ball [m]."""
 
-STEPS = 40
-PRESSURE, LAYERS, RAMP = 1e5, 10, 20
-"""Pressure [Pa] on a number of layers, and number of steps in which it grows"""
-
-
-MANY, MANY_LAYERS, MANY_CELLS = 100_000, 5, 107
-"""Required number of contacts, and sheets and cells along a side of the stack that reaches it"""
-
 
 def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **more: Any) -> Content:
     """A scene with the material of the base scene and without handles."""
@@ -54,13 +41,21 @@ def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **
     return content | {"mesh": mesh, "handles": [], "contact": contact, "obstacles": obstacles} | more
 
 
-def _over_ball(
-    setting: Setting, bench: Bench, contact: Content, stiffer: float = 1.0, speed: float = 0.0
+def over_ball(
+    setting: Setting,
+    bench: Bench,
+    stiffer: float = 1.0,
+    speed: float = 0.0,
+    thickness_in_edges: float = 0.0,
+    gap: float = 0.01,
+    friction: float = 0.0,
 ) -> Content:
     """A sheet of one square metre that falls on a ball."""
     ball = {"ball": {"sphere": {"center": [0.0, 0.0, 0.0], "radius": RADIUS}}}
-    mesh = _square(RADIUS + (contact.get("thickness", 0.0) + 0.02))
-    content = _scene(setting, mesh, contact, ball, initial={"velocity": [0.0, 0.0, -speed]})
+    thickness = thickness_in_edges / CELLS
+    contact = {"gap": gap, "thickness": thickness, "friction": friction}
+    initial = {"velocity": [0.0, 0.0, -speed]}
+    content = _scene(setting, _square(RADIUS + thickness + 0.02), contact, ball, initial=initial)
     return scale(content, stretching=stiffer)
 
 
@@ -70,7 +65,7 @@ def _square(height: float, side: float = 1.0, cells: int = CELLS, y: float = -0.
     return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": shift}}
 
 
-def _on_needles(setting: Setting, bench: Bench) -> Content:
+def on_needles(setting: Setting, bench: Bench) -> Content:
     """A sheet on a roof of triangles that are a thousand times as long as wide."""
     n = 1400
     x = np.linspace(-1.0, 1.0, n + 1)
@@ -86,7 +81,7 @@ def _on_needles(setting: Setting, bench: Bench) -> Content:
     return _scene(setting, _square(0.02), {"gap": 0.01}, {"roof": {"mesh": roof}})
 
 
-def _through_ring(setting: Setting, bench: Bench) -> Content:
+def through_ring(setting: Setting, bench: Bench) -> Content:
     """A sheet that is pulled by its centre through a ring of 0.4 of its width."""
     n, radius, thick = 16, 0.1, 0.02
     angle = 2.0 * math.pi * np.arange(n + 1) / n
@@ -101,22 +96,23 @@ def _through_ring(setting: Setting, bench: Bench) -> Content:
     return scene | {"handles": [middle], "motions": {"pull": pull}}
 
 
-def _pressed(setting: Setting, bench: Bench) -> Content:
+def pressed_layers(setting: Setting, bench: Bench) -> Content:
     """Ten layers on a plane with a pressure on the top one."""
-    meshes = []
-    for layer in range(LAYERS):
+    # pressure [Pa], and number of steps in which it grows
+    pressure, ramp, layers, meshes = 1e5, 20, 10, []
+    for layer in range(layers):
         shift = [-0.05 + 0.002 * (layer % 3), 0.003 * (layer % 2), 0.005 + 0.006 * layer]
         meshes.append(grid(0.1, 0.1, 3, 3) | {"name": f"layer{layer}", "transform": {"translate": shift}})
-    group = f"layer{LAYERS - 1}"
+    group = f"layer{layers - 1}"
     # each step adds an increment of the pressure
     loads = [
         {"group": group, "traction": [0.0, 0.0, -increment], "from": STEP * k}
-        for k, increment in enumerate(np.diff(np.geomspace(1e-4, 1.0, RAMP + 1)) * PRESSURE)
+        for k, increment in enumerate(np.diff(np.geomspace(1e-4, 1.0, ramp + 1)) * pressure)
     ]
     return _scene(setting, meshes, {"gap": 0.004}, {"floor": FLOOR}, loads=loads)
 
 
-def _knot(setting: Setting, bench: Bench) -> Content:
+def knot(setting: Setting, bench: Bench) -> Content:
     """A strip in an overhand knot, whose ends are pulled: a trefoil knot that is cut open at its outside."""
     # size of the knot [m], half the angle that is cut out of it [rad], length of its tails over its size
     size, cut, tail = 0.04, 0.2, 3.0
@@ -158,36 +154,34 @@ def _knot(setting: Setting, bench: Bench) -> Content:
     return _scene(setting, mesh, contact, {}) | {"handles": handles, "motions": motions}
 
 
-def _stack(setting: Setting, bench: Bench) -> Content:
+def stack(setting: Setting, bench: Bench) -> Content:
     """A stack of sheets on a plane, in which vertices are in contact with sheets above and below."""
-    gap = 0.2 / MANY_CELLS
+    layers, cells = 5, 107
+    gap = 0.2 / cells
     # no sheet has its vertices above those of the sheet below
     shifts = [
-        [0.3 * gap * (layer % 3), 0.4 * gap * (layer % 2), gap * (layer + 0.9)]
-        for layer in range(MANY_LAYERS)
+        [0.3 * gap * (layer % 3), 0.4 * gap * (layer % 2), gap * (layer + 0.9)] for layer in range(layers)
     ]
-    meshes = [
-        grid(1.0, 1.0, MANY_CELLS, MANY_CELLS, "alternating") | {"transform": {"translate": shift}}
-        for shift in shifts
-    ]
+    square = grid(1.0, 1.0, cells, cells, "alternating")
+    meshes = [square | {"transform": {"translate": shift}} for shift in shifts]
     return _scene(setting, meshes, {"gap": gap, "friction": 0.3}, {"floor": FLOOR})
 
 
-def _contacts(trial: Trial) -> tuple[int, float]:
+def contacts(trial: Trial) -> tuple[int, float]:
     """Numbers of crossings and of contacts."""
-    return _crossings(trial), trial.simulation.energy_balance.columns()["contacts"]
+    return crossings(trial), trial.simulation.energy_balance.columns()["contacts"]
 
 
-def _judge_many(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
-    crossings, contacts = zip(*record.observed, strict=True)
-    largest = max(contacts)
+def many_contacts(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+    crossed, touching = zip(*record.observed, strict=True)
+    largest, required = max(touching), 100_000
     return {
-        **_judge(setting, bench, replace(record, observed=list(crossings))),
-        "contacts": Verdict(largest >= MANY, f"{largest:.6g} contacts at most, asked for {MANY}"),
+        **no_crossings(setting, bench, replace(record, observed=list(crossed))),
+        "contacts": Verdict(largest >= required, f"{largest:.6g} contacts at most, asked for {required}"),
     }
 
 
-def _crossings(trial: Trial) -> int:
+def crossings(trial: Trial) -> int:
     """Number of pairs of crossing triangles, plus overlaps with obstacles, in the present state."""
     simulation, x = trial.simulation, trial.x
     mesh = simulation.problem.mesh  # on rank 0
@@ -196,69 +190,19 @@ def _crossings(trial: Trial) -> int:
     def count() -> int:
         assert mesh is not None
         triangles = mesh.triangles.astype(np.int64)
-        found = len(self_crossings(x, triangles))
+        total = len(self_crossings(x, triangles))
         for one in term.obstacles.each:
             box = (simulation.scene.obstacles or {})[one.name].box is not None
-            found += sum(map(len, find_overlaps(one, x, triangles, simulation.time, is_box=box)))
-        return found
+            total += sum(map(len, find_overlaps(one, x, triangles, simulation.time, is_box=box)))
+        return total
 
     return on_root(simulation.comm, count)
 
 
-def _judge(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
-    crossings, median = sum(record.observed), statistics.median(record.newton)
+def no_crossings(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+    number, median = sum(record.observed), statistics.median(record.newton)
     iterations = f"{median:g} Newton iterations in the median, at most {MAX_NEWTON}"
     return {
-        "crossings": Verdict(crossings == 0, f"{crossings} crossings in {len(record.observed)} states"),
+        "crossings": Verdict(number == 0, f"{number} crossings in {len(record.observed)} states"),
         "iterations": Verdict(median <= MAX_NEWTON, iterations),
     }
-
-
-_case = partial(StressCase, own_scene=True, steps=STEPS, step=STEP, observe=_crossings, judge=_judge)
-
-
-def _ball(
-    name: str,
-    title: str,
-    *,
-    stiffer: float = 1.0,
-    speed: float = 0.0,
-    contact: Content | None = None,
-    **more: Any,
-) -> StressCase:
-    """A case with the ball; the gap is 1 cm unless ``contact`` has one, ``more`` as of `StressCase`."""
-    scene = partial(_over_ball, contact={"gap": 0.01} | (contact or {}), stiffer=stiffer, speed=speed)
-    return _case(f"contact-{name}", title, scene, **more)
-
-
-RUBBING = {"friction": 0.5}
-
-contact = family(
-    "contact",
-    "contact: thickness, gap, Δt, stiffness, speed, friction, needles, a ring, a knot, layers",
-    _ball("plain", "over a ball", level=QUICK),
-    _ball("thick-0.1", "thickness 0.1 edges", contact={"thickness": 0.1 / CELLS}),
-    _ball("thick-0.5", "thickness 0.5 edges", contact={"thickness": 0.5 / CELLS}),
-    _ball("gap-1e-3", "gap 1e-3 m", contact={"gap": 1e-3}, level=FULL),
-    _ball("gap-1e-4", "gap 1e-4 m", contact={"gap": 1e-4}),
-    _ball("gap-1e-5", "gap 1e-5 m", contact={"gap": 1e-5}, level=FULL),
-    _ball("gap-1e-5-10ms", "gap 1e-5 m, Δt 10 ms", contact={"gap": 1e-5}, step=0.01, steps=30),
-    _ball("1ms", "Δt 1 ms", step=1e-3, steps=120, level=FULL),
-    _ball("20ms", "Δt 20 ms", step=1e-3 * 20, steps=20),
-    _ball("40ms", "Δt 40 ms", step=1e-3 * 40, steps=20),
-    _ball("1e3", "membrane × 1e3", stiffer=1e3),
-    _ball("1e6", "membrane × 1e6", stiffer=1e6),
-    _ball("thrown-1", "thrown at the ball with 1 m/s", speed=1.0, steps=20, level=FULL),
-    _ball("thrown-10", "thrown at the ball with 10 m/s", speed=10.0, steps=20),
-    _ball("thrown-100", "thrown at the ball with 100 m/s", speed=100.0, steps=20),
-    _case("contact-needles", "on a roof of triangles of aspect 1000", _on_needles),
-    _case("contact-ring", "pulled through a narrow ring", _through_ring, steps=80),
-    _ball("friction", "friction 0.5", contact=RUBBING, level=QUICK),
-    _ball("friction-thrown", "friction 0.5, thrown with 10 m/s", contact=RUBBING, speed=10.0, steps=20),
-    _case("contact-knot", "an overhand knot pulled tight", _knot, steps=80),
-    _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
-    _case(
-        "contact-many", "a stack with 100,000 contacts", _stack, steps=4, level=FULL, observe=_contacts,
-        judge=_judge_many,
-    ),
-)  # fmt: skip

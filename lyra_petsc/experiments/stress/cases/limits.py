@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -29,14 +28,8 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.stress.stress_scenes import (
-    FULL,
-    QUICK,
-    USUAL,
     Content,
-    Scope,
     Setting,
-    StressCase,
-    family,
     scale,
 )
 from lyra_petsc.experiments.stress.verdicts import RunRecord
@@ -56,7 +49,7 @@ JOINT_MASS = 0.5 * DENSITY * WIDTH * LENGTH / LINKS
 STEP, STEPS = 0.005, 40
 
 
-def _strip(setting: Setting, bench: Bench, stiffness: float) -> Content:
+def strip(setting: Setting, bench: Bench, stiffness: float) -> Content:
     return hung(bench, LINKS, 1.0, SPAN, RISE) | {
         "title": "A strip between two supports",
         "material": {"density": DENSITY, "membrane": isotropic(stiffness)},
@@ -64,7 +57,7 @@ def _strip(setting: Setting, bench: Bench, stiffness: float) -> Content:
     }
 
 
-def _edge_positions(trial: Trial) -> Array:
+def edge_positions(trial: Trial) -> Array:
     """x and z of the vertices of one edge of the strip, (LINKS + 1, 2) [m]."""
     return trial.x[: LINKS + 1, [0, 2]]
 
@@ -93,12 +86,12 @@ def step_inextensible_chain(x: Array, v: Array, dt: float, length: float) -> tup
         moved = (inner - free_x[1:-1]) + (pull @ (force[:, None] * links))[1:-1]
         return np.append(moved.ravel(), 0.5 * (np.sum(links**2, axis=1) - length**2))
 
-    found = root(residual, np.append(x[1:-1].ravel(), np.zeros(len(x) - 1)), tol=1e-15).x
-    x_new = np.vstack([x[0], found[: x[1:-1].size].reshape(-1, 2), x[-1]])
+    unknowns = root(residual, np.append(x[1:-1].ravel(), np.zeros(len(x) - 1)), tol=1e-15).x
+    x_new = np.vstack([x[0], unknowns[: x[1:-1].size].reshape(-1, 2), x[-1]])
     return x_new, (x_new - x) / dt
 
 
-def _judge_limit(
+def as_inextensible_chain(
     setting: Setting, bench: Bench, record: RunRecord, stiffness: float
 ) -> Mapping[str, Verdict]:
     x, v = np.asarray(record.observed[0]), np.zeros((LINKS + 1, 2))
@@ -118,20 +111,6 @@ def _judge_limit(
     return {"stiff limit": Verdict(off <= allowed + unsolved, message)}
 
 
-chain = family(
-    "chain",
-    "a strip between two supports against the chain that does not stretch",
-    *(
-        StressCase(
-            f"chain-{stiffness}", f"C {stiffness} N/m, swinging", partial(_strip, stiffness=float(stiffness)),
-            steps=STEPS, step=STEP, level=level, own_scene=True, observe=_edge_positions,
-            judge=partial(_judge_limit, stiffness=float(stiffness)),
-        )
-        for stiffness, level in (("1e4", USUAL), ("1e6", QUICK), ("1e8", USUAL), ("1e10", USUAL))
-    ),
-)  # fmt: skip
-
-
 SIDE, GRAVITY, AREAL, CELLS = 1.0, 9.8, 0.15, 16
 """Side [m], gravity [m/s²], density [kg/m²], cells along a side"""
 
@@ -139,14 +118,14 @@ FALL_TIME = 1.8540746773013719 * math.sqrt(2.0 * SIDE / (3.0 * GRAVITY))
 """Time [s] at which the rigid plate passes the vertical"""
 
 
-def _plate(setting: Setting, bench: Bench, stiffness: float, bending: float) -> Content:
+def plate(setting: Setting, bench: Bench, stiffness: float, bending: float) -> Content:
     mesh = grid(SIDE, SIDE, CELLS, CELLS, "alternating")
     material = {"density": AREAL, "membrane": isotropic(stiffness, 0.3), "bending": bending}
     time, about = {"end": 0.5, "step": setting.step}, "A plate hinged at one edge"
     return scene(mesh, material, time, title=about, gravity=[0.0, 0.0, -GRAVITY], handles=[{"group": "left"}])
 
 
-def _centre(trial: Trial) -> tuple[float, float]:
+def centre(trial: Trial) -> tuple[float, float]:
     """x and z of the centre of mass [m]."""
     x = trial.mass @ trial.x / trial.mass.sum()
     return float(x[0]), float(x[2])
@@ -163,36 +142,14 @@ def first_vertical(times: list[float], centres: list[tuple[float, float]]) -> fl
     return float(times[k - 1] + part * (times[k] - times[k - 1]))
 
 
-def _judge_fall(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
+def as_rigid_plate(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
     # allowed relative error, and part of Δt by which backward Euler may be early in addition
     late, early = 0.005, 0.25
     centres = cast("list[tuple[float, float]]", record.observed)
-    found = first_vertical([0.0, *record.times], centres)
+    passed = first_vertical([0.0, *record.times], centres)
     earliest, latest = FALL_TIME * (1.0 - late) - early * record.nominal, FALL_TIME * (1.0 + late)
-    message = f"first vertical at {found:.4f} s, from {earliest:.4f} to {latest:.4f} s allowed"
-    return {"rigid plate": Verdict(earliest <= found <= latest, message)}
-
-
-def _plate_case(stiffness: str, bending: str, step: float, level: Scope) -> StressCase:
-    ms = f"{step * 1e3:g}"
-    return StressCase(
-        f"plate-{stiffness}-{bending}-{ms}ms", f"C {stiffness} N/m, B {bending} N·m, Δt {ms} ms",
-        partial(_plate, stiffness=float(stiffness), bending=float(bending)),
-        steps=round(0.5 / step), step=step, level=level, own_scene=True, observe=_centre, judge=_judge_fall,
-    )  # fmt: skip
-
-
-rigid_plate = family(
-    "rigid-plate",
-    "stiff in membrane and bending, hinged at one edge: first vertical as a rigid plate",
-    _plate_case("1e4", "1e2", 0.005, USUAL),
-    _plate_case("1e6", "1e2", 0.005, QUICK),
-    _plate_case("1e6", "1e4", 0.005, USUAL),
-    _plate_case("1e8", "1e4", 0.005, USUAL),
-    _plate_case("1e9", "1e6", 0.005, FULL),
-    _plate_case("1e6", "1e3", 0.0025, USUAL),
-    _plate_case("1e8", "1e3", 0.001, FULL),
-)
+    message = f"first vertical at {passed:.4f} s, from {earliest:.4f} to {latest:.4f} s allowed"
+    return {"rigid plate": Verdict(earliest <= passed <= latest, message)}
 
 
 PAPER_END = 0.48
@@ -202,7 +159,7 @@ SOFTER, FINER, SECOND_ORDER = 1e-3, 4, "bdf2"
 """Factor on the stiffness of the soft sheet; refinement of Δt and integrator of its converged value."""
 
 
-def _paper(bench: Bench, integrator: str) -> Content:
+def paper(setting: Setting, bench: Bench, integrator: str = "beuler") -> Content:
     def read() -> Content:
         scene = load_scene(default_scene().with_name("paper.yaml"), (f"time.integrator={integrator}",))
         return parse_yaml(dump_scene(scene), file=None)
@@ -212,44 +169,27 @@ def _paper(bench: Bench, integrator: str) -> Content:
     return content
 
 
-def _kinetic(trial: Trial) -> float:
+def kinetic(trial: Trial) -> float:
     return trial.simulation.budget.kinetic
 
 
-def _soft_kinetic(bench: Bench, integrator: str, step: float) -> float:
+def _soft_kinetic(setting: Setting, bench: Bench, integrator: str, step: float) -> float:
     """Kinetic energy [J] of the soft sheet at the end."""
-    content = scale(_paper(bench, integrator), stretching=SOFTER)
+    content = scale(paper(setting, bench, integrator), stretching=SOFTER)
     content["time"] |= {"step": step, "end": PAPER_END}
     with bench.simulation(content) as trial:
-        return _kinetic(trial.run())
+        return kinetic(trial.run())
 
 
-def _paper_case(step: float, level: Scope) -> StressCase:
+def as_soft_cloth(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
     # mean and standard deviation [J] of the kinetic energy of the ensemble at the end
     kinetic, spread = 0.4646114, 0.0030549
-
-    def judge(setting: Setting, bench: Bench, record: RunRecord) -> Mapping[str, Verdict]:
-        error = abs(record.observed[-1] / kinetic - 1.0)
-        converged = _soft_kinetic(bench, SECOND_ORDER, step / FINER)
-        soft = abs(_soft_kinetic(bench, "beuler", step) / converged - 1.0)
-        allowed = soft + 2.0 * spread / kinetic
-        message = (
-            f"kinetic energy off by {100 * error:.2g} %, that of soft cloth by {100 * soft:.2g} %, two "
-            f"standard deviations of correct calculations are {200 * spread / kinetic:.2g} %"
-        )
-        return {"kinetic energy": Verdict(error <= allowed, message)}
-
-    ms = f"{step * 1e3:g}"
-    return StressCase(
-        f"paper-{ms}ms", f"the paper scene, Δt {ms} ms", lambda setting, bench: _paper(bench, "beuler"),
-        steps=round(PAPER_END / step), step=step, level=level, own_scene=True, observe=_kinetic, judge=judge,
-    )  # fmt: skip
-
-
-paper = family(
-    "paper",
-    "the paper scene against its converged kinetic energy, as soft cloth against its own",
-    _paper_case(0.01, FULL),
-    _paper_case(0.005, USUAL),
-    _paper_case(0.0025, FULL),
-)
+    error = abs(record.observed[-1] / kinetic - 1.0)
+    converged = _soft_kinetic(setting, bench, SECOND_ORDER, record.nominal / FINER)
+    soft = abs(_soft_kinetic(setting, bench, "beuler", record.nominal) / converged - 1.0)
+    allowed = soft + 2.0 * spread / kinetic
+    message = (
+        f"kinetic energy off by {100 * error:.2g} %, that of soft cloth by {100 * soft:.2g} %, two "
+        f"standard deviations of correct calculations are {200 * spread / kinetic:.2g} %"
+    )
+    return {"kinetic energy": Verdict(error <= allowed, message)}
