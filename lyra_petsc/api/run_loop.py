@@ -10,7 +10,6 @@ from typing import Any
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from lyra_petsc.api.waiting import Waiting
 from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.recorder import Recorder
@@ -105,7 +104,6 @@ class _RunLoop:
         self._simulation, self._recorder, self._folder = simulation, recorder, folder
         self._callbacks, self._comm = callbacks, simulation.comm
         self._versions = library_versions()
-        self._waiting = Waiting(self._comm)
         self._notes_shown = simulation.run_notes.earlier
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
@@ -132,14 +130,11 @@ class _RunLoop:
             self._show_notes()
             simulation.stepper.monitor()
             while not simulation.finished:
-                with self._waiting.step():
-                    report = simulation.step()
+                report = simulation.step()
                 with simulation.phases("output"):
                     recorder.record(report)
                 self._show_notes()
                 callbacks.step(simulation, report)
-                if note := self._waiting.check(last=simulation.finished):
-                    callbacks.note(note)
                 if number := stop():
                     recorder.write_checkpoint()
                     recorder.flush()
@@ -216,7 +211,7 @@ class _RunLoop:
             **simulation.stability,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
-            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats, self._waiting.note])],
+            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats])],
             **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)

@@ -45,6 +45,8 @@ from lyra_petsc.experiments.fabric.fabric_report import (
 )
 from lyra_petsc.experiments.fabric.specimens import Fabric, G
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, square_to_disc
+from lyra_petsc.experiments.verification.rods import loop_height
+from lyra_petsc.extras import install_hint
 from lyra_petsc.scene.material_block import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.scene.materials.library import GF_PER_CM, ShellMaterial
 from lyra_petsc.scene.materials.measured_curves import force_at
@@ -341,27 +343,28 @@ def _cantilever(bench: Bench, fabric: Fabric, degrees: float, length: float) -> 
 
 def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     """Cantilever test: the overhang whose chord falls by 41.5°; bending length c, rigidity w c³."""
+    from scipy.optimize import newton
+
     # prescribed angle of the chord [°]
     overhang = 41.5
     shell, record = fabric.shell(degrees), Record()
     weight = G * shell.density
     known = fabric.rigidity(degrees)
-    length = 2.0 * (known / weight) ** (1.0 / 3.0)
-    # secant method in the logarithms, as the angle is nearly a power of the length
-    lengths = [0.97 * length, length]
-    angles = [_cantilever(bench, fabric, degrees, trial)[0] for trial in lengths]
     line = np.empty((0, 2))
-    for _ in range(8):
-        if abs(angles[-1] - overhang) < 1e-3:
-            break
-        slope = math.log(angles[-1] / angles[-2]) / math.log(lengths[-1] / lengths[-2])
-        lengths.append(lengths[-1] * (overhang / angles[-1]) ** (1.0 / slope))
-        angle, line = _cantilever(bench, fabric, degrees, lengths[-1])
-        angles.append(angle)
-    half = 0.5 * lengths[-1]
+
+    def off(log_length: float) -> float:
+        """In logarithms, as the angle is nearly a power of the length."""
+        nonlocal line
+        angle, line = _cantilever(bench, fabric, degrees, math.exp(log_length))
+        return math.log(angle / overhang)
+
+    first = math.log(2.0 * (known / weight) ** (1.0 / 3.0))
+    # without a derivative this is the secant method
+    length = math.exp(newton(off, first - 0.03, x1=first, tol=1e-4, disp=False))
+    half = 0.5 * length
     rigidity = weight * half**3
     record.numbers = [
-        FabricNumber("overhang", 1e2 * lengths[-1], "cm"),
+        FabricNumber("overhang", 1e2 * length, "cm"),
         FabricNumber("bending length c", 1e2 * half, "cm"),
         FabricNumber("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
         FabricNumber("B", 1e6 * rigidity, "µN·m"),
@@ -388,57 +391,6 @@ def loop_length(height: float, strip: float) -> float:
     return float(first * (math.cos(angle) / math.tan(angle)) ** (1.0 / 3.0))
 
 
-Ends = tuple[float, float, float]
-
-
-def _shoot(slope: float, pull: float, weight: float) -> Ends:
-    """Integrate half a loop of length 1 with B = 1; returns residuals of angle and x at its lowest point,
-    and z.
-
-    θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by the classical Runge-Kutta method.
-    """
-    # Runge-Kutta steps along half a loop
-    shots = 200
-    h, y = 1.0 / shots, np.array([0.5 * math.pi, slope, 0.0, 0.0])
-
-    def rates(at: float, y: Array) -> Array:
-        cosine, sine = math.cos(y[0]), math.sin(y[0])
-        return np.array([y[1], weight * (1.0 - at) * cosine + pull * sine, cosine, sine])
-
-    for s in h * np.arange(shots):
-        one = rates(s, y)
-        two = rates(s + 0.5 * h, y + 0.5 * h * one)
-        three = rates(s + 0.5 * h, y + 0.5 * h * two)
-        four = rates(s + h, y + h * three)
-        y = y + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
-    return float(y[0]) + math.pi, float(y[2]), float(y[3])
-
-
-def loop_height(bending_length: float, strip: float) -> float:
-    """Height of the elastica of a hanging heart loop, in the unit of strip and bending length; by shooting.
-
-    Raises
-    ------
-    ArithmeticError
-        If Newton's method does not converge.
-    """
-    last, slope, pull = (0.5 * strip / bending_length) ** 3, -4.9, -8.8
-    ends, tiny = (0.0, 0.0, 0.0), 1e-6
-    for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)).tolist():
-        for _ in range(50):
-            ends = _shoot(slope, pull, weight)
-            if max(abs(ends[0]), abs(ends[1])) < 1e-10:
-                break
-            sides = _shoot(slope + tiny, pull, weight), _shoot(slope, pull + tiny, weight)
-            matrix = [[(side[i] - ends[i]) / tiny for side in sides] for i in range(2)]
-            one, two = np.linalg.solve(matrix, [-ends[0], -ends[1]]).tolist()
-            cut = max(1.0, abs(one), abs(two) / 5.0)
-            slope, pull = slope + one / cut, pull + two / cut
-        else:
-            raise ArithmeticError("the heart loop's elastica was not found")
-    return -0.5 * strip * ends[2]
-
-
 def _start_loop(cells: int, half: float) -> Array:
     """Start shape of half a loop (cells + 1, 2) [m]: an arc of 270° with straight end, without stretch."""
     size, s = half / cells, (np.arange(cells) + 0.5) / cells
@@ -448,11 +400,10 @@ def _start_loop(cells: int, half: float) -> Array:
         sides = size * np.column_stack([np.sin(angle), np.cos(angle)])
         return np.concatenate([np.zeros((1, 2)), np.cumsum(sides, axis=0)])
 
-    low, high = 0.5 / (1.5 * math.pi + 1.0), 2.0 / (1.5 * math.pi + 1.0)  # radii over half the length
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if line(middle)[-1, 0] < 0.0 else (low, middle)
-    return line(low)
+    from scipy.optimize import brentq
+
+    shortest = 0.5 / (1.5 * math.pi + 1.0)  # radius over half the length
+    return line(brentq(lambda radius: line(radius)[-1, 0], shortest, 4.0 * shortest))
 
 
 def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
@@ -477,9 +428,8 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             gravity=[0.0, 0.0, -G],
         )
         with bench.simulation(content) as trial:
-            found = trial.run().x[: cells + 1, ::2]
-        heights.append(-float(found[-1, 1]))
-        shapes.append(found)
+            shapes.append(trial.run().x[: cells + 1, ::2])
+        heights.append(-float(shapes[-1][-1, 1]))
     lengths = [loop_length(h, strip) for h, strip in zip(heights, strips, strict=True)]
     record.numbers = [
         FabricNumber(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
@@ -490,7 +440,7 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     if not max(shell.friction_moment) > 0.0:
         for strip, height in zip(strips, heights, strict=True):
             name = f"height of {1e2 * strip:.3g} cm, against the elastica"
-            record.claim(name, height, loop_height(known, strip), 0.01)
+            record.claim(name, height, strip * loop_height(known / strip), 0.01)
     return record
 
 
@@ -597,17 +547,15 @@ def cases_of(test: str) -> list[FabricCase]:
     """
     if test != ALL and test not in TESTS:
         raise InputError(f"unknown test, {suggest(test, [*TESTS, ALL])}", key=test)
-    found = []
+    cases = []
     for name in TESTS if test == ALL else [test]:
-        each = TESTS[name]
-        if not each.both:
-            found.append(FabricCase(name, each.title, name, 0.0))
+        title = TESTS[name].title
+        if not TESTS[name].both:
+            cases.append(FabricCase(name, title, name, 0.0))
             continue
-        found += [
-            FabricCase(f"{name}-{thread}", f"{each.title}, {thread}", name, degrees)
-            for thread, degrees in DIRECTIONS.items()
-        ]
-    return found
+        for thread, degrees in DIRECTIONS.items():
+            cases.append(FabricCase(f"{name}-{thread}", f"{title}, {thread}", name, degrees))
+    return cases
 
 
 def run_case(
@@ -624,6 +572,8 @@ def run_case(
             record = Record(stopped=failure_message(comm, error))
         except ArithmeticError as error:  # in formulas for numbers that all ranks have
             record = Record(stopped=f"no number: {error}")
+        except ModuleNotFoundError as error:  # on all ranks
+            record = Record(stopped=install_hint([str(error.name)]))
     record.seconds = comm.bcast(time.perf_counter() - began)
     return outcome_of(case, record)
 

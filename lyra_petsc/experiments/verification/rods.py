@@ -159,15 +159,15 @@ def _solved(
     s: Array,
     state: Array,
     accuracy: float = ACCURACY,
-    parameters: Sequence[float] | None = None,
+    parameters: Sequence[float] | Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """Solve a boundary value problem; returns s, states and parameters."""
     from scipy.integrate import solve_bvp
 
-    found = solve_bvp(rates, ends, s, state, p=parameters, tol=accuracy, max_nodes=50_000)
-    if not found.success:
-        raise ArithmeticError(f"no equilibrium found: {found.message}")
-    return found.x, found.y, found.p
+    solution = solve_bvp(rates, ends, s, state, p=parameters, tol=accuracy, max_nodes=50_000)
+    if not solution.success:
+        raise ArithmeticError(f"no equilibrium found: {solution.message}")
+    return solution.x, solution.y, solution.p
 
 
 def stretches(tension: Array, compliance: float) -> Array:
@@ -233,7 +233,7 @@ def column_shape(*, shortening: float | None = None, load: float | None = None) 
     from scipy.special import ellipe, ellipk
 
     def off(k: float) -> float:
-        """Residual of the given quantity for the modulus k."""
+        """Residual of the prescribed quantity for the modulus k."""
         if load is None:
             return 2.0 - 2.0 * ellipe(k * k) / ellipk(k * k) - shortening
         return 4.0 * ellipk(k * k) ** 2 - load
@@ -297,3 +297,26 @@ def pressed_tip(load: float) -> tuple[float, float]:
     y = solve_ivp(rates, (1.0, 0.0), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     cos, sin = math.cos(y[0]), math.sin(y[0])
     return float(-cos * y[4] - sin * y[5]), float(sin * y[4] - cos * y[5])
+
+
+def loop_height(bending_length: float) -> float:
+    """Height of the elastica of a hanging heart loop over the length of its strip, which is in this unit.
+
+    Half of the strip has length 1 and B = 1: θ'' = Γ (1 − s) cos θ + H sin θ with the horizontal force H,
+    from the clamp, where θ = 90°, to the lowest point, where it is −180°.
+    """
+    last, s = (0.5 / bending_length) ** 3, np.linspace(0.0, 1.0, POINTS)
+    angle = math.pi * (0.5 - 1.5 * s)
+    steps = np.stack([np.cos(angle), np.sin(angle)]) / (POINTS - 1)
+    state, pull = np.vstack([angle, 0.0 * s - 1.5 * math.pi, np.cumsum(steps, axis=1)]), np.array([-8.8])
+    for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)):
+
+        def rates(s: Array, state: Array, pull: Array, weight: float = weight) -> Array:
+            cos, sin = np.cos(state[0]), np.sin(state[0])
+            return np.stack([state[1], weight * (1.0 - s) * cos + pull * sin, cos, sin])
+
+        def ends(clamp: Array, tip: Array, pull: Array) -> Array:
+            return np.array([clamp[0] - 0.5 * math.pi, clamp[2], clamp[3], tip[0] + math.pi, tip[2]])
+
+        s, state, pull = _solved(rates, ends, s, state, parameters=pull)
+    return -0.5 * float(state[3, -1])
