@@ -180,8 +180,6 @@ class Bench:
     ----------
     steps : int
         Accepted steps so far.
-    started : int
-        Number of simulations so far.
     """
 
     def __init__(
@@ -196,7 +194,6 @@ class Bench:
         self._direct, self._trust_mesh = direct, trust_mesh
         self.watch = watch or (lambda: None)
         self.steps = 0
-        self.started = 0
         self._folder: TemporaryDirectory[str] | None = None
         self._files = 0
 
@@ -295,6 +292,5 @@ class Bench:
         scene = validated(Scene, filled, file="scene of the case")
         if self._trust_mesh:
             scene = scene.trusting_meshes()
-        self.started += 1
         with open_simulation(self.comm, scene, stops=stops) as simulation:
             yield Trial(self, simulation)

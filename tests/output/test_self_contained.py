@@ -14,7 +14,7 @@ from mpi4py import MPI
 from written_run import written
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.comparison import read_local
+from lyra_petsc.experiments.study.comparison import read_samples
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import choose_folder
@@ -97,7 +97,7 @@ def test_studies_and_resumed_runs_refuse_them_too(tmp_path: Path, attack: str) -
     with pytest.raises(InputError, match="all of its results"):
         open_stored(folder / "states-0000.h5").__enter__()
     with pytest.raises(InputError, match="all of its results"):
-        read_local(folder, (0.0, 0.1), 0.1)
+        read_samples(folder, (0.0, 0.1), 0.1)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_links_in_the_mesh_are_refused_by_all_that_read_it(tmp_path: Path) -> No
         lambda: run.triangles,
         lambda: run.uv,
         lambda: HeldVertices(run),
-        lambda: read_local(folder, (0.0,), 0.1),
+        lambda: read_samples(folder, (0.0,), 0.1),
     ):
         with pytest.raises(InputError, match="'/start' is a link to elsewhere"):
             read()

@@ -8,16 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case, Outcome, StoredArray, Verdict
-from lyra_petsc.experiments.drape import CLOTH, DISC, DRAPE_GAP
 from lyra_petsc.experiments.results import Line, View, verdict_line, write_csv
-from lyra_petsc.show.render.image_files import png_bytes
-from lyra_petsc.show.render.opengl import check_opengl, import_pyvista, off_screen_plotter
-from lyra_petsc.show.render.scene_drawing import INK, OBSTACLE_COLOR, Image
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, empty_figure, make_drawing, surface
 
@@ -197,7 +189,7 @@ class FabricView(View[FabricOutcome]):
 
 def pictures(outcome: FabricOutcome) -> list[Drawing]:
     """Figures of the curves, the drape and the shadow of a test."""
-    record, name, found = outcome.record, outcome.case.name, []
+    record, name, drawings = outcome.record, outcome.case.name, []
     if record.curves:
         figure = empty_figure(0.8 * HEIGHT)
         axes = figure.add_subplot(xlabel=record.curves[0].x_label, ylabel=record.curves[0].y_label)
@@ -208,9 +200,12 @@ def pictures(outcome: FabricOutcome) -> list[Drawing]:
             axes.set_aspect("equal", adjustable="datalim")  # a shape, not a diagram
         if len(record.curves) > 1:
             axes.legend(fontsize=8)
-        found.append(make_drawing(figure, f"{PLOTS}/{name}", outcome.case.title))
+        drawings.append(make_drawing(figure, f"{PLOTS}/{name}", outcome.case.title))
     if record.drape is not None and record.triangles is not None:
-        found.append(_drape(record.drape, record.triangles, f"{PLOTS}/{name}-drape"))
+        caption = "The first start"
+        drawings.append(
+            surface(record.drape, record.triangles, name=f"{PLOTS}/{name}-drape", caption=caption)
+        )
     if record.shadow:
         figure = empty_figure(HEIGHT)
         axes = figure.add_subplot(xlabel="x [cm]", ylabel="y [cm]")
@@ -219,35 +214,7 @@ def pictures(outcome: FabricOutcome) -> list[Drawing]:
             record.shadow, cmap="Greys", origin="lower", extent=(-half, half, -half, half),
             interpolation="nearest", vmin=0, vmax=1.4,
         )  # fmt: skip
-        found.append(make_drawing(figure, f"{PLOTS}/{name}-shadow", f"{name}: the shadow of the last start"))
-    return found
-
-
-def _drape(x: Array, triangles: Ints, name: str) -> Drawing:
-    """The draped cloth (V, 3) [m] on its disc, within the circle of the flat cloth."""
-    caption = "The first start on its disc of 18 cm, within the circle of the flat cloth, 30 cm"
-    try:
-        image = _rendered(x, triangles)
-    except (ImportError, InputError):  # no pyvista, or no OpenGL
-        return surface(x, triangles, name=name, caption="The first start")
-    return Drawing(name, caption, lambda: png_bytes(image), b"")
-
-
-def _rendered(x: Array, triangles: Ints) -> Image:
-    check_opengl()
-    # size of the picture of a drape [pixels]
-    pyvista, plotter = import_pyvista(), off_screen_plotter((1280, 720))
-    plotter.enable_lightkit()
-    plotter.set_background("white")
-    sheet = pyvista.PolyData(x, np.column_stack([np.full(len(triangles), 3), triangles]).ravel())
-    plotter.add_mesh(sheet, color="#8fb7d9", smooth_shading=True)
-    plotter.add_mesh(pyvista.Disc(inner=0.0, outer=DISC, c_res=96), color=OBSTACLE_COLOR)
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    # the rim of the disc lies on the cloth, which hides the disc
-    for radius, height, color in ((CLOTH, 0.0, "#c0392b"), (DISC, 2.5 * DRAPE_GAP, INK)):
-        circle = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height + 0.0 * angle])
-        plotter.add_mesh(pyvista.MultipleLines(circle).tube(radius=6e-4), color=color)
-    plotter.camera_position = [(0.1, -0.38, 0.24), (0.0, 0.0, -0.035), (0.0, 0.0, 1.0)]
-    image: Image = plotter.screenshot(return_img=True)
-    plotter.close()
-    return image
+        drawings.append(
+            make_drawing(figure, f"{PLOTS}/{name}-shadow", f"{name}: the shadow of the last start")
+        )
+    return drawings

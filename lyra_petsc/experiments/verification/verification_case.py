@@ -20,8 +20,8 @@ from lyra_petsc.experiments.bench import Bench, failure_message
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.results import Line, View, align_columns, verdict_line
 from lyra_petsc.extras import install_hint
-from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds
-from lyra_petsc.show.report.plots import Series, convergence, work_precision
+from lyra_petsc.show.report.document import PLOTS, Report, seconds
+from lyra_petsc.show.report.plots import Series, convergence
 
 
 @dataclass
@@ -39,10 +39,6 @@ class ErrorRow:
         Error relative to the scale of the quantity.
     order : float
         Order of convergence from the row before; NaN if there is none.
-    steps : int
-        Accepted time or load steps of all simulations at this resolution.
-    wall_seconds : float
-        Wall time [s] of these simulations, set-up included.
     problem : str
         Why there is no value; empty if there is one.
     """
@@ -55,8 +51,6 @@ class ErrorRow:
     exact: float = math.nan
     error: float = math.nan
     order: float = math.nan
-    steps: int = 0
-    wall_seconds: float = 0.0
     problem: str = ""
 
 
@@ -158,8 +152,7 @@ class VerificationCase(Case):
     Attributes
     ----------
     measure : callable (bench, n) → Measured, one by one
-        Collective; the same result on every rank. A row has the steps and run time of the simulations since
-        the row before; rows without one between them share theirs.
+        Collective; the same result on every rank.
     source : str
         Source of the solution.
     resolutions : sequence of float
@@ -240,12 +233,7 @@ class VerificationOutcome(Outcome[VerificationCase]):
 
 
 def run_case(
-    comm: MPI.Comm,
-    case: VerificationCase,
-    *,
-    quick: bool = False,
-    warm: bool = True,
-    watch: Callable[[], None] | None = None,
+    comm: MPI.Comm, case: VerificationCase, *, quick: bool = False, watch: Callable[[], None] | None = None
 ) -> VerificationOutcome:
     """Measure a case at its resolutions and judge it; collective, the same outcome on all ranks.
 
@@ -255,18 +243,14 @@ def run_case(
     case : VerificationCase
     quick : bool
         Only the coarsest resolutions.
-    warm : bool
-        Measure the coarsest resolution once untimed, so that compilation is not counted.
     watch : callable, optional
         Called before every step on all ranks; may raise to end the work.
     """
     began = time.perf_counter()
-    resolutions = list(case.resolutions)[: case.quick] if quick else list(case.resolutions)
-    if warm and len(resolutions) > 1:
-        _measure_rows(comm, watch, case, resolutions[0])
+    outcome = VerificationOutcome(case)
     tables: dict[str, list[ErrorRow]] = {}
     problems: list[ErrorRow] = []
-    for n in resolutions:
+    for n in case.resolutions[: case.quick] if quick else case.resolutions:
         for row in _measure_rows(comm, watch, case, n):
             if row.problem:
                 problems.append(row)
@@ -275,7 +259,6 @@ def run_case(
             if table and case.claim_of(row.quantity).exact is None:
                 row.order = observed_order(table[-1], row)
             table.append(row)
-    outcome = VerificationOutcome(case)
     for quantity, table in tables.items():
         outcome.rows += table
         outcome.verdicts[quantity] = case.claim_of(quantity).judge(table, 1.0 / case.resolutions[-1])
@@ -292,27 +275,17 @@ def _measure_rows(
     comm: MPI.Comm, watch: Callable[[], None] | None, case: VerificationCase, n: float
 ) -> list[ErrorRow]:
     """The rows of one resolution; if it cannot run to its end, also a row with the reason."""
-    comm.Barrier()
-    began, h = time.perf_counter(), 1.0 / n
     rows: list[ErrorRow] = []
-    problem, seen, spent = "", (0, 0), (0, 0.0)
+    problem, h = "", 1.0 / n
     with Bench(comm, watch) as bench:
         bench.watch()
         try:
             for one in case.measure(bench, n):
-                if (bench.steps, bench.started) != seen:
-                    spent = bench.steps - seen[0], time.perf_counter() - began
-                    began, seen = began + spent[1], (bench.steps, bench.started)
-                row = ErrorRow(one.quantity, one.unit, n, h, one.value, one.exact, one.error)
-                row.steps, row.wall_seconds = spent
-                rows.append(row)
+                rows.append(ErrorRow(one.quantity, one.unit, n, h, one.value, one.exact, one.error))
         except (InputError, SolverError) as error:
             problem = failure_message(comm, error)
         except ModuleNotFoundError as error:  # on all ranks
             problem = install_hint([str(error.name)])
-    slowest = np.max(comm.allgather([row.wall_seconds for row in rows]), axis=0)
-    for row, wall in zip(rows, slowest, strict=True):
-        row.wall_seconds = float(wall)
     if problem:
         rows.append(ErrorRow("could not run", "", n, h, problem=problem))
     return rows
@@ -320,9 +293,8 @@ def _measure_rows(
 
 CELLS = {
     "n": "{:g}", "h": "{:.4g}", "value": "{:.9g}", "exact": "{:.9g}", "error": "{:.2e}", "order": "{:.2f}",
-    "steps": "{}", "run time [s]": "{:.2f}",
 }  # fmt: skip
-"""Headings of the table of a quantity, and the formats of its cells."""
+"""Columns of the table of a quantity, and the formats of their cells."""
 
 
 def cells(rows: Sequence[ErrorRow]) -> list[list[str]]:
@@ -330,9 +302,8 @@ def cells(rows: Sequence[ErrorRow]) -> list[list[str]]:
     unit = "" if rows[0].unit == "1" else f" [{rows[0].unit}]"
     table = [[name + unit if name in ("value", "exact") else name for name in CELLS]]
     for row in rows:
-        values = [row.n, row.h, row.value, row.exact, row.error, row.order, row.steps, row.wall_seconds]
-        texts = zip(CELLS.values(), values, strict=True)
-        table.append(["" if math.isnan(value) else text.format(value) for text, value in texts])
+        values = [(getattr(row, name), text) for name, text in CELLS.items()]
+        table.append(["" if math.isnan(value) else text.format(value) for value, text in values])
     return table
 
 
@@ -343,8 +314,7 @@ class VerificationView(View[VerificationOutcome]):
     title = "Verification: exact and published answers"
     pictures = "plots"
     columns = (
-        "case", "quantity", "unit", "n", "h", "value", "exact", "error", "order", "steps", "wall_seconds",
-        "passed", "problem",
+        "case", "quantity", "unit", "n", "h", "value", "exact", "error", "order", "passed", "problem",
     )  # fmt: skip
 
     def terminal_lines(self, outcome: VerificationOutcome) -> Iterable[Line]:
@@ -377,8 +347,7 @@ class VerificationView(View[VerificationOutcome]):
     ) -> None:
         report.paragraph(
             f"{summary} The error is |value − exact| over the size of the exact value, or over a natural "
-            "scale where that is zero; the order is that between a row and the one before; the run time of "
-            "a row is that of all its simulations, set-up included."
+            "scale where that is zero; the order is that between a row and the one before."
         )
         heads = ["case", "what is compared", "verdict", "run time"]
         table = [[o.case.name, o.case.title, o.status, seconds(o.seconds)] for o in outcomes]
@@ -392,26 +361,15 @@ class VerificationView(View[VerificationOutcome]):
                     heads, *table = cells(rows)
                     report.table(heads, table, caption=quantity)
                 report.paragraph(f"{outcome.verdicts[quantity].line}.")
-            if plots:
-                _figures(report, outcome)
-
-
-def _figures(report: Report, outcome: VerificationOutcome) -> None:
-    """Plot error against h and against run time, for the quantities that converge."""
-    case = outcome.case
-    tables = {
-        quantity: rows
-        for quantity, rows in outcome.tables().items()
-        if case.claim_of(quantity).exact is None and len(rows) > 1 and not any(row.problem for row in rows)
-    }
-    drawn: tuple[tuple[str, str, str, Callable[..., Drawing]], ...] = (
-        ("h", "h", "h", convergence), ("wall_seconds", "run time", "run time [s]", work_precision),
-    )  # fmt: skip
-    for x, axis, label, draw in drawn if tables else ():
-        lines = [
-            Series(quantity, [getattr(row, x) for row in rows], [row.error for row in rows])
-            for quantity, rows in tables.items()
-        ]
-        file = f"{PLOTS}/{case.name}-{'convergence' if x == 'h' else 'run-time'}"
-        about = {"name": file, "caption": f"{case.name}: error against {axis}"}
-        report.figure(draw(lines, **about, x_label=label, y_label="relative error"))
+            lines = [
+                Series(quantity, [row.h for row in rows], [row.error for row in rows])
+                for quantity, rows in outcome.tables().items()
+                if case.claim_of(quantity).exact is None
+                and len(rows) > 1
+                and not any(r.problem for r in rows)
+            ]
+            if plots and lines:
+                caption, name = f"{case.name}: error against h", f"{PLOTS}/{case.name}-convergence"
+                report.figure(
+                    convergence(lines, name=name, caption=caption, x_label="h", y_label="relative error")
+                )

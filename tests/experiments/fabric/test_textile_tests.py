@@ -116,7 +116,8 @@ def test_a_stiff_membrane_does_not_lock(test: str) -> None:
 def test_heart_loops_with_and_without_weight() -> None:
     assert textile_tests.loop_height(100.0) == pytest.approx(0.13386, abs=1e-4)
     # Peirce's formula is an approximation
-    assert textile_tests.loop_length(6.0 * textile_tests.loop_height(1.0 / 6.0), 6.0) == pytest.approx(1.0, rel=0.05)
+    height = 6.0 * textile_tests.loop_height(1.0 / 6.0)
+    assert textile_tests.loop_length(height, 6.0) == pytest.approx(1.0, rel=0.05)
     with Bench(MPI.COMM_SELF) as bench:
         record = textile_tests.loop(bench, FABRIC, 0.0)
     assert len(record.verdicts) == 3

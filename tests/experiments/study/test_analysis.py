@@ -179,21 +179,21 @@ def test_failed_rows_are_omitted() -> None:
 @pytest.mark.parametrize("order", [1, 2])
 def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None:
     value = [1.0 + 0.3 * h**order for h in (0.1, 0.2, 0.4)]
-    found = richardson(abs(value[0] - value[1]), abs(value[1] - value[2]), 2.0, order)
+    found = richardson(abs(value[0] - value[1]), abs(value[1] - value[2]), order)
     assert found.error == pytest.approx(value[0] - 1.0)
     assert found.order == pytest.approx(order)
     assert found.trusted
 
 
 def test_richardson_limits_the_order_and_refuses_divergence() -> None:
-    fast = richardson(1.0, 16.0, 2.0, 2)
+    fast = richardson(1.0, 16.0, 2)
     assert fast.error == pytest.approx(16.0 / 4.0 / 3.0)  # the estimate of the coarser pair
-    slow = richardson(1.0, 2.0, 2.0, 2)
+    slow = richardson(1.0, 2.0, 2)
     assert slow.error == pytest.approx(1.0)
-    away = richardson(2.0, 1.0, 2.0, 2)
+    away = richardson(2.0, 1.0, 2)
     assert not away.trusted
     assert away.error > 2.0
-    assert richardson(0.0, 0.0, 2.0, 2).error == 0.0
+    assert richardson(0.0, 0.0, 2).error == 0.0
 
 
 def test_errors_in_time_and_space_add_up() -> None:

@@ -1,4 +1,4 @@
-"""Comparison of runs on one mesh and across meshes, in slabs, on any number of ranks."""
+"""Comparison of runs on one mesh and across meshes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from physics import grid, scene_of
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import Energies, ExactMotion
-from lyra_petsc.experiments.study import comparison
 from lyra_petsc.experiments.study.comparison import (
+    Errors,
     RestSurface,
+    Samples,
     barycentric,
-    make_interpolation,
-    motion_errors,
-    read_local,
+    error_history,
+    interpolation,
+    overall,
     read_samples,
     read_surface,
-    run_errors,
+    samples_of_motion,
 )
 from lyra_petsc.experiments.study.plan import ENERGY, POSITION, probe_quantity
 from lyra_petsc.mesh.build import build_mesh
@@ -64,33 +65,34 @@ TIP = [np.zeros(3), np.array([0.0, 0.0, -0.1]), np.array([0.0, 0.0, -0.2])]
 
 
 @pytest.fixture
-def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
+def pair(tmp_path: Path) -> tuple[Path, Path]:
     """Two runs on one mesh; the second differs at 0.1 s by 0.05 m at one corner, and in energy and probe."""
-    one, two = shared_tmp / "one", shared_tmp / "two"
-    if comm.rank == 0:
-        mesh = mesh_of(SHEET)
-        states = [mesh.rest + [0, 0, -t] for t in TIME_KEYS]
-        off = [x.copy() for x in states]
-        off[1][0] += [0.03, 0.0, 0.04]
-        energies = [[0.0, 0.0, 0.0, 5.0], [1.2, 0.5, 0.0, 3.5], [2.0, 0.0, 0.0, 3.0]]
-        tip = [TIP[0], TIP[1], TIP[2] + [0.0, 0.005, 0.0]]
-        write_run(one, mesh, states, ENERGIES, TIP)
-        write_run(two, mesh, off, energies, tip)
-    comm.Barrier()
+    one, two = tmp_path / "one", tmp_path / "two"
+    mesh = mesh_of(SHEET)
+    states = [mesh.rest + [0, 0, -t] for t in TIME_KEYS]
+    off = [x.copy() for x in states]
+    off[1][0] += [0.03, 0.0, 0.04]
+    energies = [[0.0, 0.0, 0.0, 5.0], [1.2, 0.5, 0.0, 3.5], [2.0, 0.0, 0.0, 3.0]]
+    tip = [TIP[0], TIP[1], TIP[2] + [0.0, 0.005, 0.0]]
+    write_run(one, mesh, states, ENERGIES, TIP)
+    write_run(two, mesh, off, energies, tip)
     return one, two
 
 
-@pytest.mark.parallel(2)
-def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (read_samples(comm, folder, TIME_KEYS, 0.1, [20]) for folder in pair)
-    errors = run_errors(comm, two, one, QUANTITIES)
+def errors_of(run: Samples, reference: Samples) -> Errors:
+    return overall(error_history(run, reference, QUANTITIES))
+
+
+def test_errors_on_one_mesh(pair: tuple[Path, Path]) -> None:
+    one, two = (read_samples(folder, TIME_KEYS, 0.1, [20]) for folder in pair)
+    errors = errors_of(two, one)
     assert errors["position_max"] == pytest.approx(0.05 / 0.5)
     # the corner of a diagonal grid that both triangles of its cell meet in: two thirds of 0.005 m²
     share = (2.0 * 0.005 / 3.0) / 0.12
     assert errors["position_l2"] == pytest.approx(math.sqrt(share * 0.05**2 / 2.0) / 0.5)
     assert errors["energy"] == pytest.approx(0.2 / 2.0)
     assert errors["probe_tip"] == pytest.approx(0.005 / 0.5)
-    assert run_errors(comm, one, one, QUANTITIES) == dict.fromkeys(errors, 0.0)
+    assert errors_of(one, one) == dict.fromkeys(errors, 0.0)
 
 
 class Falling(ExactMotion):
@@ -104,13 +106,10 @@ class Falling(ExactMotion):
         return Energies(kinetic, membrane, potential)
 
 
-@pytest.mark.parallel(2)
-def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (read_samples(comm, folder, TIME_KEYS, 0.1, [20]) for folder in pair)
-    exact = motion_errors(comm, one, Falling(), QUANTITIES)
-    assert max(exact.values()) < 1e-15
-    errors = motion_errors(comm, two, Falling(), QUANTITIES)
-    assert errors == pytest.approx(run_errors(comm, two, one, QUANTITIES))
+def test_errors_against_an_exact_motion(pair: tuple[Path, Path]) -> None:
+    one, two = (read_samples(folder, TIME_KEYS, 0.1, [20]) for folder in pair)
+    assert max(errors_of(one, samples_of_motion(Falling(), one)).values()) < 1e-15
+    assert errors_of(two, samples_of_motion(Falling(), two)) == pytest.approx(errors_of(two, one))
 
 
 def linear(rest: Array, t: float) -> Array:
@@ -118,26 +117,16 @@ def linear(rest: Array, t: float) -> Array:
     return np.asarray(rest @ np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, 0.5], [0.0, 0.0, 1.0]]) + [t, 0.0, -t])
 
 
-@pytest.mark.parallel(2)
-@pytest.mark.parametrize("rows_at_once", [7, 1 << 16])
-def test_errors_across_meshes(
-    shared_tmp: Path, comm: MPI.Comm, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(comparison, "ROWS_AT_ONCE", rows_at_once)
+def test_errors_across_meshes(tmp_path: Path) -> None:
     folders = {"coarse": grid(0.3, 0.4, 3, 2), "fine": grid(0.3, 0.4, 7, 9, "criss-cross")}
-    if comm.rank == 0:
-        for name, source in folders.items():
-            mesh = mesh_of(source)
-            write_run(shared_tmp / name, mesh, [linear(mesh.rest, t) for t in TIME_KEYS], ENERGIES, TIP)
-    comm.Barrier()
+    for name, source in folders.items():
+        mesh = mesh_of(source)
+        write_run(tmp_path / name, mesh, [linear(mesh.rest, t) for t in TIME_KEYS], ENERGIES, TIP)
     coarse, fine = (
-        read_samples(comm, shared_tmp / name, TIME_KEYS, 0.1, [count])
+        read_samples(tmp_path / name, TIME_KEYS, 0.1, [count])
         for name, count in (("coarse", 12), ("fine", 143))
     )
-    for errors in (
-        run_errors(comm, coarse, fine, QUANTITIES),
-        run_errors(comm, fine, coarse, QUANTITIES),
-    ):
+    for errors in (errors_of(coarse, fine), errors_of(fine, coarse)):
         assert errors["position_max"] < 1e-14
         assert errors["energy"] == 0.0
 
@@ -146,16 +135,11 @@ def surface(mesh: Mesh) -> RestSurface:
     return RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
 
 
-@pytest.mark.parallel(2)
-def test_coincident_sheets_are_distinguished(comm: MPI.Comm, shared_tmp: Path) -> None:
-    two = [grid(1.0, 1.0, 2, 2), grid(1.0, 1.0, 2, 2)]
-    finer = [grid(1.0, 1.0, 4, 4), grid(1.0, 1.0, 4, 4)]
-    coarse, fine = mesh_of(*two), mesh_of(*finer)
-    transfer = make_interpolation(comm, surface(coarse), [9, 9], surface(fine), [25, 25])
-    first, last = comm.rank * 18 // comm.size, (comm.rank + 1) * 18 // comm.size
-    numbers = transfer.wanted[transfer.corner]
-    for row, point in enumerate(range(first, last)):
-        used = numbers[row][transfer.weight[row] > 1e-12]
+def test_coincident_sheets_are_distinguished() -> None:
+    coarse, fine = mesh_of(*2 * [grid(1.0, 1.0, 2, 2)]), mesh_of(*2 * [grid(1.0, 1.0, 4, 4)])
+    corner, weight = interpolation(surface(coarse), [9, 9], surface(fine), [25, 25])
+    for point in range(18):
+        used = corner[point][weight[point] > 1e-12]
         assert (used < 25).all() == (point < 9)
 
 
@@ -167,11 +151,11 @@ def test_curved_surfaces_are_projected() -> None:
         return mesh
 
     coarse, fine = cylinder(5), cylinder(23)
-    transfer = make_interpolation(MPI.COMM_SELF, surface(coarse), [36], surface(fine), [576])
-    found = np.einsum("nc,nci->ni", transfer.weight, fine.rest[transfer.wanted[transfer.corner]])
-    assert np.linalg.norm(found - coarse.rest, axis=1).max() < (1.0 / 23.0) ** 2 / 8.0
-    assert transfer.weight.min() >= 0.0
-    assert np.allclose(transfer.weight.sum(axis=1), 1.0)
+    corner, weight = interpolation(surface(coarse), [36], surface(fine), [576])
+    projected = np.einsum("nc,nci->ni", weight, fine.rest[corner])
+    assert np.linalg.norm(projected - coarse.rest, axis=1).max() < (1.0 / 23.0) ** 2 / 8.0
+    assert weight.min() >= 0.0
+    assert np.allclose(weight.sum(axis=1), 1.0)
 
 
 def test_weights_of_the_nearest_point() -> None:
@@ -192,14 +176,14 @@ def test_different_meshes_are_recognised(tmp_path: Path) -> None:
 
 def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:
     with pytest.raises(InputError, match=r"no state at t = 0.05 s, .* output.every = 0.05"):
-        read_local(pair[0], [0.0, 0.05, 0.1], 0.05)
+        read_samples(pair[0], [0.0, 0.05, 0.1], 0.05)
     with pytest.raises(InputError, match="no such folder"):
-        read_local(pair[0] / "nowhere", TIME_KEYS, 0.1)
+        read_samples(pair[0] / "nowhere", TIME_KEYS, 0.1)
     (pair[0] / "mesh.h5").write_bytes(b"no HDF5")
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
         read_surface(pair[0])
     with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
-        read_local(pair[0], TIME_KEYS, 0.1)
+        read_samples(pair[0], TIME_KEYS, 0.1)
 
 
 def test_areas_are_thirds_of_rest_areas(pair: tuple[Path, Path]) -> None:

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from physics import reference
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.cases import hinges
+from lyra_petsc.experiments.verification.cases import CASES, hinges
 from lyra_petsc.experiments.verification.cases.hinges import (
     expected,
     hinges_of,
@@ -105,7 +105,7 @@ def test_bending_over_the_factor_of_the_mesh_gives_b(comm: MPI.Comm, pattern: st
 @pytest.mark.parallel(2)
 def test_a_stiffness_other_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hinges, "expected", lambda pattern, ratio=1.0: 1.0)
-    outcome = run_case(comm, CASES.load("hinge-strip"), quick=True, warm=False)
+    outcome = run_case(comm, CASES.load("hinge-strip"), quick=True)
     verdicts = {quantity: verdict.passed for quantity, verdict in outcome.verdicts.items()}
     assert not verdicts["B_effective / B, diagonal, square cells"]
     assert verdicts["B_effective / B, criss-cross, square cells"]

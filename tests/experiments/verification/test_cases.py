@@ -84,6 +84,6 @@ def test_a_case_passes(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatc
     for constant, fewer in FEWER.get(name, {}).items():
         monkeypatch.setattr(sys.modules[case.measure.__module__], constant, fewer)
     # on several ranks, the resolutions that suffice to compare them
-    outcome = run_case(comm, case, quick=comm.size > 1 or name in LONG, warm=False)
+    outcome = run_case(comm, case, quick=comm.size > 1 or name in LONG)
     words = "; ".join(f"{quantity}: {verdict.message}" for quantity, verdict in outcome.verdicts.items())
     assert outcome.passed, words

@@ -156,7 +156,7 @@ QUICK_AND_EXACT = ("patch-states", "free-fall", "oscillator", "rigid-rotation", 
 @pytest.mark.parametrize("name", QUICK_AND_EXACT)
 def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -> None:
     case = CASES.load(name)
-    outcome = run_case(comm, wrong_by(case, 1e-9), quick=True, warm=False)
+    outcome = run_case(comm, wrong_by(case, 1e-9), quick=True)
     exact = [q for q in outcome.tables() if case.claim_of(q) == Claim(exact=1e-10)]
     assert exact
     for quantity in exact:
@@ -166,7 +166,7 @@ def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -
 @pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", ["stretched-membrane", "hanging-chain", "hanging-strip"])
 def test_a_limit_wrong_by_a_few_percent_fails(comm: MPI.Comm, name: str) -> None:
-    outcome = run_case(comm, wrong_by(CASES.load(name), 0.05), quick=True, warm=False)
+    outcome = run_case(comm, wrong_by(CASES.load(name), 0.05), quick=True)
     assert not any(verdict.passed for verdict in outcome.verdicts.values())
 
 
