@@ -194,25 +194,8 @@ class Solution:
         return body.influences(self.terms) or self.assumptions(body)
 
 
-SOLUTIONS: dict[str, Solution] = {}
-"""Exact solutions by name."""
-
 RIGID = frozenset({"membrane", "bending", "midedge", "midedge_friction", "shear_friction", "gravity"})
 """Terms without force in the translation of a sheet free of stress, and gravity."""
-
-Motion = Callable[[Body], ExactMotion]
-
-
-def _solution(
-    name: str, title: str, terms: frozenset[str], assumptions: Callable[[Body], list[str]]
-) -> Callable[[Motion], Motion]:
-    """Decorator that registers the function which makes the motion."""
-
-    def add(motion: Motion) -> Motion:
-        SOLUTIONS[name] = Solution(name, title, terms, assumptions, motion)
-        return motion
-
-    return add
 
 
 def _translation(body: Body, path: Callable[[float], tuple[Array, Array]]) -> ExactMotion:
@@ -226,7 +209,6 @@ def _holding(conditions: Mapping[str, object]) -> list[str]:
     return [name for name, holds in conditions.items() if holds]
 
 
-@_solution("free-fall", "free fall, x = X + v t + g t²/2", RIGID, Body.strained)
 def free_fall(body: Body) -> ExactMotion:
     """A sheet that moves freely without deformation: x = X + v₀ t + g t²/2."""
     return _translation(body, partial(_free_path, body.start_velocity, body.gravity))
@@ -281,12 +263,6 @@ def _level_law(terminal: float, g: float, t: float) -> tuple[float, float]:
     return depth, terminal * math.tanh(a)
 
 
-@_solution(
-    "terminal-fall",
-    "level sheet falling in still air, v = vt tanh(g t/vt)",
-    RIGID | {"wind"},
-    partial(_in_still_air, drag="density", cosine=1.0, otherwise="a sheet that is not flat and level"),
-)
 def flat_fall(body: Body) -> ExactMotion:
     """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
 
@@ -301,12 +277,6 @@ def _edge_law(terminal: float, g: float, t: float) -> tuple[float, float]:
     return terminal * (t - terminal / g * part), terminal * part
 
 
-@_solution(
-    "edge-fall",
-    "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
-    RIGID | {"wind"},
-    partial(_in_still_air, drag="drag", cosine=0.0, otherwise="a sheet that is not upright"),
-)
 def edge_fall(body: Body) -> ExactMotion:
     """An upright flat sheet released at rest: v = vt (1 − exp(−g t / vt)), vt = ρ_sheet g / drag.
 
@@ -365,7 +335,7 @@ def breathing_violations(body: Body) -> list[str]:
     sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
     uneven = np.ptp(stretch) > SAME * stretch.max()
     open_ended = not 0.0 < stretch[0] < math.sqrt(2.0) or abs(stretch[0] - 1.0) < SAME
-    held = {
+    contradictions = {
         "a membrane law other than stvk": shell.law != "stvk",
         "initial.velocity": body.start_velocity.any(),
         "c11 and c22 that differ": abs(shell.c11 - shell.c22) > SAME * shell.c11,
@@ -374,15 +344,9 @@ def breathing_violations(body: Body) -> list[str]:
         "a start that is not stretched alike in all directions": uneven,
         "a start stretched by a factor that is 1, or √2 or more": open_ended and not uneven,
     }
-    return _holding(held)
+    return _holding(contradictions)
 
 
-@_solution(
-    "breathing-triangle",
-    "equilateral triangle oscillating in its plane, Jacobi's dn",
-    frozenset({"membrane", "bending", "midedge"}),
-    breathing_violations,
-)
 def breathing(body: Body) -> ExactMotion:
     """The oscillation of the triangle."""
     shell = body.rest.shells[int(body.rest.shell_of[0])]
@@ -397,6 +361,34 @@ def breathing(body: Body) -> ExactMotion:
         rate=(shell.c11 + shell.c12) / (shell.density * radius2),
         stiffness=area * (shell.c11 + shell.c12),
     )
+
+
+_ALL = (
+    Solution("free-fall", "free fall, x = X + v t + g t²/2", RIGID, Body.strained, free_fall),
+    Solution(
+        "terminal-fall",
+        "level sheet falling in still air, v = vt tanh(g t/vt)",
+        RIGID | {"wind"},
+        partial(_in_still_air, drag="density", cosine=1.0, otherwise="a sheet that is not flat and level"),
+        flat_fall,
+    ),
+    Solution(
+        "edge-fall",
+        "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
+        RIGID | {"wind"},
+        partial(_in_still_air, drag="drag", cosine=0.0, otherwise="a sheet that is not upright"),
+        edge_fall,
+    ),
+    Solution(
+        "breathing-triangle",
+        "equilateral triangle oscillating in its plane, Jacobi's dn",
+        frozenset({"membrane", "bending", "midedge"}),
+        breathing_violations,
+        breathing,
+    ),
+)
+SOLUTIONS = {solution.name: solution for solution in _ALL}
+"""Exact solutions by name."""
 
 
 def exact_motion(name: str, body: Body) -> ExactMotion:

@@ -32,7 +32,7 @@ from lyra_petsc.experiments.fit.estimate import (
     search,
 )
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
-from lyra_petsc.experiments.fit.readings import HangingAngle, Reading, readings_of, readings_without_values
+from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.mesh.topology import connected_pieces
@@ -300,7 +300,7 @@ def _bending_of_mesh(scene: Scene, unknowns: Sequence[Unknown], model: Model) ->
             if one.model != "hinge" or one.bending == other.bending:
                 continue
             assert model.mesh is not None
-            hangs = any(isinstance(reading, HangingAngle) for reading in model.readings)
+            hangs = any(reading.kind == "overhang" for reading in model.readings)
             if hangs or _has_strip(model.mesh, blocks[0].group):
                 scaled = blocks[0].bending_scale != 1.0 and "bending_scale" not in unknown.key
                 raise InputError(

@@ -16,7 +16,7 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import open_simulation
 from lyra_petsc.experiments.case import Watch
-from lyra_petsc.experiments.fit.readings import SAME_TIME, HandleForce, Reading, instants
+from lyra_petsc.experiments.fit.readings import SAME_TIME, Reading, instants
 from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
@@ -91,7 +91,7 @@ class Model:
         self.keys, self._sizes = list(sizes), list(sizes.values())
         self._instants = instants(readings)
         self.readings = [reading for instant in self._instants for reading in instant.readings]
-        self._forces = any(isinstance(reading, HandleForce) for reading in readings)
+        self._forces = any(reading.kind == "force" for reading in readings)
         self.mesh: Mesh | None = None
         self.shape: Array | None = None
         self.runs = 0
@@ -202,8 +202,8 @@ class Model:
                 run = self._evaluate(changed, False, partial(_scaled, progress, done, count))
                 pair.append(run.values)
             columns.append((pair[0] - pair[1]) / (2.0 * WHOLE_RUNS * size))
-        found = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
-        return ModelEvaluation(found.values, np.stack(columns, axis=1))
+        middle = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
+        return ModelEvaluation(middle.values, np.stack(columns, axis=1))
 
 
 def _scaled(progress: Progress, done: int, count: int, part: float) -> None:

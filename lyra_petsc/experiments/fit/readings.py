@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import csv
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.errors import InputError, suggest
-from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
+from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Quantity
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import read_text
 from lyra_petsc.stepping.energy_balance import EnergyBalance
@@ -30,8 +30,12 @@ SAME_TIME = 1e-9
 """Fraction of the end time by which the time of a step may differ from that of a measurement."""
 
 
+Points = Sequence[tuple[str | int, tuple[int, ...]]]
+"""Probes by name or vertices by number, each with some axes."""
+
+
 @dataclass
-class Reading(ABC):
+class Reading:
     """One quantity at one time.
 
     Attributes
@@ -44,6 +48,14 @@ class Reading(ABC):
         Time [s], or load factor.
     parts : tuple of str
         Names of its m values.
+    kind : str
+        ``position``, ``overhang``, ``drape`` or ``force``.
+    sums : callable (problem, energy balance)
+        This rank's part of the sums over all ranks.
+    values : callable
+        The values (m,) as a function of the sums.
+    vertices : sequence of int
+        Numbers of the vertices that the measurement names.
     measured, uncertainty : (m,)
         Measured values and standard deviations; empty if nothing was measured.
     """
@@ -52,21 +64,12 @@ class Reading(ABC):
     name: str
     time: float
     parts: tuple[str, ...]
+    kind: str
+    sums: Callable[[Problem, EnergyBalance | None], Array]
+    values: Callable[[Array], Array]
+    vertices: Sequence[int] = ()
     measured: Array = field(default_factory=lambda: np.empty(0))
     uncertainty: Array = field(default_factory=lambda: np.empty(0))
-
-    @abstractmethod
-    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
-        """This rank's part of the sums over all ranks."""
-
-    @abstractmethod
-    def values(self, total: Array) -> Array:
-        """The values (m,) as a function of the sums."""
-
-    @property
-    def vertices(self) -> list[int]:
-        """Numbers of the vertices that the measurement names."""
-        return []
 
     @property
     def labels(self) -> list[str]:
@@ -74,88 +77,60 @@ class Reading(ABC):
         return [f"{self.name} {part}".strip() for part in self.parts]
 
 
-@dataclass
-class Positions(Reading):
-    """Mean positions of probes (by name) or positions of vertices (by number), each with some axes."""
-
-    wanted: list[tuple[str | int, tuple[int, ...]]] = field(default_factory=list)
-
-    def _rows(self, problem: Problem) -> list[Ints]:
-        original = problem.points.mesh_vertices
-        order = np.argsort(original)
-        found = []
-        for what, _ in self.wanted:
-            if isinstance(what, str):
-                found.append(problem.probes[what])
-                continue
-            at = np.searchsorted(original, what, sorter=order)
-            here = at < len(original) and original[order[at]] == what
-            found.append(order[at : at + 1] if here else np.empty(0, dtype=np.int64))
-        return found
-
-    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
-        x, rows = problem.equations.x, self._rows(problem)
-        parts = [np.append(x[mine].sum(axis=0), float(len(mine))) for mine in rows]
-        return np.concatenate(parts)
-
-    def means(self, total: Array) -> Array:
-        """Mean positions (n, 3) [m]."""
-        sums = total.reshape(-1, 4)
-        return sums[:, :3] / sums[:, 3:]
-
-    def values(self, total: Array) -> Array:
-        means = self.means(total)
-        return np.concatenate([mean[list(axes)] for mean, (_, axes) in zip(means, self.wanted, strict=True)])
-
-    @property
-    def vertices(self) -> list[int]:
-        return [what for what, _ in self.wanted if isinstance(what, int)]
+def _position_sums(points: Points, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
+    """Sums of positions and numbers of this rank's vertices of all points, (4 n,)."""
+    x, vertices = problem.equations.x, problem.points.mesh_vertices
+    sums = []
+    for point, _ in points:
+        rows = problem.probes[point] if isinstance(point, str) else np.flatnonzero(vertices == point)
+        sums += [*x[rows].sum(axis=0), float(len(rows))]
+    return np.array(sums)
 
 
-@dataclass
-class HangingAngle(Positions):
-    """Angle [°] below the horizontal of the line from one probe to another."""
-
-    def values(self, total: Array) -> Array:
-        edge, tip = self.means(total)
-        chord = tip - edge
-        return np.array([math.degrees(math.atan2(-chord[2], math.hypot(chord[0], chord[1])))])
+def _means(total: Array) -> Array:
+    """Mean positions (n, 3) [m]."""
+    sums = total.reshape(-1, 4)
+    return sums[:, :3] / sums[:, 3:]
 
 
-@dataclass
-class Shadow(Reading):
-    """Drape coefficient: area of the sheet's projection along z beyond the support, over that of the ring."""
+def _positions(key: str, name: str, time: float, parts: tuple[str, ...], points: Points) -> Reading:
+    """Mean positions [m] of probes, or positions of vertices."""
 
-    block: DrapeCoefficient | None = None
+    def values(total: Array) -> Array:
+        return np.concatenate(
+            [mean[list(axes)] for mean, (_, axes) in zip(_means(total), points, strict=True)]
+        )
 
-    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
-        membrane = problem.membrane
-        a, b, c = (problem.equations.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
-        first, second = b - a, c - a
-        return np.array([0.5 * float(np.sum(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]))])
-
-    def values(self, total: Array) -> Array:
-        assert self.block is not None
-        support, whole = (math.pi * r * r for r in (self.block.support, self.block.radius))
-        return np.array([(abs(total[0]) - support) / (whole - support)])
+    vertices = [point for point, _ in points if isinstance(point, int)]
+    return Reading(key, name, time, parts, "position", partial(_position_sums, points), values, vertices)
 
 
-@dataclass
-class HandleForce(Reading):
-    """Force [N] of a handle on the sheet."""
+def _hanging_angle(total: Array) -> Array:
+    """Angle [°] below the horizontal of the line from one probe to another, (1,)."""
+    edge, tip = _means(total)
+    chord = tip - edge
+    return np.array([math.degrees(math.atan2(-chord[2], math.hypot(chord[0], chord[1])))])
 
-    handle: int = 0
-    axes: tuple[int, ...] = (0, 1, 2)
 
-    def sums(self, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
-        assert energy_balance is not None
-        count = len(problem.scene.handles)
-        force = energy_balance.handle_forces(count)[self.handle]
-        # every rank has the total force
-        return force / problem.points.comm.size
+def _projected_area(problem: Problem, energy_balance: EnergyBalance | None) -> Array:
+    """Area [m²] of the sheet's projection along z."""
+    membrane = problem.membrane
+    a, b, c = (problem.equations.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
+    first, second = b - a, c - a
+    return np.array([0.5 * float(np.sum(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]))])
 
-    def values(self, total: Array) -> Array:
-        return np.asarray(total)[list(self.axes)]
+
+def _drape_coefficient(block: DrapeCoefficient, total: Array) -> Array:
+    """Area of the projection beyond the support, over that of the ring, (1,)."""
+    support, whole = (math.pi * r * r for r in (block.support, block.radius))
+    return np.array([(abs(total[0]) - support) / (whole - support)])
+
+
+def _handle_force(handle: int, problem: Problem, energy_balance: EnergyBalance | None) -> Array:
+    """This rank's share of the force [N] of a handle on the sheet; every rank has the total force."""
+    assert energy_balance is not None
+    force = energy_balance.handle_forces(len(problem.scene.handles))[handle]
+    return force / problem.points.comm.size
 
 
 @dataclass(frozen=True)
@@ -172,8 +147,7 @@ class Instant:
         problem.points.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
         ends = np.cumsum([len(part) for part in sums])[:-1]
         parts = np.split(total, ends)
-        found = [reading.values(part) for reading, part in zip(self.readings, parts, strict=True)]
-        return np.concatenate(found)
+        return np.concatenate([r.values(part) for r, part in zip(self.readings, parts, strict=True)])
 
 
 def instants(readings: Sequence[Reading]) -> list[Instant]:
@@ -193,7 +167,7 @@ def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Readi
     InputError
         For unknown probes, handles, times or columns.
     """
-    found: list[Reading] = []
+    readings: list[Reading] = []
     for number, measurement in enumerate(measurements):
         key = f"fit.measurements[{number}]"
         if measurement in measurements[:number]:
@@ -203,22 +177,22 @@ def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Readi
                 key=key,
             )
         try:
-            found += _readings(scene, measurement, key)
+            readings += _readings(scene, measurement, key)
         except InputError as error:
             if error.key is None:
                 raise InputError(str(error), key=key) from None
             raise
-    _refuse_times(scene, found)
-    return found
+    _refuse_times(scene, readings)
+    return readings
 
 
 def _refuse_times(scene: Scene, readings: Sequence[Reading]) -> None:
     end = scene.time.end
     for reading in readings:
         if not SAME_TIME * end < reading.time <= end * (1.0 + SAME_TIME):
-            what = "load factor" if scene.time.analysis == "static" else "time"
+            kind = "load factor" if scene.time.static else "time"
             raise InputError(
-                f"measures at {what} {reading.time:g}, but the scene ends at {end:g}; times are > 0",
+                f"measures at {kind} {reading.time:g}, but the scene ends at {end:g}; times are > 0",
                 file=scene.source,
                 key=reading.key,
             )
@@ -233,11 +207,11 @@ def readings_without_values(scene: Scene, quantity: Quantity) -> list[Reading]:
         As `readings_of`.
     """
     if quantity.points is not None:
-        found = _points(scene, _Table(quantity.points), "quantity", quantity.at, 1.0)
+        readings = _points(scene, _Table(quantity.points), "quantity", quantity.at, 1.0)
     else:
-        found = [_make_reading(scene, quantity, "quantity", quantity.at or scene.time.end)]
-    _refuse_times(scene, found)
-    return found
+        readings = [_make_reading(scene, quantity, "quantity", quantity.at or scene.time.end)]
+    _refuse_times(scene, readings)
+    return readings
 
 
 def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]:
@@ -265,11 +239,12 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
     sigmas = np.full(len(times), measurement.uncertainty)
     if measurement.uncertainty is None or "uncertainty" in table.names:
         sigmas = table.uncertainties()
-    found = []
+    readings = []
     for time, sigma, *values in zip(times.tolist(), sigmas, *columns, strict=True):
-        found.append(_make_reading(scene, measurement, key, time))
-        found[-1].measured, found[-1].uncertainty = np.array(values), np.full(len(values), sigma)
-    return found
+        reading = _make_reading(scene, measurement, key, time)
+        reading.measured, reading.uncertainty = np.array(values), np.full(len(values), sigma)
+        readings.append(reading)
+    return readings
 
 
 def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
@@ -277,15 +252,16 @@ def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Re
     names = tuple(AXES[axis] for axis in axes)
     if quantity.probe is not None:
         _check_probe(scene, quantity.probe, f"{key}.probe")
-        return Positions(key, quantity.probe, time, names, wanted=[(quantity.probe, axes)])
+        return _positions(key, quantity.probe, time, names, [(quantity.probe, axes)])
     if quantity.overhang is not None:
-        overhang: Overhang = quantity.overhang
-        _check_probe(scene, overhang.edge, f"{key}.overhang.edge")
-        _check_probe(scene, overhang.tip, f"{key}.overhang.tip")
-        wanted: list[tuple[str | int, tuple[int, ...]]] = [(overhang.edge, ()), (overhang.tip, ())]
-        return HangingAngle(key, "overhang", time, ("degrees",), wanted=wanted)
+        edge, tip = quantity.overhang.edge, quantity.overhang.tip
+        _check_probe(scene, edge, f"{key}.overhang.edge")
+        _check_probe(scene, tip, f"{key}.overhang.tip")
+        sums = partial(_position_sums, [(edge, ()), (tip, ())])
+        return Reading(key, "overhang", time, ("degrees",), "overhang", sums, _hanging_angle)
     if quantity.drape is not None:
-        return Shadow(key, "drape", time, ("coefficient",), block=quantity.drape)
+        values = partial(_drape_coefficient, quantity.drape)
+        return Reading(key, "drape", time, ("coefficient",), "drape", _projected_area, values)
     assert quantity.force is not None
     if not quantity.force < len(scene.handles):
         raise InputError(
@@ -294,7 +270,10 @@ def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Re
             file=scene.source,
             key=f"{key}.force",
         )
-    return HandleForce(key, f"handle {quantity.force}", time, names, handle=quantity.force, axes=axes)
+    sums = partial(_handle_force, quantity.force)
+    return Reading(
+        key, f"handle {quantity.force}", time, names, "force", sums, lambda total: total[list(axes)]
+    )
 
 
 def _check_probe(scene: Scene, name: str, key: str) -> None:
@@ -377,15 +356,15 @@ class _Table:
             If it is missing, or contains other texts.
         """
         texts = self.texts(name)
-        found = np.array([_number(text) for text in texts])
-        self.refuse(~np.isfinite(found), lambda row: f"{name} must be a number, not {texts[row]!r}")
-        return found
+        numbers = np.array([_number(text) for text in texts])
+        self.refuse(~np.isfinite(numbers), lambda row: f"{name} must be a number, not {texts[row]!r}")
+        return numbers
 
     def uncertainties(self) -> Array:
         """The column ``uncertainty``, which must be positive."""
-        found = self.numbers("uncertainty")
-        self.refuse(~(found > 0.0), lambda row: f"uncertainty must be > 0, not {found[row]:g}")
-        return found
+        sigmas = self.numbers("uncertainty")
+        self.refuse(~(sigmas > 0.0), lambda row: f"uncertainty must be > 0, not {sigmas[row]:g}")
+        return sigmas
 
     def refuse(self, wrong: Mask, why: Callable[[int], str]) -> None:
         """Refuse the first of the rows in a mask, if there is one.
@@ -442,12 +421,12 @@ def _points(
         if at is not None:
             raise InputError("has a column time; leave at out", file=table.path, key=key)
         times = table.numbers("time")
-    found: list[Reading] = []
+    readings: list[Reading] = []
     axes = tuple(AXES.index(name) for name in names)
     for time in sorted(set(times.tolist())):
         rows = np.flatnonzero(times == time)
         parts = tuple(f"{points[row]} {name}" for row in rows for name in names)
-        place = Positions(key, table.path.stem, time, parts, wanted=[(points[row], axes) for row in rows])
-        place.measured, place.uncertainty = columns[rows].ravel(), np.repeat(sigmas[rows], len(names))
-        found.append(place)
-    return found
+        reading = _positions(key, table.path.stem, time, parts, [(points[row], axes) for row in rows])
+        reading.measured, reading.uncertainty = columns[rows].ravel(), np.repeat(sigmas[rows], len(names))
+        readings.append(reading)
+    return readings
