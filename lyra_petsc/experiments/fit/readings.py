@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -93,16 +94,16 @@ def _means(total: Array) -> Array:
     return sums[:, :3] / sums[:, 3:]
 
 
+def _components(points: Points, total: Array) -> Array:
+    """Mean positions [m] of the points, each along its axes, (m,)."""
+    return np.concatenate([mean[list(axes)] for mean, (_, axes) in zip(_means(total), points, strict=True)])
+
+
 def _positions(key: str, name: str, time: float, parts: tuple[str, ...], points: Points) -> Reading:
     """Mean positions [m] of probes, or positions of vertices."""
-
-    def values(total: Array) -> Array:
-        return np.concatenate(
-            [mean[list(axes)] for mean, (_, axes) in zip(_means(total), points, strict=True)]
-        )
-
+    sums, values = partial(_position_sums, points), partial(_components, points)
     vertices = [point for point, _ in points if isinstance(point, int)]
-    return Reading(key, name, time, parts, "position", partial(_position_sums, points), values, vertices)
+    return Reading(key, name, time, parts, "position", sums, values, vertices)
 
 
 def _hanging_angle(total: Array) -> Array:
@@ -270,10 +271,8 @@ def _make_reading(scene: Scene, quantity: Quantity, key: str, time: float) -> Re
             file=scene.source,
             key=f"{key}.force",
         )
-    sums = partial(_handle_force, quantity.force)
-    return Reading(
-        key, f"handle {quantity.force}", time, names, "force", sums, lambda total: total[list(axes)]
-    )
+    sums, name = partial(_handle_force, quantity.force), f"handle {quantity.force}"
+    return Reading(key, name, time, names, "force", sums, itemgetter(list(axes)))
 
 
 def _check_probe(scene: Scene, name: str, key: str) -> None:

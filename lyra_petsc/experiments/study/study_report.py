@@ -432,7 +432,7 @@ def _work_precision(
         y_label=quantity.title,
         front=[(row.run_time, row.resolved(name)) for row in rows if row.on_front] if main else (),
         bounds=[(row.run_time, hidden[row.case.name]) for row in rows if row.case.name in hidden],
-        recommended=star and (star.run_time, hidden.get(star.case.name, star.errors[name])),
+        recommended=(star.run_time, hidden.get(star.case.name, star.errors[name])) if star else None,
         recommendation=f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})" if star else "",
         floor=_error_floor(reference, quantity),
         floor_label=BELOW,

@@ -613,7 +613,9 @@ class StudyRunner:
     def _errors(self, reference: Reference, rows: Sequence[StudyRow]) -> list[Errors | str]:
         """The errors of each row, or why it has none. On rank 0."""
         errors: list[Errors | str] = []
-        other = reference.folder and self._samples(reference.folder, reference.sheets)
+        other: Samples | None = None
+        if reference.folder is not None:
+            other = self._samples(reference.folder, reference.sheets)
         for row in rows:
             try:
                 samples = self._samples_of(row.case)

@@ -318,5 +318,5 @@ def loop_height(bending_length: float) -> float:
         def ends(clamp: Array, tip: Array, pull: Array) -> Array:
             return np.array([clamp[0] - 0.5 * math.pi, clamp[2], clamp[3], tip[0] + math.pi, tip[2]])
 
-        s, state, pull = _solved(rates, ends, s, state, parameters=pull)
+        s, state, pull = _solved(rates, ends, s, state, 1e-8, pull)
     return -0.5 * float(state[3, -1])

@@ -207,8 +207,10 @@ def strip(
     content["time"] = {**content["time"], "integrator": integrator}
     content["handles"] = [{"group": "right", "clamp": True}]
     turns = [{"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts} for k in range(parts + 1)]
-    twist = [{"time": MOVED * k / parts, "rotate": turn} for k, turn in enumerate(turns)]
-    crush = [{"time": 0.0}, {"time": MOVED, "scale": [length, 1.0, 1.0]}]
+    twist: list[dict[str, Any]] = [
+        {"time": MOVED * k / parts, "rotate": turn} for k, turn in enumerate(turns)
+    ]
+    crush: list[dict[str, Any]] = [{"time": 0.0}, {"time": MOVED, "scale": [length, 1.0, 1.0]}]
     content = move_handles(content, twist if degrees else crush)
     content["handles"].append({"group": "left", "clamp": True})
     return content
