@@ -18,7 +18,6 @@ from lyra_petsc.mesh.gmsh_sandbox import describe_sandbox, supported_layers
 
 OLDEST_PETSC = (3, 18)
 
-
 Problems = list[str]
 """One line for each part that does not fit, with its remedy."""
 
@@ -36,86 +35,76 @@ def info(comm: Any) -> str:
     """
     hosts = Counter(comm.allgather(socket.gethostname()))
     cores, problems = os.cpu_count() or 1, Problems()
-    lines = [
-        ("lyra_petsc", f"{__version__} in {Path(__file__).resolve().parents[1]}"),
-        ("Python", f"{platform.python_version()} at {sys.executable}"),
-        ("system", f"{platform.system()} {platform.release()}, {platform.machine()}, {cores} cores"),
-    ]
-    for name, describe in PARTS.items():
-        lines.append((name, _described(name, describe, problems)))
+    lines = {
+        "lyra_petsc": f"{__version__} in {Path(__file__).resolve().parents[1]}",
+        "Python": f"{platform.python_version()} at {sys.executable}",
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}, {cores} cores",
+    }
+    lines |= {name: _described(name, describe, problems) for name, describe in PARTS.items()}
     if comm.rank == 0:
-        lines.append(("gmsh's sandbox", describe_sandbox(supported_layers())))
-    lines.append(("ranks", ", ".join(f"{count} on {host}" for host, count in hosts.items())))
-    check_ranks(problems, os.environ, comm.size, max(hosts.values()), cores)
-    libraries = loaded_mpi_libraries()
-    if len(libraries) > 1:
+        lines["gmsh's sandbox"] = describe_sandbox(supported_layers())
+    lines["ranks"] = ", ".join(f"{count} on {host}" for host, count in hosts.items())
+    problems += rank_problems(os.environ, comm.size, max(hosts.values()), cores)
+    if len(libraries := loaded_mpi_libraries()) > 1:
         problems.append(
             f"Two MPI libraries are loaded at once ({', '.join(libraries)}): mpi4py, petsc4py and h5py must "
             "be built with the same one."
         )
-    width = max(len(name) for name, _ in lines)
-    text = [*(f"{name:<{width}}  {value}" for name, value in lines), ""]
+    width = max(map(len, lines))
+    text = [*(f"{name:<{width}}  {value}" for name, value in lines.items()), ""]
     text += ["What does not fit together:", *(f"- {problem}" for problem in problems)] if problems else []
     # rank 0 decides: h5py and the libraries are the same files on every rank
     return comm.bcast("\n".join(text if problems else [*text, "All fits together."]), root=0)
 
 
-def check_ranks(
-    problems: Problems, environment: Mapping[str, str], ranks: int, ranks_here: int, cores: int
-) -> None:
-    """Check the ranks against the launcher's, and their threads against the cores of a machine.
+def rank_problems(environment: Mapping[str, str], ranks: int, ranks_here: int, cores: int) -> Problems:
+    """What is wrong with the number of ranks, and of their threads.
 
     Parameters
     ----------
-    problems : list of str
-        Gets a line for each problem.
     environment : mapping
     ranks, ranks_here : int
         Ranks of the job, and most ranks of a machine.
     cores : int
         Cores of a machine.
     """
-    launched, threads = launched_ranks(environment), environment.get("OMP_NUM_THREADS", "")
-    if ranks < launched:
+    problems = Problems()
+    # srun's only within srun: the batch script, a single process, has SLURM_NTASKS as well
+    names = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MPI_LOCALNRANKS"]
+    names += ["SLURM_STEP_NUM_TASKS"] if "SLURM_PROCID" in environment else []
+    launched = [int(number) for name in names if (number := environment.get(name, "")).isdigit()]
+    if launched and ranks < launched[0]:
         problems.append(
-            f"The launcher started {launched} ranks but each of them sees {ranks}: mpi4py was built with "
+            f"The launcher started {launched[0]} ranks but each of them sees {ranks}: mpi4py was built with "
             "another MPI. Use the mpirun (or srun --mpi=…) of the MPI named above, or rebuild mpi4py and "
             "petsc4py with the launcher's."
         )
+    threads = environment.get("OMP_NUM_THREADS", "")
     if threads.isdigit() and int(threads) > 1 and int(threads) * ranks_here > cores:
         problems.append(
             f"OMP_NUM_THREADS={threads} on {ranks_here} ranks asks for more than the {cores} cores of a "
             "host: set OMP_NUM_THREADS=1, the ranks are the parallelism."
         )
+    return problems
 
 
-def launched_ranks(environment: Mapping[str, str]) -> int:
-    """Number of ranks that the launcher started, by its environment variables; 1 without a launcher."""
-    for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MPI_LOCALNRANKS"):
-        if environment.get(name, "").isdigit():
-            return int(environment[name])
-    # only within srun: the batch script, a single process, has SLURM_NTASKS as well
-    if environment.get("SLURM_STEP_NUM_TASKS", "").isdigit() and "SLURM_PROCID" in environment:
-        return int(environment["SLURM_STEP_NUM_TASKS"])
-    return 1
-
-
-def loaded_mpi_libraries() -> tuple[str, ...]:
+def loaded_mpi_libraries() -> list[str]:
     """Files of the MPI libraries loaded in this process; empty on systems without /proc."""
     try:
         maps = Path("/proc/self/maps").read_text(errors="replace")
     except OSError:
-        return ()
+        return []
     files = {line.split(maxsplit=5)[5] for line in maps.splitlines() if len(line.split(maxsplit=5)) == 6}
     names = ("libmpi.so", "libmpich.so", "libmpi_cray.so", "libmpi_gnu")
-    return tuple(sorted(file for file in files if Path(file).name.startswith(names)))
+    return sorted(file for file in files if Path(file).name.startswith(names))
 
 
 def _described(name: str, describe: Callable[[Problems], str], problems: Problems) -> str:
     try:
         return describe(problems)
     except ModuleNotFoundError:
-        problems.append(f"{name} is missing: {SOURCES.get(name, f'pip install {name}')}.")
+        remedy = "install it from the distribution, conda-forge or the cluster's modules (see README.md)"
+        problems.append(f"{name} is missing: {remedy if name in BUILT else f'pip install {name}'}.")
         return "missing"
     except Exception as error:  # a broken library may raise anything, and this verb must report it
         problems.append(f"{name} is there but fails: {' '.join(str(error).split()) or type(error).__name__}.")
@@ -135,46 +124,26 @@ def _mpi(problems: Problems) -> str:
     from mpi4py import MPI
 
     library = MPI.Get_library_version().split("\n")[0].split(",")[0].strip("\0 ")
-    standard = ".".join(map(str, MPI.Get_version()))
-    return f"{mpi4py.__version__} with {library} (MPI {standard})"
+    return f"{mpi4py.__version__} with {library} (MPI {'.'.join(map(str, MPI.Get_version()))})"
 
 
 def _petsc(problems: Problems) -> str:
     import petsc4py
     from petsc4py import PETSc
 
-    version = PETSc.Sys.getVersion()
-    text = ".".join(map(str, version))
-    if version[:2] < OLDEST_PETSC:
-        oldest = ".".join(map(str, OLDEST_PETSC))
-        problems.append(f"PETSc {text} is too old: {oldest} or newer is needed.")
+    version, oldest = (".".join(map(str, numbers)) for numbers in (PETSc.Sys.getVersion(), OLDEST_PETSC))
+    if PETSc.Sys.getVersion() < OLDEST_PETSC:
+        problems.append(f"PETSc {version} is too old: {oldest} or newer is needed.")
     scalar, index = PETSc.ScalarType().dtype, PETSc.IntType().dtype
     if scalar.kind == "c":
         problems.append(
             "PETSc was built with complex scalars: use a real build (Debian: python3-petsc4py-real; "
             'conda-forge: "petsc=*=real*").'
         )
-    text += f" (petsc4py {petsc4py.__version__}), {scalar.name} scalars, {index.name} indices"
-    debugging = _petsc_debugging(petsc4py.get_config())
-    if debugging is not None:
-        text += ", with debugging (slow)" if debugging else ", optimised"
-    return text
-
-
-def _petsc_debugging(config: Mapping[str, str]) -> bool | None:
-    """Whether PETSc was built with debugging; ``None`` if its headers are not installed."""
-    header = Path(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", ""), "include", "petscconf.h")
-    try:
-        return "#define PETSC_USE_DEBUG 1" in header.read_text(errors="replace")
-    except OSError:
-        return None
-
-
-def _petsc_folder(problems: Problems) -> str:
-    import petsc4py
-
     config = petsc4py.get_config()
-    return os.path.join(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", "")).rstrip("/") or "not known"
+    folder = Path(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", ""))
+    kinds = f"{scalar.name} scalars, {index.name} indices"
+    return f"{version} (petsc4py {petsc4py.__version__}), {kinds}, in {folder}"
 
 
 def _petsc_packages(problems: Problems) -> str:
@@ -192,21 +161,14 @@ def _h5py(problems: Problems) -> str:
     return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
 
 
-SOURCES = dict.fromkeys(
-    ("mpi4py", "PETSc", "h5py", "gmsh"),
-    "install it from the distribution, conda-forge or the cluster's modules (see README.md)",
-) | dict.fromkeys(("PETSc folder", "PETSc packages"), "it comes with petsc4py")
+BUILT = ("mpi4py", "PETSc", "PETSc packages", "h5py", "gmsh")
+"""Parts that are built for one MPI, or that pip should not lay over those of a distribution."""
 
 PARTS: dict[str, Callable[[Problems], str]] = {
     "mpi4py": _mpi,
     "PETSc": _petsc,
-    "PETSc folder": _petsc_folder,
     "PETSc packages": _petsc_packages,
     "h5py": _h5py,
-    "gmsh": _module_version("gmsh"),
-    "numpy": _module_version("numpy"),
-    "numba": _module_version("numba"),
-    "pydantic": _module_version("pydantic"),
-    "ruamel.yaml": _module_version("ruamel.yaml"),
+    **{name: _module_version(name) for name in ("gmsh", "numpy", "numba", "pydantic", "ruamel.yaml")},
 }
 """The parts to describe, in this order; each function may also add problems."""

@@ -15,12 +15,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from typing_extensions import Self
 
-ESTIMATE_UPDATES, ESTIMATE_SECONDS, ESTIMATE_FRACTION = 3, 2.0, 0.05
-"""Updates, and seconds or part of the work, after which the remaining time is shown."""
-
 REDRAW_SECONDS = 0.1
-LINE_SECONDS, LINE_FRACTION = 2.0, 0.05
-MAX_LINE_SECONDS = 60.0
+LINE_SECONDS, LINE_FRACTION, LATEST_LINE_SECONDS = 2.0, 0.05, 60.0
 """A plain line is printed for each 5 % of the work, not more often than each two seconds, or each minute."""
 
 
@@ -49,10 +45,9 @@ class ProgressBar:
     ) -> None:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
-        self._drawn = -math.inf  # clock time when the bar was last drawn
-        self._printed = -math.inf, -math.inf  # clock time and fraction of the last plain line
+        self._at = self._shown_at = -math.inf, math.inf  # clock time and fraction: latest, latest shown
+        self._first = 0.0, 0.0  # of the first update
         self._pending = ""  # a line that is not printed yet
-        self._first, self._updates, self._fraction = (0.0, 0.0), 0, 0.0
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
             self._bar = _bar(self._stream)
@@ -70,37 +65,33 @@ class ProgressBar:
                 print(text, file=self._stream, flush=True)
 
     def show(self, fraction: float, text: str) -> None:
-        """Show the fraction of the work that is done, a text, and after some updates the time left.
+        """Show the fraction of the work that is done, a text, and after the first update the time left.
 
         Cheap enough to be called after each step.
         """
         now = self._clock()
-        if not self._updates or fraction < self._fraction:  # the work begins, also once more
-            self._first, self._updates = (now, fraction), 0
-        self._updates, self._fraction = self._updates + 1, fraction
-        text += self._time_left(now - self._first[0], fraction - self._first[1])
+        if fraction < self._at[1]:  # the work begins, also once more
+            self._first, self._shown_at = (now, fraction), (-math.inf, -math.inf)
+        self._at = now, fraction
+        # by the mean speed since the first update, as the first step takes longest
+        if (done := fraction - self._first[1]) > 0.0:
+            text += f"  {duration((now - self._first[0]) * (1.0 - fraction) / done)} left"
+        since, more = now - self._shown_at[0], fraction - self._shown_at[1]
         if self._bar is not None:
             with suppress(OSError):
                 self._bar.update(self._task, completed=fraction, state=text)
-                if fraction >= 1.0 or now - self._drawn >= REDRAW_SECONDS:
-                    self._drawn = now
+                if fraction >= 1.0 or since >= REDRAW_SECONDS:
+                    self._shown_at = self._at
                     self._bar.refresh()
             return
-        self._pending, since = f"{fraction:4.0%}  {text}", now - self._printed[0]
-        due = fraction - self._printed[1] >= LINE_FRACTION - 1e-9
-        if since >= MAX_LINE_SECONDS or (since >= LINE_SECONDS and due):
+        self._pending = f"{fraction:4.0%}  {text}"
+        due = since >= LINE_SECONDS and more >= LINE_FRACTION - 1e-9  # round-off
+        if due or since >= LATEST_LINE_SECONDS:
             self._print_pending()
-
-    def _time_left(self, seconds: float, done: float) -> str:
-        """Estimate by the mean speed since the first update, as the first step takes longest."""
-        enough = seconds >= ESTIMATE_SECONDS or done >= ESTIMATE_FRACTION
-        if self._updates <= ESTIMATE_UPDATES or not enough or done <= 0.0:
-            return ""
-        return f"  {duration(seconds * (1.0 - self._fraction) / done)} left"
 
     def _print_pending(self) -> None:
         self.say(self._pending)
-        self._printed, self._pending = (self._clock(), self._fraction), ""
+        self._shown_at, self._pending = self._at, ""
 
     def close(self) -> None:
         """Show the last update and remove the bar."""
@@ -117,55 +108,6 @@ class ProgressBar:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-class Progress(ProgressBar):
-    """The progress of a run.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    end : float
-        Simulated time at which the run ends [s] (static: load factor 1).
-    start : float
-        Simulated time at which it starts or resumes [s].
-    unit : str
-        Unit of the time; empty for a load factor.
-    **options
-        Parameters of `ProgressBar`.
-    """
-
-    def __init__(
-        self, comm: MPI.Comm, end: float, *, start: float = 0.0, unit: str = "s", **options: Any
-    ) -> None:
-        super().__init__(comm, **options)
-        self._name = "t" if unit else "load"
-        self._unit = f" {unit}" if unit else ""
-        self._start, self._end = start, end
-
-    def update(
-        self, step: int, time: float, newton_iterations: int, linear_iterations: int, energy: float
-    ) -> None:
-        """Show an accepted step.
-
-        Parameters
-        ----------
-        step : int
-            Accepted steps so far.
-        time : float
-            Simulated time [s].
-        newton_iterations, linear_iterations : int
-            Iterations of this step.
-        energy : float
-            Kinetic and potential energy [J].
-        """
-        span = self._end - self._start
-        fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
-        self.show(
-            fraction,
-            f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
-            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J",
-        )
 
 
 class StudyProgress(ProgressBar):
@@ -198,39 +140,27 @@ class StudyProgress(ProgressBar):
     def progress(self, done: float, whole: float) -> None:
         """Show the work done of the whole work; may raise, see ``stop``."""
         self._stop()
-        fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
-        self.show(fraction, self._label)
+        self.show(min(done / whole, 1.0) if whole > 0.0 else 1.0, self._label)
 
     def note(self, text: str) -> None:
         """Print a line for the user, above the bar."""
         self.say(f"note: {text}")
 
 
-def closing_table(comm: MPI.Comm, phases: Mapping[str, float], folder: Path | str, outcome: str) -> None:
-    """Print the wall time of each phase, where the results are and how to open them. Rank 0 only.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-        Only its rank 0 prints.
-    phases : mapping of str to float
-        Wall seconds by phase; they add up to the total.
-    folder : path
-        The run's folder.
-    outcome : str
-        Text on how the run ended.
-    """
-    if comm.rank > 0:
-        return
+def closing_table(phases: Mapping[str, float], folder: Path, outcome: str) -> None:
+    """Print the wall time [s] of each phase, where the results are and how to open them; on one rank."""
     total = sum(phases.values())
     lines = [f"{'phase':<12} {'wall time':>12} {'share':>5}"]
     lines += [
-        f"{name:<12} {seconds:>10.2f} s {f'{seconds / total:.0%}' if total > 0 else '':>5}".rstrip()
+        f"{name:<12} {seconds:>10.2f} s {seconds / total:>5.0%}"
         for name, seconds in [*phases.items(), ("total", total)]
-        if seconds >= 0.005 or name == "total"
+        if f"{seconds:.2f}" != "0.00"
     ]
-    states = f"paraview {Path(folder) / 'states.xdmf'}"
-    for name, text in (("results", folder), ("open", states), ("outcome", outcome)):
+    for name, text in (
+        ("results", folder),
+        ("open", f"paraview {folder / 'states.xdmf'}"),
+        ("outcome", outcome),
+    ):
         lines.append(f"{name:<12} {text}")
     with suppress(OSError):
         print("\n".join(lines), flush=True)
@@ -245,12 +175,11 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def _bar(stream: TextIO) -> Any:
+def _bar(stream: TextIO) -> Bar:
     from rich.console import Console
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    return Bar(
+    return Progress(
         BarColumn(bar_width=24),
         TaskProgressColumn(),
         TextColumn("{task.fields[state]}", markup=False),

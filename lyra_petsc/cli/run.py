@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
-from lyra_petsc.cli.progress import Progress, closing_table
+from lyra_petsc.cli.progress import ProgressBar, closing_table
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.kernels.compilation import COMPILATION, no_action
 from lyra_petsc.linear.petsc_options import unused
@@ -93,7 +93,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def __init__(self, comm: MPI.Comm, served: Served | None = None, usual: Path | None = None) -> None:
         self._comm, self._usual = comm, usual
-        self._progress: Progress | None = None
+        self._progress: ProgressBar | None = None
         self._noted_cache = False
         if comm.rank == 0:
             COMPILATION.first = self._announce_compilation
@@ -117,14 +117,11 @@ class TerminalProgress(ProgressCallbacks):
 
     def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """Start the progress bar, and show the run on the page."""
-        self._folder = folder
-        self._progress = Progress(
+        self._folder, self._start = folder, simulation.time
+        self._progress = ProgressBar(
             self._comm,
-            simulation.control.end,
-            start=simulation.time,
             plain=petsc_prints(),
             clock=lambda: time.monotonic() - COMPILATION.seconds,
-            unit="s" if simulation.problem.equations.integrator.dynamic else "",
         )
         if self._usual is not None and folder != self._usual:
             self.note(f"{self._usual} exists: the results go to {folder} (--force would replace it)")
@@ -137,9 +134,17 @@ class TerminalProgress(ProgressCallbacks):
 
     def step(self, simulation: SteppedScene, report: StepReport) -> None:
         """Move the bar."""
-        if self._progress is not None:
-            iterations = report.newton_iterations, report.linear_iterations
-            self._progress.update(report.step, report.time, *iterations, simulation.budget.total)
+        if self._progress is None:
+            return
+        end = simulation.control.end
+        at = f"load {report.time:.4g} of {end:.4g}"
+        if simulation.problem.equations.integrator.dynamic:
+            at = f"t {report.time:.4g} of {end:.4g} s"
+        self._progress.show(
+            min((report.time - self._start) / (end - self._start), 1.0),
+            f"{at}  step {report.step}  Newton {report.newton_iterations}  "
+            f"linear {report.linear_iterations}  energy {simulation.budget.total:.4g} J",
+        )
 
     def close(self) -> None:
         """Leave the terminal as it was, end the page, and say how to view the run again."""
@@ -160,8 +165,8 @@ class TerminalProgress(ProgressCallbacks):
             outcome = f"stopped at {now}, by -ts_max_steps; --resume goes on"
         if not COMPILATION.all_cached and not self._noted_cache:
             self._say(f"note: the next run compiles kernels anew: {NO_CACHE}")
-        closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._comm.rank == 0:
+            closing_table(simulation.phases.seconds(), folder, outcome)
             warn_unused(simulation.stepper.our_options)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shlex
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +11,7 @@ from string import Template
 
 from pydantic import ValidationError
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
@@ -19,9 +19,6 @@ from lyra_petsc.mesh.select import DIMENSION_NAMES
 from lyra_petsc.scene.json_schema import schema_file
 from lyra_petsc.scene.materials.library import material_names
 from lyra_petsc.scene.schema import FIELDS, MeshSource
-
-CLOTHS = 4
-"""Number of the library's cloths that are named."""
 
 _GRID = """\
 mesh:
@@ -32,9 +29,6 @@ mesh:
 _GRID_HANDLE = """\
   - box: [[0, 1, 0], [1, 1, 0]] # the vertices in it: the edge y = 1. Or nodes: [0, 1], or group: NAME
     # motion: swing"""
-
-_PLAIN_NAME = re.compile(r"[A-Za-z_][\w-]*")
-_RESERVED = re.compile("null|true|false|yes|no|on|off", re.IGNORECASE)
 
 
 def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_mesh: bool) -> str:
@@ -67,7 +61,7 @@ def starter(scene: Path, commands: tuple[str, str], file: Path | None, *, trust_
         title=_quoted(scene.stem),
         mesh=_GRID if file is None or mesh is None else _mesh(file, mesh, scene),
         handle=_GRID_HANDLE if mesh is None else _handle(mesh),
-        cloths=", ".join(material_names()[:CLOTHS]),
+        cloths=", ".join(material_names()[:4]),
         fields=", ".join(name for name in FIELDS if name != "velocity"),
     )
 
@@ -86,53 +80,40 @@ def _mesh(file: Path, mesh: Mesh, scene: Path) -> str:
     name = os.path.relpath(file.absolute(), scene.absolute().parent)
     if name.startswith(os.path.join("..", "..")):  # so far apart that they will hardly be moved together
         name = str(file.absolute())
-    lines = ["mesh:", f"  file: {_quoted(name)}"]
-    if file.suffix.lower() == ".geo":
-        lines.append("  # size: 0.02                # m, instead of the element sizes in the .geo")
-    low, high = ("[" + ", ".join(f"{x:.4g}" for x in corner) + "]" for corner in _span(mesh))
-    lines += [
+    low, high = _corner(mesh.positions.min(axis=0)), _corner(mesh.positions.max(axis=0))
+    lines = [
+        "mesh:",
+        f"  file: {_quoted(name)}",
+        "  # size: 0.02                # m, instead of the element sizes in a .geo",
         "  # transform: {scale: 0.001}   # for a mesh in millimetres; also: rotate, translate",
         f"  # {mesh.n_vertices} vertices, {mesh.n_triangles} triangles, from {low} to {high}",
+        "  # groups, for handles, loads and probes, and those of surfaces for materials"
+        + (":" if mesh.groups else ": none (gmsh: Physical Curve, Physical Surface; .obj: g NAME)"),
     ]
-    if mesh.groups:
-        lines.append("  # groups, for handles, loads and probes, and those of surfaces for materials:")
-        width = max(len(_quoted(name)) for name in mesh.groups)
-        lines += [
-            f"  #   {_quoted(name):{width}}  {DIMENSION_NAMES[group.dimension]}, "
-            f"{len(group.vertices)} {'vertex' if len(group.vertices) == 1 else 'vertices'}"
-            for name, group in mesh.groups.items()
-        ]
-    else:
-        lines.append("  # it has no groups (gmsh: Physical Curve, Physical Surface; .obj: g NAME)")
+    lines += [
+        f"  #   {_quoted(name)}  {DIMENSION_NAMES[group.dimension]}, vertices: {len(group.vertices)}"
+        for name, group in mesh.groups.items()
+    ]
     return "\n".join(lines)
 
 
-def _span(mesh: Mesh) -> tuple[list[float], list[float]]:
-    """Lower and upper corner [m] of the mesh's bounding box."""
-    return mesh.positions.min(axis=0).tolist(), mesh.positions.max(axis=0).tolist()
-
-
 def _handle(mesh: Mesh) -> str:
-    lines = ["    # motion: swing"]
+    held = ""
     for name, group in mesh.groups.items():
-        if group.dimension < 2 and len(group.vertices) < mesh.n_vertices:
-            return "\n".join([f"  - group: {_quoted(name)}", *lines])
-    # no suitable group: a box at the upper end of the sheet, along z or the longest axis of a flat sheet
-    low, high = _span(mesh)
-    extent = [b - a for a, b in zip(low, high, strict=True)]
-    axis = 2 if extent[2] > 0.01 * max(extent) else extent.index(max(extent))
-    bottom = [high[k] - 0.01 * extent[k] if k == axis else low[k] for k in range(3)]
-    margin = 1e-6 * max(extent)
-    corners = [[_digits(x - margin) for x in bottom], [_digits(x + margin) for x in high]]
-    box = ", ".join(f"[{', '.join(corner)}]" for corner in corners)
-    return "\n".join([f"  - box: [{box}]   # the vertices at the end of {'xyz'[axis]}", *lines])
+        if not held and group.dimension < 2 and len(group.vertices) < mesh.n_vertices:
+            held = f"  - group: {_quoted(name)}"
+    if not held:  # a box at the upper end of the sheet, along z or the longest axis of a flat sheet
+        low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
+        extent = high - low
+        axis = 2 if extent[2] > 0.01 * extent.max() else int(extent.argmax())
+        low[axis] = high[axis] - 0.01 * extent[axis]
+        held = f"  - box: [{_corner(low)}, {_corner(high)}]   # the vertices at the end of {'xyz'[axis]}"
+    return f"{held}\n    # motion: swing"
 
 
-def _digits(value: float) -> str:
-    return f"{value:.9g}" if "e" not in f"{value:.9g}" else repr(float(f"{value:.9f}"))
+def _corner(point: Array) -> str:
+    return "[" + ", ".join(f"{x:.12g}" for x in point) + "]"
 
 
 def _quoted(text: str) -> str:
-    """A text, quoted if YAML would not read it as a text."""
-    plain = _PLAIN_NAME.fullmatch(text) and not _RESERVED.fullmatch(text)
-    return text if plain else json.dumps(text, ensure_ascii=False)
+    return json.dumps(text, ensure_ascii=False)

@@ -1,17 +1,14 @@
 """The command ``info``: its output here, and for installations whose parts do not fit together."""
 
 import builtins
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lyra_petsc import startup
 from lyra_petsc.cli import info as module
-from lyra_petsc.cli.info import check_ranks, info, launched_ranks
+from lyra_petsc.cli.info import info, rank_problems
 from lyra_petsc.errors import InputError
 
 
@@ -64,14 +61,11 @@ def test_an_unsuitable_petsc_is_named(comm, monkeypatch):
 
     monkeypatch.setattr(module, "OLDEST_PETSC", (99, 0))
     monkeypatch.setattr(PETSc, "ScalarType", np.complex128)
+    monkeypatch.setattr(module, "loaded_mpi_libraries", lambda: ["/a/libmpi.so.12", "/b/libmpi.so.40"])
     text = info(comm)
+    assert "- Two MPI libraries are loaded at once (/a/libmpi.so.12, /b/libmpi.so.40)" in text
     assert "is too old: 99.0 or newer is needed" in text
     assert "- PETSc was built with complex scalars" in text
-
-
-def test_two_mpi_libraries_are_named(comm, monkeypatch):
-    monkeypatch.setattr(module, "loaded_mpi_libraries", lambda: ("/a/libmpi.so.12", "/b/libmpi.so.40"))
-    assert "- Two MPI libraries are loaded at once (/a/libmpi.so.12, /b/libmpi.so.40)" in info(comm)
 
 
 @pytest.mark.parametrize(
@@ -80,41 +74,17 @@ def test_two_mpi_libraries_are_named(comm, monkeypatch):
         ({"OMPI_COMM_WORLD_SIZE": "4"}, ["started 4 ranks but each of them sees 2"]),
         ({"OMP_NUM_THREADS": "4"}, ["OMP_NUM_THREADS=4 on 2 ranks asks for more than the 4 cores"]),
         ({"OMPI_COMM_WORLD_SIZE": "2", "OMP_NUM_THREADS": "2"}, []),
+        ({}, []),
+        ({"PMI_SIZE": "3"}, ["started 3 ranks"]),
+        ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0"}, ["started 8 ranks"]),
+        ({"SLURM_NTASKS": "8"}, []),
+        ({"OMPI_COMM_WORLD_SIZE": "many"}, []),
     ],
 )
 def test_ranks_that_do_not_fit_are_one_line(environment, words):
-    problems = []
-    check_ranks(problems, environment, 2, 2, 4)
+    problems = rank_problems(environment, 2, 2, 4)
     assert len(problems) == len(words)
     assert all(one in line for one, line in zip(words, problems, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("environment", "ranks"),
-    [
-        ({}, 1),
-        ({"OMPI_COMM_WORLD_SIZE": "3"}, 3),
-        ({"PMI_SIZE": "2"}, 2),
-        ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0"}, 8),
-        ({"SLURM_NTASKS": "8"}, 1),
-        ({"OMPI_COMM_WORLD_SIZE": "many"}, 1),
-    ],
-)
-def test_the_number_of_ranks_of_the_launcher_is_read(environment, ranks):
-    assert launched_ranks(environment) == ranks
-
-
-def test_its_import_starts_neither_petsc_nor_mpi():
-    code = (
-        "import sys, lyra_petsc.cli.info;"
-        "print([name for name in sys.modules if name.startswith(('petsc4py', 'mpi4py'))])"
-    )
-    root = str(Path(module.__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": root + os.pathsep + os.environ.get("PYTHONPATH", "")}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
 
 
 def test_the_folder_of_the_distributions_petsc4py_is_named(tmp_path, monkeypatch):
