@@ -56,7 +56,7 @@ def input_error(
     path = parts + list(context.get("at", ()))
     key = one_line(dotted(path, data))
     message = one_line(_message(first["type"], first["msg"], first.get("input"), context))
-    if any(key == given or key.startswith((f"{given}.", f"{given}[")) for given in overridden):
+    if any(key == name or key.startswith((f"{name}.", f"{name}[")) for name in overridden):
         message += " (from --set)"
     if len(findings) > 1:
         message += f" (and {len(findings) - 1} more)"
@@ -91,8 +91,8 @@ def _message(kind: str, message: str, value: Any, context: dict[str, Any]) -> st
         return "missing"
     if kind in _BOUNDS:
         (bound,) = (limit for name, limit in context.items() if name != "error")
-        given = f"{value:g}" if isinstance(value, float) else shown(value)
-        return f"must be {_BOUNDS[kind]} {bound:.10g}, not {given}"
+        noun = "a whole number " if isinstance(bound, int) else ""
+        return f"must be {noun}{_BOUNDS[kind]} {bound:.10g}, not {value:.10g}"
     if kind == "literal_error":
         known = context["expected"].replace("'", "").replace(" or ", ", ")
         return f"must be one of {known}, not {shown(value)}"

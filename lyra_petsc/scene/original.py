@@ -20,8 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
-from typing_extensions import Self
+from pydantic import BeforeValidator, Field
 
 from lyra_petsc.errors import InputError, suggest
 from lyra_petsc.scene.block import Block
@@ -40,6 +39,7 @@ from lyra_petsc.scene.values import (
     number,
     one_line,
     problem,
+    require,
     shown,
 )
 
@@ -50,39 +50,31 @@ ARCSIM_KEYS = {
 }
 """Keys that Lyra does not have."""
 
-_NOT_SIMULATED = "no effect here"
-IGNORED = {
-    "scene": {"morphs": _NOT_SIMULATED, "passive_time": _NOT_SIMULATED, "remeshing_frames": _NOT_SIMULATED},
+_REASONS = {
+    "scene": {"": "morphs passive_time remeshing_frames"},
     "cloth": {
-        "remeshing": "no effect here: the triangles stay those of the mesh file, which must be fine enough",
-        "reference": "no effect here: the rest shape is that of the mesh file",
+        ": the triangles stay those of the mesh file, which must be fine enough": "remeshing",
+        ": the rest shape is that of the mesh file": "reference",
     },
     "material": {
-        "strain_limits": "no effect here: the sheet stretches by its stiffness",
-        **dict.fromkeys(
-            ("yield_curv", "weakening", "yield_stretch", "plastic_flow", "plastic_limit"),
-            "no effect here: plasticity is not simulated",
-        ),
-        **dict.fromkeys(
-            (
-                *("toughness", "fracture_bending_mult", "bending_factor"),
-                *("bend_width", "initiation_factor"),
-            ),
-            "no effect here: fracture is not simulated",
-        ),
+        ": the sheet stretches by its stiffness": "strain_limits",
+        ": plasticity is not simulated": "yield_curv weakening yield_stretch plastic_flow plastic_limit",
+        ": fracture is not simulated": "toughness fracture_bending_mult bending_factor bend_width "
+        "initiation_factor",
     },
     "obstacle": {
-        **dict.fromkeys(("start_time", "end_time"), "no effect here: obstacles are always there"),
-        "proxy": "no effect here: the obstacle is its mesh",
+        ": obstacles are always there": "start_time end_time",
+        ": the obstacle is its mesh": "proxy",
     },
-    "magic": dict.fromkeys(
-        (
-            *("fixed_high_res_mesh", "collision_stiffness", "projection_thickness", "edge_flip_threshold"),
-            *("rib_stiffening", "combine_tensors", "add_jitter", "preserve_creases", "separation_step_size"),
-            *("relax_method", "max_cracks", "enable_localopt"),
-        ),
-        "no effect here: for ARCSim's own algorithms",
-    ),
+    "magic": {
+        ": for ARCSim's own algorithms": "fixed_high_res_mesh collision_stiffness projection_thickness "
+        "edge_flip_threshold rib_stiffening combine_tensors add_jitter preserve_creases "
+        "separation_step_size relax_method max_cracks enable_localopt"
+    },
+}
+IGNORED = {
+    kind: {name: f"no effect here{reason}" for reason, names in reasons.items() for name in names.split()}
+    for kind, reasons in _REASONS.items()
 }
 """ARCSim's keys of each kind of block that have no effect here, and why."""
 
@@ -121,11 +113,10 @@ class Placement(Block):
     scale: Number = 1.0
     rotate: Annotated[tuple[float, float, float, float], BeforeValidator(_rotation)] = (0.0, 0.0, 0.0, 0.0)
 
-    @model_validator(mode="after")
-    def _check_axis(self) -> Self:
-        if self.rotate[0] != 0.0 and not any(self.rotate[1:]):
-            raise problem("needs an axis: [degrees, x, y, z]", "rotate")
-        return self
+    def check(self) -> None:
+        """Refuse a rotation about no axis."""
+        has_axis = self.rotate[0] == 0.0 or any(self.rotate[1:])
+        require(has_axis, "needs an axis: [degrees, x, y, z]", "rotate")
 
     def to_our_keys(self) -> dict[str, Any]:
         """As our ``transform``, or as the keys of a keyframe other than time and velocity."""
@@ -148,14 +139,11 @@ class OriginalMaterial(Block):
     thicken: Positive = 1.0
     damping: NonNegative = 0.0
 
-    @model_validator(mode="after")
-    def _check_numbers(self) -> Self:
-        for name in () if self.data else ("thickness", "density", "elastic_modulus"):
-            if getattr(self, name) is None:
-                raise problem(
-                    "missing (a material has data, or thickness, density and elastic_modulus)", name
-                )
-        return self
+    def check(self) -> None:
+        """Refuse a material without data or some of its numbers."""
+        text = "missing (a material has data, or thickness, density and elastic_modulus)"
+        for name in ("thickness", "density", "elastic_modulus"):
+            require(self.data or self.get(name) is not None, text, name)
 
 
 class OriginalVelocity(Block):
@@ -171,13 +159,11 @@ class OriginalCloth(Block):
     texture: Text = ""
     velocity: OriginalVelocity = Field(default_factory=OriginalVelocity)
 
-    @model_validator(mode="after")
-    def _check_materials(self) -> Self:
-        if len(self.materials) != 1:
-            raise problem(f"must hold one material, not {len(self.materials)}", "materials")
-        if self.transform.scale <= 0:
-            raise problem("must be > 0", "transform", "scale")
-        return self
+    def check(self) -> None:
+        """Refuse several materials, and a mirrored mesh."""
+        n_materials = len(self.materials)
+        require(n_materials == 1, f"must hold one material, not {n_materials}", "materials")
+        require(self.transform.scale > 0, "must be > 0", "transform", "scale")
 
 
 class OriginalHandle(Block):
@@ -190,13 +176,10 @@ class OriginalHandle(Block):
     end_time: Number | None = None
     fade_time: NonNegative = 0.0
 
-    @model_validator(mode="after")
-    def _check_selection(self) -> Self:
-        if self.type != "node":
-            raise problem(f"only handles of type 'node' are read, not {self.type!r}", "type")
-        if self.label == -1 and not self.nodes:
-            raise problem("must have nodes or label")
-        return self
+    def check(self) -> None:
+        """Refuse handles of other types, and of no vertices."""
+        require(self.type == "node", f"only handles of type 'node' are read, not {self.type!r}", "type")
+        require(self.label != -1 or self.nodes, "must have nodes or label")
 
 
 class OriginalKeyframe(Block):
@@ -204,12 +187,11 @@ class OriginalKeyframe(Block):
     transform: Placement = Field(default_factory=Placement)
     velocity: Placement | None = None
 
-    @model_validator(mode="after")
-    def _check_velocity(self) -> Self:
-        moving = self.velocity
-        if moving is not None and (moving.scale not in (0.0, 1.0) or moving.rotate[0] != 0.0):
-            raise problem("may hold translate only", "velocity")
-        return self
+    def check(self) -> None:
+        """Refuse a rate of rotation or scale."""
+        rate = self.velocity
+        moves = rate is None or (rate.scale in (0.0, 1.0) and rate.rotate[0] == 0.0)
+        require(moves, "may hold translate only", "velocity")
 
 
 class OriginalObstacle(Block):
@@ -259,21 +241,17 @@ class OriginalScene(Block):
         """``frame_steps`` is 1 by default, but without ``frame_time`` that of the original's own scene."""
         return {"frame_steps": 1 if "frame_time" in data else 8, **data}
 
-    @model_validator(mode="after")
-    def _check_references(self) -> Self:
-        if not self.cloths:
-            raise problem("must hold at least one cloth", "cloths")
-        users = [("handles", i, handle.motion) for i, handle in enumerate(self.handles)]
-        users += [("obstacles", i, obstacle.motion) for i, obstacle in enumerate(self.obstacles)]
-        for key, i, motion in users:
-            if motion is not None and motion >= len(self.motions):
-                raise problem(f"there is no motion {motion}, only {len(self.motions)}", key, i, "motion")
+    def check(self) -> None:
+        """Refuse cloths and motions that do not exist."""
+        require(self.cloths, "must hold at least one cloth", "cloths")
+        moved = [("handles", i, handle.motion) for i, handle in enumerate(self.handles)]
+        moved += [("obstacles", i, obstacle.motion) for i, obstacle in enumerate(self.obstacles)]
+        for key, i, motion in moved:
+            text = f"there is no motion {motion}, only {len(self.motions)}"
+            require(motion is None or motion < len(self.motions), text, key, i, "motion")
         for i, handle in enumerate(self.handles):
-            if handle.cloth >= len(self.cloths):
-                raise problem(
-                    f"there is no cloth {handle.cloth}, only {len(self.cloths)}", "handles", i, "cloth"
-                )
-        return self
+            text = f"there is no cloth {handle.cloth}, only {len(self.cloths)}"
+            require(handle.cloth < len(self.cloths), text, "handles", i, "cloth")
 
 
 def find_beside(name: str, scene: Path) -> Path | None:
@@ -319,9 +297,9 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
     InputError
         Neither a file nor a known name; a stiffness that is not positive definite.
     """
-    found = find_beside(data, scene)
-    if found is not None:
-        table = _read_material(found)
+    file = find_beside(data, scene)
+    if file is not None:
+        table = _read_material(file)
     else:
         cloths = {name: entry for name, entry in library_entries().items() if isinstance(entry, ClothTable)}
         name = Path(data).stem
@@ -334,8 +312,8 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
     if min(c11, c22, c33) == 0.0 or c11 * c22 <= c12 * c12:
         raise InputError(
             f"the small-strain row [{c11:g}, {c12:g}, {c22:g}, {c33:g}] N/m is not positive definite",
-            file=found or scene,
-            key="stretching[0]" if found else key,
+            file=file or scene,
+            key="stretching[0]" if file else key,
         )
     at_0, at_45, at_90 = (max(k, 0.0) for k in table.bending)
     shell, _ = shell_of_table(ClothTable(table.density, c11, c12, c22, c33, (at_0, at_45, at_90)), data)
@@ -373,22 +351,22 @@ class ObjVertices:
 
 def read_vertices(file: Path) -> ObjVertices:
     """The vertices of an .obj file and their labels; raises as `read_text`."""
-    found = ObjVertices()
+    vertices = ObjVertices()
     for line in read_text(file, largest=math.inf).splitlines():
         word, *label = line.split(maxsplit=2)[:2] or [""]
-        found.count += word == "v"
-        found.textured |= word == "vt"
-        if word == "nl" and label and found.count:
-            found.labels.setdefault(label[0], set()).add(found.count - 1)
-    return found
+        vertices.count += word == "v"
+        vertices.textured |= word == "vt"
+        if word == "nl" and label and vertices.count:
+            vertices.labels.setdefault(label[0], set()).add(vertices.count - 1)
+    return vertices
 
 
 def _blocks(data: Any) -> Iterator[tuple[str, str, Any]]:
     """Kind, key and content of the blocks of a conf.json that may have keys of ARCSim."""
 
     def entries(block: Any, name: str) -> list[tuple[str, Any]]:
-        found = block.get(name) if isinstance(block, dict) else None
-        return [(f"{name}[{i}]", entry) for i, entry in enumerate(found if isinstance(found, list) else [])]
+        blocks = block.get(name) if isinstance(block, dict) else None
+        return [(f"{name}[{i}]", entry) for i, entry in enumerate(blocks if isinstance(blocks, list) else [])]
 
     yield "scene", "", data
     yield "magic", "magic", data.get("magic") if isinstance(data, dict) else None
@@ -486,18 +464,18 @@ def import_original(data: Any, path: Path) -> tuple[dict[str, Any], list[str]]:
 
 def _numbered_obstacles(pattern: str, path: Path, motions: Any) -> list[dict[str, Any]]:
     """The obstacles of the files ``pattern`` % 0, 1, …; the motion of the same number moves each."""
-    found: list[dict[str, Any]] = []
+    obstacles: list[dict[str, Any]] = []
     try:
-        while find_beside(name := pattern % len(found), path) is not None:
-            moves = isinstance(motions, list) and len(found) < len(motions)
-            found.append({"mesh": name, "motion": len(found) if moves else -1})
+        while find_beside(name := pattern % len(obstacles), path) is not None:
+            moves = isinstance(motions, list) and len(obstacles) < len(motions)
+            obstacles.append({"mesh": name, "motion": len(obstacles) if moves else -1})
     except (TypeError, ValueError):
         name = pattern
-    if not found:
+    if not obstacles:
         raise InputError(
             f"no such file: {name} (a name with a number, as body%02d.obj)", file=path, key="obstacles"
         )
-    return found
+    return obstacles
 
 
 def _obstacle(scene: OriginalScene, i: int, path: Path) -> dict[str, Any]:
@@ -525,10 +503,10 @@ def _obstacle(scene: OriginalScene, i: int, path: Path) -> dict[str, Any]:
 def _mesh_file(name: str, path: Path, key: str) -> Path:
     if not name.lower().endswith(".obj"):
         raise InputError(f"must be an .obj file, not {shown(name)}", file=path, key=key)
-    found = find_beside(name, path)
-    if found is None:
+    file = find_beside(name, path)
+    if file is None:
         raise InputError(f"no such file: {name}", file=path, key=key)
-    return found
+    return file
 
 
 def _material(material: OriginalMaterial, i: int, path: Path, *, arcsim: bool) -> dict[str, Any]:

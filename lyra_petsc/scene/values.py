@@ -24,7 +24,6 @@ LARGEST_INDEX = 2**31 - 2
 
 # Shows few entries only: a value with YAML anchors can be larger than memory.
 _SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 6, 4
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 
 
@@ -119,25 +118,25 @@ def _reads_as_number(text: str) -> bool:
     return True
 
 
-def list_of(what: str = "", *, minimum: int = 0) -> BeforeValidator:
-    """Validator of a list of at least ``minimum`` entries; ``what`` follows the word list in the message."""
+def list_of(content: str = "", *, minimum: int = 0) -> BeforeValidator:
+    """Validator of a list of at least ``minimum`` entries; ``content`` follows "list" in the message."""
 
     def check(value: Any) -> list[Any]:
         if not isinstance(value, (list, tuple)) or len(value) < minimum:
             block = isinstance(value, dict)
             hint = "; put '- ' before the entry" if block else f", not {shown(value)}"
-            raise problem(f"must be a list{what}{hint}")
+            raise problem(f"must be a list{content}{hint}")
         return list(value)
 
     return BeforeValidator(check)
 
 
-def block_of(what: str, *, minimum: int = 0) -> BeforeValidator:
+def block_of(content: str, *, minimum: int = 0) -> BeforeValidator:
     """Validator of a block of at least ``minimum`` keys."""
 
     def check(value: Any) -> dict[Any, Any]:
         if not isinstance(value, dict) or len(value) < minimum:
-            raise problem(f"must be a block of {what}, not {shown(value)}")
+            raise problem(f"must be a block of {content}, not {shown(value)}")
         return value
 
     return BeforeValidator(check)
@@ -168,6 +167,17 @@ def _one_or_two(value: Any) -> tuple[float, float]:
     values = value if isinstance(value, (list, tuple)) else (value, value)
     require(len(values) == 2, f"must be a number, or two, not {shown(value)}")
     return number(values[0]), number(values[1])
+
+
+def _between(low: float, high: float, unit: str = "") -> BeforeValidator:
+    """Validator of a number from ``low`` to ``high``."""
+
+    def check(value: Any) -> float:
+        result = number(value)
+        require(low <= result <= high, f"must be from {low:g} to {high:g}{unit}, not {shown(value)}")
+        return result
+
+    return BeforeValidator(check)
 
 
 def _pair(value: Any) -> tuple[float, float]:
@@ -260,11 +270,11 @@ _NONZERO: tuple[Callable[[float], bool], str] = (lambda one: one != 0.0, "must n
 Number = Annotated[float, _NUMBER]
 Positive = Annotated[float, Field(gt=0), _NUMBER]
 NonNegative = Annotated[float, Field(ge=0), _NUMBER]
-Fraction = Annotated[float, Field(ge=0, le=1), _NUMBER]
-Poisson = Annotated[float, Field(gt=-1, le=0.5), _NUMBER]
+Fraction = Annotated[float, Field(ge=0, le=1), _between(0, 1)]
+Poisson = Annotated[float, Field(gt=-1, le=0.5), _between(-1, 0.5)]
 StretchRatio = Annotated[float, Field(gt=1), _NUMBER]
-Angle = Annotated[float, Field(ge=1, le=120), _NUMBER]
-Share = Annotated[float, Field(ge=50, le=100), _NUMBER]
+Angle = Annotated[float, Field(ge=1, le=120), _between(1, 120, " degrees")]
+Share = Annotated[float, Field(ge=50, le=100), _between(50, 100, " percent")]
 StepLength = Annotated[float | Literal["auto"], BeforeValidator(_step_length)]
 Until = Annotated[float, BeforeValidator(_until)]
 Vector = Annotated[Vec3, BeforeValidator(vector)]

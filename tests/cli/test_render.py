@@ -13,7 +13,7 @@ from patience import communicate
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.show.render.paraview_script import SCRIPT, write_script
+from lyra_petsc.show.render.paraview_script import write_script
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
 
 MISTAKES = [
@@ -45,7 +45,7 @@ MISTAKES = [
     ({"out": Path("text.png")}, "--out: cannot be made"),
     ({"settings": ("time.end=3",)}, "--set: 'time.end=3': the run is done, only render"),
     ({"settings": ("render.camera.angel=3",)}, "render.camera.angel: unknown key, did you mean 'angle'"),
-    ({"settings": ("render.camera.angle=0",)}, "render.camera.angle: must be >= 1, not 0"),
+    ({"settings": ("render.camera.angle=0",)}, "render.camera.angle: must be from 1 to 120 degrees, not 0"),
     ({"run": Path("nowhere")}, "nowhere: no such folder"),
     ({"run": Path("text.png")}, "text.png: is a file"),
 ]
@@ -110,20 +110,6 @@ def test_an_unfinished_run_is_drawn_up_to_its_newest_state(tmp_path):
     assert plan.states == [0, 1, 2]
     writer.write()
     assert make_plan(RenderOptions(tmp_path / "run")).states == [0, 1, 2, 3]
-
-
-def test_optional_packages_are_imported_for_drawing_only(tmp_path):
-    written(tmp_path / "run")
-    program = (
-        "import sys; from lyra_petsc.cli.app import run_command_line;"
-        "code = run_command_line(['lyra-petsc', 'render', 'run', '--paraview']);"
-        "print([name for name in ('pyvista', 'vtkmodules', 'PIL', 'imageio_ffmpeg') if name in sys.modules]);"
-        "sys.exit(code)"
-    )
-    left = lyra([], tmp_path, program=("-c", program))
-    assert left.code == 0, left.err
-    assert left.out.splitlines()[-1] == "[]"
-    assert (tmp_path / "run" / SCRIPT).exists()
 
 
 @pytest.mark.parametrize("fields", [True, False])

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +24,6 @@ def validator() -> Any:
     schema = json.loads(schema_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema)
-
-
-def with_text_keys(value: Any) -> bool:
-    """Whether a value has text keys only, as in JSON."""
-    if isinstance(value, dict):
-        return all(isinstance(key, str) and with_text_keys(entry) for key, entry in value.items())
-    return all(map(with_text_keys, value)) if isinstance(value, list) else True
 
 
 def judgement(validator: Any, data: Any) -> str:
@@ -110,40 +101,3 @@ def test_unusual_scenes_are_accepted(part: str, validator: Any) -> None:
 )
 def test_unknown_keys_types_and_ranges_are_marked(part: str, validator: Any) -> None:
     assert not validator.is_valid(parse_yaml(scene_text(part), file=None))
-
-
-@pytest.mark.slow
-def test_random_scenes_of_the_loader_are_accepted(validator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    hypothesis = pytest.importorskip("hypothesis")
-    with suppress(ImportError):
-        # it also draws constants of all imported modules
-        from hypothesis.internal.conjecture import providers
-
-        fixed = providers.GLOBAL_CONSTANTS
-        monkeypatch.setattr(providers, "_get_local_constants", lambda: fixed, raising=False)
-    for folder in ("fuzz", "cli"):
-        monkeypatch.syspath_prepend(str(ROOT / "tests" / folder))
-    from odd_values import document
-    from scene_cases import mutated, scenes
-
-    seen: Counter[str] = Counter()
-
-    @hypothesis.seed(6)
-    @hypothesis.settings(
-        max_examples=150,
-        deadline=None,
-        database=None,
-        phases=[hypothesis.Phase.generate],
-        suppress_health_check=list(hypothesis.HealthCheck),
-    )
-    @hypothesis.given(mutated() | scenes())
-    def draw(blocks: dict[str, Any]) -> None:
-        try:
-            data = parse_yaml(document(blocks), file=None)
-        except Exception:  # no YAML
-            return
-        if with_text_keys(data):
-            seen[judgement(validator, data)] += 1
-
-    draw()
-    assert set(seen) == {"accepted", "refused"}, seen

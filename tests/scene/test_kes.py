@@ -72,15 +72,6 @@ def test_friction_in_bending_selects_midedge(moment: Any, model: str) -> None:
     assert scene_of(parse_yaml(dump_scene(scene), file=None)).material == scene.material
 
 
-def test_a_dumped_scene_is_the_same_scene(tmp_path: Any) -> None:
-    scene = scene_of(SCENE | {"material": NUMBERS | {"kes": REPORT}})
-    path = tmp_path / "scene.yaml"
-    path.write_text(dump_scene(scene), encoding="utf-8")
-    from lyra_petsc.scene.load import load_scene
-
-    assert load_scene(path).material == scene.material
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [

@@ -11,29 +11,14 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.material_block import Material
 from lyra_petsc.scene.materials.library import (
     PROJECTION_FLOOR,
-    ClothTable,
     ShellMaterial,
-    library_entries,
     material_names,
     resolve_material,
-    shell_of_table,
 )
-
-WANG_2011 = {
-    "11oz-black-denim", "aluminium", "camel-ponte-roma", "gray-interlock", "ivory-rib-knit",
-    "navy-sparkle-sweat", "paper", "pink-ribbon-brown", "royal-target", "tango-red-jet-set",
-    "white-dots-on-blk", "white-swim-solid",
-}  # fmt: skip
 
 
 def shell(**keys: object) -> ShellMaterial:
     return resolve_material(Material.model_validate(keys))[0]
-
-
-def test_the_library_has_all_cloths() -> None:
-    assert set(material_names()) >= WANG_2011 | {"isotropic"}
-    assert sum(isinstance(entry, ClothTable) for entry in library_entries().values()) == 13
-    assert len(material_names()) == len(set(material_names()))
 
 
 @pytest.mark.parametrize("name", material_names())
@@ -82,14 +67,6 @@ def test_indefinite_cloths_are_projected() -> None:
     assert "projected" in note
 
 
-def test_positive_definite_tables_are_not_projected() -> None:
-    table = ClothTable(0.1, 3.0, -1.0, 2.0, 1.0, (4.0, 8.0, 12.0))
-    material, notes = shell_of_table(table, "x")
-    assert (material.c11, material.c12, material.c22, material.c33) == (6.0, -2.0, 4.0, 1.0)
-    assert material.bending == (1.0, 2.0, 3.0)
-    assert notes == []
-
-
 def test_isotropic_sheets_are_in_plane_stress() -> None:
     sheet = shell(young=1e6, poisson=0.25, thickness=0.01, density=0.5)
     # E h = 1e4 N/m; 1 − ν² = 15/16; E h³ = 1 N·m
@@ -135,10 +112,6 @@ def test_scale_factors_apply_to_each_kind_of_material(keys: dict[str, object]) -
     assert scaled.bending == pytest.approx([b * 7 * 8 for b in plain.bending], rel=1e-14)
     assert (scaled.damping, scaled.warp_degrees, scaled.rest_curvature) == (0.03, 30.0, (1.0, 2.0, 3.0))
     assert (plain.damping, plain.warp_degrees, plain.rest_curvature) == (0.0, 0.0, None)
-
-
-def test_bending_can_be_switched_off() -> None:
-    assert shell(cloth="paper", bending_scale=0).bending == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])

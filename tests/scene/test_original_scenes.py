@@ -329,11 +329,6 @@ def test_obstacles_of_arcsim_by_number(folder: Path) -> None:
     assert ends == [-1.0, -2.0, 0.0]
 
 
-def test_a_scene_of_lyra_has_no_contact_and_no_air(folder: Path) -> None:
-    scene = load_scene(write(folder))
-    assert (scene.contact, scene.obstacles, scene.wind, scene.notes) == (None, None, None, [])
-
-
 BROKEN = [
     ('{"frame_time": 0.04,\n "frame_steps": }', "line 2"),
     ('{"a": NaN}', "NaN"),

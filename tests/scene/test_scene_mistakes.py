@@ -118,7 +118,7 @@ CASES = [
     ("time: {end: 1" + "0" * 400 + ", step: 0.1}", "time.end", "below 1.8e308"),
     ("time: {end: 1, step: 0}", "time.step", "must be > 0, not 0"),
     ("time: {end: -1, step: 0.1}", "time.end", "must be > 0"),
-    ("mesh: {grid: {width: 1, height: 1, nx: 0, ny: 2}}", "mesh.grid.nx", ">= 1"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 0, ny: 2}}", "mesh.grid.nx", "a whole number >= 1, not 0"),
     ("mesh: {grid: {width: 1, height: 1, nx: 99999999999, ny: 2}}", "mesh.grid.nx", "<= 2147483646"),
     ("mesh: {grid: {width: 0, height: 1, nx: 2, ny: 2}}", "mesh.grid.width", "> 0"),
     ("mesh: {grid: {width: 1, height: 1, nx: 2, ny: 2, pattern: cross}}", "mesh.grid.pattern", "criss-cross"),
@@ -164,11 +164,8 @@ CASES = [
     ("time: {end: 1, step: auto, tolerance: 2}", "time.tolerance", "fraction of the sheet's size, below 1"),
     ("time: {end: 1, step: 0.1, tolerance: 1e-3}", "time.tolerance", "is for step: auto"),
     ("time: {end: 1, step: 0.1, spectral_radius: 0.5}", "time.spectral_radius", "is for integrator: alpha2"),
-    (
-        "time: {end: 1, step: 0.1, integrator: alpha2, spectral_radius: 1.1}",
-        "time.spectral_radius",
-        "must be <= 1, not 1.1",
-    ),
+    ("time: {end: 1, step: 0.1, integrator: alpha2, spectral_radius: 1.1}",
+     "time.spectral_radius", "must be from 0 to 1, not 1.1"),
     ("time: {step: 0.1, integrator: static}", "time.integrator", "write analysis: static"),
     ("time: {end: 1, step: 0.1, integrator: euler}", "time.integrator", "one of beuler, semi-implicit"),
     ("time: {end: 1, step: 0.1, integrator: [euler]}", "time.integrator", "must be one of"),
@@ -194,20 +191,14 @@ CASES = [
      "material.bending", "three numbers"),
     ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, bending: -1}",
      "material.bending", ">= 0"),
-    (
-        "material: {" + SHEET + "bending: {d11: 1, d22: 1, d33: 1}, bending_model: hinge}",
-        "material.bending",
-        "are for bending_model: midedge",
-    ),
-    (
-        "material: {" + SHEET + "bending: {d11: 1, d22: 4, d12: 2, d33: 1}}",
-        "material.bending.d12",
-        "below sqrt(d11 d22) = 2 N·m",
-    ),
+    ("material: {" + SHEET + "bending: {d11: 1, d22: 1, d33: 1}, bending_model: hinge}",
+     "material.bending", "are for bending_model: midedge"),
+    ("material: {" + SHEET + "bending: {d11: 1, d22: 4, d12: 2, d33: 1}}",
+     "material.bending.d12", "below sqrt(d11 d22) = 2 N·m"),
     ("material: {" + SHEET + "bending: {d11: 1, d22: 1}}", "material.bending.d33", "missing"),
     ("material: {" + SHEET + "bending: {d11: 1, d22: 1, d33: 1, d44: 1}}", "material.bending.d44", "d11"),
     ("material: {" + SHEET + "bending_model: midege}", "material.bending_model", "one of hinge, midedge"),
-    ("material: {young: 1, poisson: 0.6, thickness: 1, density: 1}", "material.poisson", "must be <= 0.5"),
+    ("material: {young: 1, poisson: 0.6, thickness: 1, density: 1}", "material.poisson", "from -1 to 0.5"),
     ("material: {young: 1, poisson: -1, thickness: 1, density: 1}", "material.poisson", "must be > -1"),
     ("material: {young: 1, poisson: 0.3, density: 1}", "material.thickness", "missing"),
     ("material: [{cloth: paper}, {cloth: paper}]", "material[1].group", "second material"),
@@ -258,12 +249,6 @@ def test_message_names_file_key_and_remedy(tmp_path: Path, part: str, key: str, 
     assert "\n" not in str(error)
     assert len(str(error)) < 600
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
-
-
-def test_the_valid_scene_is_accepted(tmp_path: Path) -> None:
-    path = tmp_path / "good.yaml"
-    path.write_text(scene_text("title: right"))
-    assert load_scene(path).title == "right"
 
 
 def test_the_number_of_further_mistakes_is_reported(tmp_path: Path) -> None:
@@ -376,24 +361,6 @@ def test_unreadable_files(tmp_path: Path, content: bytes, message: str, override
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("first", "line"),
-    [
-        ("[1]", "a{0}: &a{0} [{1}]"),
-        ("{k: 1}", "a{0}: &a{0} {{b: [{1}]}}"),
-        ("{k: 1}", "a{0}: &a{0} {{<<: [{1}], k{0}: 1}}"),
-    ],
-    ids=["lists", "blocks", "merged keys"],
-)
-def test_anchors_within_anchors(tmp_path: Path, first: str, line: str) -> None:
-    path = tmp_path / "bad.yaml"
-    lines = [f"a0: &a0 {first}"] + [line.format(i, ", ".join([f"*a{i - 1}"] * 9)) for i in range(1, 12)]
-    path.write_text("\n".join(["title: x", *lines]) + "\n")
-    with pytest.raises(InputError, match="more than 2000000 entries once its anchors") as caught:
-        load_scene(path)
-    assert caught.value.file == str(path)
-
-
 def test_merged_keys_and_anchors_of_a_usual_size_are_read(tmp_path: Path) -> None:
     path = tmp_path / "good.yaml"
     path.write_text(
@@ -404,13 +371,6 @@ def test_merged_keys_and_anchors_of_a_usual_size_are_read(tmp_path: Path) -> Non
     scene = load_scene(path)
     assert scene.handles[1].nodes == [0]
     assert scene.handles[1].stiffness == 10
-
-
-def test_redefined_anchors_give_no_warning(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    path = tmp_path / "good.yaml"
-    path.write_text(scene_text("handles: [{nodes: &n [0]}, {nodes: &n [1]}, {nodes: *n}]"))
-    assert load_scene(path).handles[2].nodes == [1]
-    assert len(recwarn) == 0
 
 
 def test_a_huge_file_is_refused(tmp_path: Path) -> None:
