@@ -15,7 +15,7 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
-from lyra_petsc.mesh.measures import plane_coordinates
+from lyra_petsc.mesh.measures import SAME_PLACE, SCALE_RATIO, plane_coordinates
 from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
 from lyra_petsc.mesh.readers import first_few
 from lyra_petsc.mesh.select import DIMENSION_NAMES
@@ -210,12 +210,12 @@ def _add_groups(
     members: Members, groups: list[NamedSet], source: str | None, n_triangles: int, first: tuple[int, int]
 ) -> None:
     """Add the groups of a source to ``members``; ``first``: numbers of its first vertex and triangle."""
-    found = [(each.name, each.dimension, each.members + first[each.dimension == 2]) for each in groups]
+    named = [(group.name, group.dimension, group.members + first[group.dimension == 2]) for group in groups]
     if source is not None:
-        found += [(f"{source}.{name}", dimension, each) for name, dimension, each in found]
-        found.append((source, 2, np.arange(first[1], first[1] + n_triangles, dtype=np.int64)))
-    for name, dimension, each in found:
-        members.setdefault((name, dimension), []).append(each)
+        named += [(f"{source}.{name}", dimension, numbers) for name, dimension, numbers in named]
+        named.append((source, 2, np.arange(first[1], first[1] + n_triangles, dtype=np.int64)))
+    for name, dimension, numbers in named:
+        members.setdefault((name, dimension), []).append(numbers)
 
 
 def _named_groups(members: Members, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
@@ -339,7 +339,7 @@ def build_mesh(
     mesh.sources = listed
     mesh.coincident, mesh.unconnected = _coincident(mesh)
     mesh.notes = notes + group_notes + [mesh.unconnected] * (mesh.unconnected != "")
-    mesh.tags = np.concatenate(tags) if any(each.any() for each in tags) else None
+    mesh.tags = np.concatenate(tags) if any(numbers.any() for numbers in tags) else None
     return mesh
 
 
@@ -408,10 +408,6 @@ def _weld(sheet: Sheet, source: MeshSource, distance: float, where: dict[str, An
     sheet.notes.append(f"{dropped} vertices welded to others; vertices are numbered anew")
 
 
-SCALE_RATIO = 1.5
-"""Ratio of lengths by the vt and in space, in the mean over all edges, from which on a note says so."""
-
-
 def _scale_notes(uv: Array, corners: Array) -> list[str]:
     """A note if lengths by ``uv`` (F, 3, 2) and in space (F, 3, 3) [m] are hardly those of one sheet."""
     pattern, space = (np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2).ravel() for at in (uv, corners))
@@ -427,13 +423,6 @@ def _scale_notes(uv: Array, corners: Array) -> list[str]:
     ]
 
 
-SAME_PLACE = 1e-6
-"""Distance over the mean edge up to which vertices coincide."""
-
-WELD = 1e-9
-"""Distance [m] that notes recommend for `weld`, unless it is too small or too large."""
-
-
 def _coincident(mesh: Mesh) -> tuple[Ints, str]:
     """`Mesh.coincident` and `Mesh.unconnected`."""
     x = mesh.positions
@@ -444,10 +433,8 @@ def _coincident(mesh: Mesh) -> tuple[Ints, str]:
     pairs = np.column_stack([others, same[others]])
     if not len(pairs):
         return pairs, ""
-    apart = float(np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]).max())
-    distance = "1e-9" if apart <= WELD < 1e-3 * edge else f"{2 * SAME_PLACE * edge:.1g}"
-    source = np.repeat(np.arange(len(mesh.sources)), [each.n_vertices for each in mesh.sources])
-    remedy = f"mesh: {{weld: {distance}}} joins them"
+    source = np.repeat(np.arange(len(mesh.sources)), [source.n_vertices for source in mesh.sources])
+    remedy = f"mesh: {{weld: {2 * SAME_PLACE * edge:.1g}}} joins them"
     same_source = source[pairs[:, 0]] == source[pairs[:, 1]]
     if not same_source.all():
         remedy += " within one file; put sheets that belong together into one, or move them apart"

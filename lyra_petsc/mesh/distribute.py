@@ -106,7 +106,7 @@ class Rows:
         n_vertices = np.diff(vertices.bounds)
         n_edges, edges_of = np.zeros_like(n_vertices), [np.empty(0, dtype=np.int64)] * n_ranks
         edge = edge_owner = component = np.empty(0, dtype=np.int64)
-        used = [each.edges.ravel() for each in whole.elements.values() if each.edges is not None]
+        used = [elements.edges.ravel() for elements in whole.elements.values() if elements.edges is not None]
         bounds, vertex = vertices.bounds, vertices.number
         if used:
             assert whole.edges is not None
@@ -197,29 +197,29 @@ def distribute(comm: MPI.Comm, whole: GlobalMesh | None) -> LocalMesh:
 def _pieces(whole: GlobalMesh, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
     """Yield the piece of each rank, rank 0's last: only one at a time is in memory."""
     split = {
-        name: split_elements(gather_stencils(each, rows.vertex_owner, rows.edge_owner), n_ranks)
-        for name, each in whole.elements.items()
+        name: split_elements(gather_stencils(kind, rows.vertex_owner, rows.edge_owner), n_ranks)
+        for name, kind in whole.elements.items()
     }
     for rank in (*range(1, n_ranks), 0):
         lo, hi = rows.bounds[rank], rows.bounds[rank + 1]
         elements = {}
         coupled = {
-            name: gather_stencils(each, rows.vertex, rows.edge, split[name][rank][0])
-            for name, each in whole.elements.items()
+            name: gather_stencils(kind, rows.vertex, rows.edge, split[name][rank][0])
+            for name, kind in whole.elements.items()
         }
         every = np.unique(np.concatenate([*map(np.unique, coupled.values()), np.empty(0, np.int64)]))
         ghosts = every[(every < lo) | (every >= hi)]
         for name, (index, n_owned) in ((n, s[rank]) for n, s in split.items()):
-            each = whole.elements[name]
-            n = each.stencil.shape[1]
+            kind = whole.elements[name]
+            n = kind.stencil.shape[1]
             local = local_numbers(coupled[name], ghosts, lo, hi)
             order = _locality_order(local[:, :n], n_owned)
             index, local = index[order], local[order]
-            data = {key: np.ascontiguousarray(v[index]) for key, v in each.data.items()}
-            counts = np.promote_types(np.int32, np.min_scalar_type(-len(each.stencil)))
+            data = {key: np.ascontiguousarray(v[index]) for key, v in kind.data.items()}
+            counts = np.promote_types(np.int32, np.min_scalar_type(-len(kind.stencil)))
             edges = None
-            if each.edges is not None:
-                edges = (3 * local[:, n:] + rows.component[each.edges[index]]).astype(np.int32)
+            if kind.edges is not None:
+                edges = (3 * local[:, n:] + rows.component[kind.edges[index]]).astype(np.int32)
             stencil = local[:, :n].astype(np.int32)
             elements[name] = Elements(stencil, data, n_owned, index.astype(counts), edges)
         own = rows.unknowns[rank]

@@ -128,10 +128,10 @@ def supported_layers() -> list[str]:
             capture_output=True,
             timeout=60,
         )
-        found: list[str] = json.loads(done.stdout)
+        layers: list[str] = json.loads(done.stdout)
     except (OSError, ValueError, subprocess.SubprocessError):
         return []
-    return found
+    return layers
 
 
 # -- seccomp -----------------------------------------------------------------------------------------

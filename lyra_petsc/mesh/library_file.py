@@ -20,15 +20,13 @@ import numpy as np
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import BYTES_PER_VERTEX, available_memory
 from lyra_petsc.mesh.library_formats import LIBRARIES, usual_spelling
+from lyra_petsc.mesh.measures import SCALE_RATIO
 from lyra_petsc.mesh.mesh import ElementBlock, Sheet
 from lyra_petsc.mesh.msh_file import MshError, NoTrianglesError, assemble_sheet
 from lyra_petsc.mesh.readers import printable
 from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.startup import module_command
-
-# beyond this ratio of the mean edge to the requested size a note says that the script sets its own sizes
-_SIZE_RATIO = 1.6
 
 READ_SECONDS = 60
 """Limit on the CPU time of reading a file, for scripts that loop for ever."""
@@ -119,7 +117,7 @@ def read_by_library(
     if size is not None:
         corners = sheet.points[sheet.triangles]
         mean = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
-        if not 1 / _SIZE_RATIO < mean / size < _SIZE_RATIO:
+        if not 1 / SCALE_RATIO < mean / size < SCALE_RATIO:
             sheet.notes.append(
                 f"mean edge {mean:.3g} m though size {size:g} m is asked for: "
                 "the script fixes its divisions, or is smaller than that"
@@ -180,8 +178,6 @@ def _wait(
         except subprocess.TimeoutExpired:
             outcome = _read_outcome(file)
         doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading it"
-        if "triangles" in outcome:
-            doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
         if report is not None:
             library = LIBRARIES[path.suffix.lower()]
             report(f"{path.name}: {library} {doing}, {time.monotonic() - began:.0f} s so far")
@@ -223,21 +219,18 @@ def _read_mesh(path: Path, file: BinaryIO, *, note_loose: bool) -> Sheet:
 def _failure(path: Path, stage: str, code: int, errors: bytes, job: dict[str, Any]) -> str:
     """Message on why the library did not finish."""
     library, is_script = LIBRARIES[path.suffix.lower()], job["script"] is not None
-    doing = "meshing" if stage == "mesh" else "reading the script" if is_script else "reading the file"
+    doing = "meshing" if stage == "mesh" else f"reading the {'script' if is_script else 'file'}"
+    hint = "is a mesh size too small, or a loop too long?" if is_script else "is the file damaged?"
     if code == -signal.SIGSYS:
         return f"the {'script' if is_script else 'library'} tried to start a program"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
-        hint = "is a mesh size too small, or a loop too long?" if is_script else "is the file damaged?"
         return f"{library} needs more than the {job['memory'] / 2**30:.3g} GiB there are, {doing}: {hint}"
     if code in (-signal.SIGXCPU, -signal.SIGKILL, -signal.SIGALRM):
         seconds = job["mesh_seconds" if stage == "mesh" else "read_seconds"]
-        limit = f"{seconds} s of CPU time"
-        if code == -signal.SIGALRM:
-            limit = f"{job['wall_ratio'] * seconds:g} s"
-        hint = "are its mesh sizes too small?" if stage == "mesh" else "does it loop for ever?"
-        return f"{library} did not finish {doing} in {limit}; {hint if is_script else 'is the file damaged?'}"
+        wall = f"{job['wall_ratio'] * seconds:g} s"
+        limit = wall if code == -signal.SIGALRM else f"{seconds} s of CPU time"
+        return f"{library} did not finish {doing} in {limit}: {hint}"
     if code < 0:
-        hint = "" if is_script else "; is it damaged?"
-        return f"{library} broke down ({signal.Signals(-code).name}) {doing}{hint}"
+        return f"{library} broke down ({signal.Signals(-code).name}) {doing}: {hint}"
     last = one_line(errors.decode("utf-8", errors="replace")[-200:])
     return f"{library} ended early ({code}) {doing}{': ' + last if last else ''}"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,25 +129,25 @@ def _converted(
     """The mesh that a library read, if it is whole."""
     surfaces_only = path.suffix == ".bdf"  # whose other cards are too many to know them
     counted = [
-        len(each.points)
-        for each in cells
-        if each.name != _POINT_SET and (not surfaces_only or each.name[:4] in ("tria", "quad"))
+        len(block.points)
+        for block in cells
+        if block.name != _POINT_SET and (not surfaces_only or block.name[:4] in ("tria", "quad"))
     ]
     refuse_losses(LIBRARIES[path.suffix], announced, len(points), sum(counted))
     if points.ndim != 2 or points.shape[1] != 3:
         raise Refused(f"its points have {points.shape[-1]} coordinates, not three; {_REMEDY}")
     points = points.astype(np.float64)
-    elements = [_elements(points, each) for each in cells]
-    polygons = sum(len(each.points) for each in cells if each.name.startswith("polygon"))
+    elements = [_elements(points, block) for block in cells]
+    polygons = sum(len(block.points) for block in cells if block.name.startswith("polygon"))
     notes = [f"{polygons} polygons split into triangles"] if polygons else []
     return FileMesh(np.arange(len(points)), points, elements, names, notes)
 
 
 def refuse_losses(library: str, announced: tuple[int | None, int], n_points: int, n_elements: int) -> None:
     """Refuse a mesh with other numbers of points and elements than ``announced``."""
-    for here, there, what in zip((n_points, n_elements), announced, ("points", "elements"), strict=True):
+    for here, there, parts in zip((n_points, n_elements), announced, ("points", "elements"), strict=True):
         if there not in (None, here):
-            raise Refused(f"{library} reads {here} of the {there} {what} in it; {_REMEDY}")
+            raise Refused(f"{library} reads {here} of the {there} {parts} in it; {_REMEDY}")
 
 
 def _elements(points: Array, cells: _Cells) -> ElementBlock:
@@ -200,7 +200,7 @@ def usual_spelling(suffix: str, data: bytes) -> bytes:
         return data if re.search(rb"^\s*BEGIN BULK", data, re.MULTILINE) else b"BEGIN BULK\n" + data
     if suffix == ".inp":
         data = re.sub(rb"^\*\*[^\n]*\n", b"", data, flags=re.MULTILINE)
-        return _ABAQUS_TYPE.sub(lambda found: found[1] + _ABAQUS_FLAT.sub(rb"S\1", found[2].upper()), data)
+        return _ABAQUS_TYPE.sub(lambda card: card[1] + _ABAQUS_FLAT.sub(rb"S\1", card[2].upper()), data)
     return data
 
 
@@ -239,7 +239,7 @@ def _read_meshio(meshio: ModuleType, path: Path) -> tuple[Array, list[_Cells], _
                 groups[block].append(np.column_stack([inside, np.full(len(inside), number)]))
         names += [(dimension, number, name) for dimension in (1, 2)]
     properties = mesh.cell_data.get("nastran:ref", [])
-    if [len(each) for each in properties] == [len(nodes) for _, nodes in blocks]:
+    if [len(numbers) for numbers in properties] == [len(nodes) for _, nodes in blocks]:
         for block, numbers in enumerate(properties):
             groups[block].append(np.column_stack([np.arange(len(numbers)), numbers]))
     cells = [
@@ -260,18 +260,17 @@ def _read_vtk(vtk: ModuleType, path: Path) -> tuple[Array, list[_Cells], _Names]
     reader.SetFileName(str(path))
     reader.Update()
     data = reader.GetOutput()
-    found: list[tuple[Any, Ints | None]] = []
     if data is not None and data.IsA("vtkPolyData"):
-        found = [(data.GetPolys(), None), (data.GetStrips(), np.array([6]))]
+        arrays = [(data.GetPolys(), None), (data.GetStrips(), np.array([6]))]
     elif data is not None and data.IsA("vtkUnstructuredGrid"):
         types = data.GetCellTypesArray()
-        found = [(data.GetCells(), np.empty(0, int) if types is None else vtk_to_numpy(types))]
+        arrays = [(data.GetCells(), np.empty(0, int) if types is None else vtk_to_numpy(types))]
     else:
         raise Refused(f"VTK finds no surface mesh in it; {_REMEDY}")
     if data.GetPoints() is None:
         raise Refused("VTK finds no points in it")
     cells = []
-    for array, types in found:
+    for array, types in arrays:
         if array is None:
             continue
         offsets = vtk_to_numpy(array.GetOffsetsArray()).astype(np.int64)
@@ -345,12 +344,12 @@ class _InpContent(NamedTuple):
 
 def _inp_content(data: bytes) -> _InpContent:
     nodes: list[str] = []
-    n_elements, n_parts, sets, keyword, goes_on = 0, 0, [], "", False
+    n_elements, n_parts, sets, keyword, continued = 0, 0, [], "", False
     for line in map(str.strip, data.decode("latin-1").splitlines()):
         if not line or line.startswith("**"):
             continue
         if line.startswith("*"):
-            keyword, goes_on = line[1:].upper().split(",")[0].strip(), False
+            keyword, continued = line[1:].upper().split(",")[0].strip(), False
             n_parts += keyword == "PART"
             if keyword == "INCLUDE" or n_parts > 1:
                 raise Refused(f"holds several parts or files, of which one is read; {_REMEDY}")
@@ -362,8 +361,8 @@ def _inp_content(data: bytes) -> _InpContent:
         elif keyword == "NODE":
             nodes.append(line.split(",")[0].strip())
         elif keyword == "ELEMENT":
-            n_elements += not goes_on
-            goes_on = line.endswith(",")
+            n_elements += not continued
+            continued = line.endswith(",")
     if len(set(nodes)) < len(nodes):
         raise Refused("has several nodes of one number")
     return _InpContent(len(nodes), n_elements, sets)

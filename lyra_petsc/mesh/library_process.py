@@ -37,15 +37,11 @@ from lyra_petsc.mesh.library_formats import (
 )
 from lyra_petsc.mesh.mesh import ElementBlock
 
-_EQUILATERAL = math.sqrt(3) / 4
 _UNGUARDED = (
     "mesh scripts are programs, and this system has no seccomp to confine them: give --trust-mesh "
     "(Python: trust_mesh=True) if you trust it, or a .msh"
 )
 _FENCE = " (is it there, in the folder of the script? scripts write no files)"
-_MIN_FILL = 0.25
-"""Fraction of its bounding box that a surface fills at least, for estimates of the number of triangles."""
-
 _SYSTEM = (
     *("/usr", "/lib", "/lib64", "/opt", "/etc/ld.so.cache", "/etc/localtime", "/dev/null", "/dev/urandom"),
     *("/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system"),
@@ -92,13 +88,13 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
     try:
         file = Path(job["file"])
         if LIBRARIES[file.suffix] == "gmsh":
-            with _session(file.suffix) as gmsh:
-                enter(gmsh)
-                found = _read_by_gmsh(gmsh, job, report)
+            gmsh = _start_gmsh(file.suffix)
+            enter(gmsh)
+            whole = _read_by_gmsh(gmsh, job, report)
         else:
-            found = read_format(file, enter)
+            whole = read_format(file, enter)
         with open(mesh, "wb", closefd=False) as output:
-            _write_mesh(found, output)
+            _write_mesh(whole, output)
     except Refused as error:
         report(refused=str(error))
     except MemoryError:
@@ -115,12 +111,12 @@ def _read_by_gmsh(gmsh: ModuleType, job: dict[str, Any], report: Callable[..., N
         announced = count_announced(file.suffix, file.read_bytes())
         with _raise_refused(gmsh, str(file)):
             gmsh.merge(str(file))
-        found, n_elements = _gmsh_mesh(gmsh), sum(len(tags) for tags in gmsh.model.mesh.getElements()[1])
-        refuse_losses("gmsh", announced, len(found.points), n_elements)
+        whole, n_elements = _gmsh_mesh(gmsh), sum(len(tags) for tags in gmsh.model.mesh.getElements()[1])
+        refuse_losses("gmsh", announced, len(whole.points), n_elements)
         # elements without a group have the number 0
-        grouped = [block._replace(groups=block.groups[block.groups[:, 1] != 0]) for block in found.elements]
-        order = np.argsort(found.tags)  # gmsh sorts them by entity
-        return found._replace(tags=found.tags[order], points=found.points[order], elements=grouped)
+        grouped = [block._replace(groups=block.groups[block.groups[:, 1] != 0]) for block in whole.elements]
+        order = np.argsort(whole.tags)  # gmsh sorts them by entity
+        return whole._replace(tags=whole.tags[order], points=whole.points[order], elements=grouped)
     _set_size(gmsh, job["size"])
     with _raise_refused(gmsh, script):
         gmsh.merge(str(file))
@@ -128,7 +124,7 @@ def _read_by_gmsh(gmsh: ModuleType, job: dict[str, Any], report: Callable[..., N
             gmsh.merge(f"{script}.opt")
     report(stage="mesh")
     _allow_seconds(job["mesh_seconds"], job["wall_ratio"])
-    _generate_mesh(gmsh, job, lambda count: report(triangles=round(count)))
+    _generate_mesh(gmsh, job)
     return _gmsh_mesh(gmsh)
 
 
@@ -153,8 +149,7 @@ def _limit(kind: int, value: int) -> None:
     resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
 
 
-@contextmanager
-def _session(suffix: str) -> Iterator[ModuleType]:
+def _start_gmsh(suffix: str) -> ModuleType:
     """gmsh, initialised without the user's configuration, that prints nothing."""
     try:
         import gmsh
@@ -172,11 +167,11 @@ def _session(suffix: str) -> Iterator[ModuleType]:
     gmsh.option.setNumber("General.Verbosity", 1)  # errors only
     gmsh.option.setNumber("General.AbortOnError", 0)
     gmsh.logger.start()
-    yield gmsh
+    return gmsh
 
 
-def _generate_mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[float], None]) -> None:
-    """Mesh the surfaces; ``expect`` is called with an estimate of the number of triangles."""
+def _generate_mesh(gmsh: ModuleType, job: dict[str, Any]) -> None:
+    """Mesh the surfaces."""
     script, size, maximum = job["script"], job["size"], job["max_triangles"]
     _set_size(gmsh, size)  # the script may have set its own
     if job["algorithm"] is not None:
@@ -187,13 +182,10 @@ def _generate_mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[floa
             if has_mesh:
                 gmsh.model.mesh.clear()
             if size is not None:
-                _refuse_many(_curve_length(gmsh) / size, "edges", size, maximum)
-                _refuse_many(_estimate_triangles(gmsh, size), "triangles", size, maximum)
+                _refuse_many_triangles(gmsh, size, maximum)
             gmsh.model.mesh.generate(1)
-            count = _estimate_triangles(gmsh, size)
             if size is None:
-                _refuse_many(count, "triangles", None, maximum)
-            expect(count / _MIN_FILL)  # for flat sheets, which fill their boxes
+                _refuse_many_triangles(gmsh, None, maximum)
             gmsh.model.mesh.generate(2)
 
 
@@ -202,14 +194,14 @@ def _gmsh_mesh(gmsh: ModuleType) -> FileMesh:
     model = gmsh.model
     tags, points, elements = [np.empty(0, np.int64)], [np.empty((0, 3))], []
     for entity in sorted(model.getEntities()):
-        found, coordinates, _ = model.mesh.getNodes(*entity)
-        tags.append(np.asarray(found, dtype=np.int64))
+        of_entity, coordinates, _ = model.mesh.getNodes(*entity)
+        tags.append(np.asarray(of_entity, dtype=np.int64))
         points.append(np.asarray(coordinates, dtype=np.float64).reshape(-1, 3))
         groups = [abs(int(tag)) for tag in model.getPhysicalGroupsForEntity(*entity)]
         kinds, _, nodes = model.mesh.getElements(*entity)
         for kind, of_kind in zip(kinds, nodes, strict=True):
-            _, _, _, each, _, primary = model.mesh.getElementProperties(int(kind))
-            corners = np.asarray(of_kind, dtype=np.int64).reshape(-1, each)[:, :primary]
+            _, _, _, n_nodes, _, n_corners = model.mesh.getElementProperties(int(kind))
+            corners = np.asarray(of_kind, dtype=np.int64).reshape(-1, n_nodes)[:, :n_corners]
             rows = np.column_stack(
                 [np.tile(np.arange(len(corners)), len(groups)), np.repeat(groups, len(corners))]
             )
@@ -253,28 +245,22 @@ def _set_size(gmsh: ModuleType, size: float | None) -> None:
         gmsh.option.setNumber(f"Mesh.{option}", value)
 
 
-def _refuse_many(number: float, kind: str, size: float | None, maximum: int) -> None:
-    if number > maximum:
-        cause = "the sizes in the script" if size is None else f"size {size:g} m"
-        raise Refused(f"{cause} would give about {number:.2g} {kind}; at most {maximum:.2g} fit into memory")
-
-
-def _curve_length(gmsh: ModuleType) -> float:
-    """Lower bound [m] of the length of all curves: the sum of the diagonals of their bounding boxes."""
-    boxes = (gmsh.model.getBoundingBox(*entity) for entity in gmsh.model.getEntities(1))
-    return sum(math.hypot(*_extent(box)) for box in boxes)
-
-
-def _estimate_triangles(gmsh: ModuleType, size: float | None) -> float:
-    """Number of triangles by bounding boxes and element size; without ``size`` by that of boundary edges."""
+def _refuse_many_triangles(gmsh: ModuleType, size: float | None, maximum: int) -> None:
+    """Refuse a mesh that cannot fit into memory, by the areas of bounding boxes and the element size; without
+    ``size`` by that of boundary edges.
+    """
     count = 0.0
     for dimension, tag in gmsh.model.getEntities(2):
         edge = _longest_mean_edge(gmsh, tag) if size is None else size
-        if edge is None:
-            continue
-        x, y, z = _extent(gmsh.model.getBoundingBox(dimension, tag))
-        count += _MIN_FILL * math.hypot(x * y, y * z, z * x) / (_EQUILATERAL * edge * edge)
-    return count
+        if edge is not None:
+            x, y, z = _extent(gmsh.model.getBoundingBox(dimension, tag))
+            # a quarter of those that fill the box, which a surface may hardly do
+            count += 0.5 * math.hypot(x * y, y * z, z * x) / edge**2
+    if count > maximum:
+        cause = "the sizes in the script" if size is None else f"size {size:g} m"
+        raise Refused(
+            f"{cause} would give about {count:.2g} triangles; at most {maximum:.2g} fit into memory"
+        )
 
 
 def _longest_mean_edge(gmsh: ModuleType, surface: int) -> float | None:

@@ -7,6 +7,12 @@ import numpy as np
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
 
+SAME_PLACE = 1e-6
+"""Fraction of a length (an edge, the sheet) up to which places count as the same: files have six digits."""
+
+SCALE_RATIO = 1.5
+"""Ratio of mean lengths from which on a note says that they are not those of one sheet, or as asked for."""
+
 # if the projection of x into the plane of a triangle is shorter, y is projected instead
 _NEARLY_NORMAL = 0.1
 

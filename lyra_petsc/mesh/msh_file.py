@@ -108,25 +108,25 @@ class _File:
 
 
 def _read_sections(data: bytes, path: Path) -> _File:
-    found: _File | None = None
+    content: _File | None = None
     at = 0
     while (head := _SECTION.search(data, at)) is not None:
         name = head.group(1)
         end = data.find(b"$End" + name, head.end())
         if end < 0:
-            if found is None and name != b"MeshFormat":
+            if content is None and name != b"MeshFormat":
                 break
             raise InputError(f"damaged: section ${name.decode()} does not end", file=path)
         body = data[head.end() : end]
         at = end + 4 + len(name)
         if name == b"MeshFormat":
-            found = _read_format(body, path)
-        elif found is not None:
-            found.sections.setdefault(name.decode(), body)
-    if found is None:
+            content = _read_format(body, path)
+        elif content is not None:
+            content.sections.setdefault(name.decode(), body)
+    if content is None:
         hint = "format 1" if b"$NOD" in data[:200] else "no $MeshFormat section"
         raise InputError(f"is no gmsh mesh of format 2.2 or 4.1 ({hint})", file=path)
-    return found
+    return content
 
 
 def _read_format(body: bytes, path: Path) -> _File:
@@ -263,11 +263,11 @@ class TextValues:
         MshError
             If fewer numbers remain, or an integer is none.
         """
-        each = integers + reals
-        if n < 0 or n * each > len(self._values) - self._at:
+        columns = integers + reals
+        if n < 0 or n * columns > len(self._values) - self._at:
             raise MshError(f"is cut short: {n} rows announced, too few numbers left")
-        table = self._values[self._at : self._at + n * each].reshape(n, each)
-        self._at += n * each
+        table = self._values[self._at : self._at + n * columns].reshape(n, columns)
+        self._at += n * columns
         return _whole(table[:, :integers]), np.array(table[:, integers:])
 
     def peek(self, n: int) -> Ints:
@@ -418,8 +418,9 @@ def _merge_blocks(blocks: list[ElementBlock]) -> list[ElementBlock]:
 def _by_tag(members: Ints, tags: Ints) -> dict[int, Ints]:
     """The ``members`` (n, …) of each tag, in their order; tags ascending."""
     order = np.argsort(tags, kind="stable")
-    found, first = np.unique(tags[order], return_index=True)
-    return dict(zip(found.tolist(), np.split(members[order], first[1:]), strict=True)) if len(found) else {}
+    present, first = np.unique(tags[order], return_index=True)
+    parts = np.split(members[order], first[1:])
+    return dict(zip(present.tolist(), parts, strict=False))
 
 
 # -- triangles and groups ----------------------------------------------------------------------------
@@ -518,15 +519,15 @@ def _triangles(
     for block in blocks:
         _, corners, nodes = ELEMENT_TYPES[block.kind]
         curved += len(block.nodes) if nodes > corners else 0
-        each = corners - 2
+        per_element = corners - 2
         part = block.nodes
         if corners == 4:
             quads += len(part)
             part = np.take_along_axis(part[:, None, :], split_quads(points[part]), axis=2).reshape(-1, 3)
         parts.append(part)
-        entities.append(np.repeat(block.entity, each))
-        members.append((block.groups[:, :1] * each + np.arange(each)).reshape(-1) + begin)
-        tags.append(np.repeat(block.groups[:, 1], each))
+        entities.append(np.repeat(block.entity, per_element))
+        members.append((block.groups[:, :1] * per_element + np.arange(per_element)).reshape(-1) + begin)
+        tags.append(np.repeat(block.groups[:, 1], per_element))
         begin += len(part)
     if quads:
         notes.append(f"{quads} quads split into triangles")

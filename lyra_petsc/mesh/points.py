@@ -86,8 +86,8 @@ class Points:
         end = self.start + self.n_owned
         order = np.argsort(self.ghosts, kind="stable")
         inside = (numbers >= self.start) & (numbers < end)
-        found = np.searchsorted(self.ghosts, np.where(inside, -1, numbers), sorter=order)
-        ghost = order[np.minimum(found, len(order) - 1)] if len(order) else found
+        place = np.searchsorted(self.ghosts, np.where(inside, -1, numbers), sorter=order)
+        ghost = order[np.minimum(place, len(order) - 1)] if len(order) else place
         return np.where(inside, numbers - self.start, self.n_owned + ghost)
 
     def extended(self, owned: Array) -> Array:

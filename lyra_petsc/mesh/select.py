@@ -15,9 +15,6 @@ from lyra_petsc.scene.schema import VertexChoice
 
 DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 
-FLAT = 1e-6
-"""Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
-
 
 def select_vertices(mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None) -> Ints:
     """Vertices that a selector names, ascending, each once.
@@ -59,16 +56,16 @@ def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | 
     """
     if group is None:
         return np.arange(mesh.n_triangles, dtype=np.int64)
-    found = find_group(mesh, group, key=key, file=file)
-    if found.dimension != 2:
+    surface = find_group(mesh, group, key=key, file=file)
+    if surface.dimension != 2:
         surfaces = [name for name, candidate in mesh.groups.items() if candidate.dimension == 2]
         raise InputError(
-            f"group '{group}' is a {DIMENSION_NAMES[found.dimension]} group and has no triangles; "
+            f"group '{group}' is a {DIMENSION_NAMES[surface.dimension]} group and has no triangles; "
             f"surface groups: {first_few(sorted(surfaces), 20) or 'none'}",
             key=key,
             file=file,
         )
-    return found.triangles
+    return surface.triangles
 
 
 def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -> Group:
@@ -79,9 +76,8 @@ def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -
     InputError
         No such group; the message gives the most similar name and all names.
     """
-    found = mesh.groups.get(name)
-    if found is not None:
-        return found
+    if name in mesh.groups:
+        return mesh.groups[name]
     raise InputError(f"no group '{name}' in the mesh; {suggest(name, mesh.groups)}", key=key, file=file)
 
 

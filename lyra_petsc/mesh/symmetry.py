@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.measures import SAME_PLACE
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container
-from lyra_petsc.mesh.select import FLAT, select_vertices
+from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import connected_pieces
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import AXES
@@ -60,7 +61,7 @@ def symmetry_walls(scene: Scene, mesh: Mesh) -> list[Wall]:
     if scene.contact is None or not scene.contact.self:
         return []
     x, triangles = mesh.positions, mesh.triangles
-    tolerance = FLAT * float(np.ptp(x, axis=0).max())
+    tolerance = SAME_PLACE * float(np.ptp(x, axis=0).max())
     planes: list[tuple[int, int, float, Ints]] = []
     for number, handle in enumerate(scene.handles):
         if handle.symmetry is None:

@@ -18,13 +18,13 @@ from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.linear.petsc_options import petsc_number
-from lyra_petsc.mesh.build import SAME_PLACE, build_scene_mesh
+from lyra_petsc.mesh.build import build_scene_mesh
 from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.measures import largest_changes, mean_edge_length, unit_normals
+from lyra_petsc.mesh.measures import SAME_PLACE, largest_changes, mean_edge_length, unit_normals
 from lyra_petsc.mesh.mesh import Mesh, Source
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.mesh.select import FLAT, select_vertices
+from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -293,7 +293,7 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
     A facet of a curved sheet that is normal to the plane is off it by half the angle to the next facet.
     """
     scene, mesh = rest.scene, rest.mesh
-    tolerance = FLAT * float(np.ptp(mesh.positions, axis=0).max())
+    tolerance = SAME_PLACE * float(np.ptp(mesh.positions, axis=0).max())
     for number, vertices in held.items():
         axis = scene.handles[number].symmetry
         if axis is None:
@@ -350,7 +350,7 @@ def _check_sliding(rest: RestShape, held: Selection) -> None:
         keyframes = scene.motions[handle.motion] if handle.motion is not None else ()
         names = ", ".join(AXES[axis] for axis in free)
         problem = ""
-        if slope > FLAT:
+        if slope > SAME_PLACE:
             problem = (
                 f"keeps the slope of an edge that slides in its sheet's plane, not along {names} out of it"
             )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mesh_sources import MeshSource, Transform, grid, grid_mesh, mesh_of, obj_mesh, rest_areas, turn
+from mesh_sources import MeshSource, Transform, grid, grid_mesh, obj_mesh, rest_areas, turn
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import build_mesh
@@ -46,23 +46,11 @@ def test_several_sheets_are_numbered_consecutively() -> None:
     assert (mesh.rest[4:, 2] == 0).all()
 
 
-def test_a_source_named_like_one_of_its_curves() -> None:
-    mesh = build_mesh([MeshSource(grid=grid(nx=1, ny=1), name="left")])
-    assert mesh.groups["left"].dimension == 2
-    assert mesh.groups["left.curve"].vertices.tolist() == [0, 2]
-    assert any("'left' is used for several dimensions" in note for note in mesh.notes)
-
-
 def test_transform_order_and_exact_right_angles() -> None:
     mesh = grid_mesh(Transform(scale=(2, 3, 1), rotate=turn((1, 0, 0), 90), translate=(0, 1, 0)), nx=1, ny=1)
     assert mesh.positions.tolist() == [[0, 1, 0], [2, 1, 0], [0, 1, 3], [2, 1, 3]]
     assert mesh.rest.tolist() == [[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 0]]
     assert rest_areas(mesh).tolist() == [3, 3]
-
-
-def test_rotation_keeps_lengths_and_turns_right_handed() -> None:
-    mesh = grid_mesh(Transform(rotate=turn((0, 0, 2), 30)), nx=1, ny=1)
-    assert np.allclose(mesh.positions[1], [np.cos(np.pi / 6), 0.5, 0])
 
 
 def test_inconsistently_oriented_triangles_are_reversed(tmp_path: Path) -> None:
@@ -152,22 +140,3 @@ def test_slivers_and_small_triangles_are_accepted(tmp_path: Path, aspect: float,
     text = obj([(offset, 0, 0), (offset + 1, 0, 0), (offset + 0.5, 1 / aspect, 0)], [(0, 1, 2)])
     assert rest_areas(obj_mesh(tmp_path, text))[0] == pytest.approx(0.5 / aspect)
     assert rest_areas(obj_mesh(tmp_path, text, Transform(scale=1e-6)))[0] == pytest.approx(0.5e-12 / aspect)
-
-
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        (MeshSource(file=Path("/nowhere/flag.msh")), "no such file"),
-        (MeshSource(grid=grid(), transform=Transform(translate=(1e200, 0, 0))), "start shape"),
-    ],
-)
-def test_invalid_sources_are_refused(source: MeshSource, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        build_mesh([source], file="scene.yaml")
-    assert caught.value.file is not None
-
-
-def test_a_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "folder.msh").mkdir()
-    with pytest.raises(InputError, match="is a directory"):
-        mesh_of(tmp_path / "folder.msh")

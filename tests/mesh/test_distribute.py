@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -14,7 +12,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import grid_sheet
 from lyra_petsc.mesh.distribute import GlobalMesh, LocalMesh, distribute
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, vertex_graph
+from lyra_petsc.mesh.partitioner import partition, vertex_graph
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.scene.schema import Grid
 
@@ -107,17 +105,6 @@ def test_each_rank_has_an_equal_part_of_all_layers(comm: MPI.Comm) -> None:
     assert np.abs(fraction - 1.0 / comm.size).max() < 13.0 / 169.0  # within a row of vertices
 
 
-@pytest.mark.parallel(1)
-@pytest.mark.parametrize("ranks", [2, 3, 7])
-def test_bisection_is_even_and_across_the_longest_side(ranks: int) -> None:
-    x = np.random.default_rng(1).random((1001, 3)) * [1.0, 40.0, 0.1]
-    owner = bisection(x, ranks)
-    sizes = np.bincount(owner, minlength=ranks)
-    assert sizes.max() - sizes.min() <= 2
-    along = [x[owner == rank, 1] for rank in range(ranks)]
-    assert all(low.max() < high.min() for low, high in pairwise(along))
-
-
 def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
     graph = vertex_graph([np.array([[i, i + 1] for i in range(11)])], 12) if comm.rank == 0 else None
     PETSc.Options()["mat_partitioning_type"] = "average"
@@ -134,15 +121,6 @@ def test_a_partitioner_that_petsc_lacks_is_refused(comm: MPI.Comm) -> None:
     PETSc.Options()["mat_partitioning_type"] = "scissors"
     with pytest.raises(InputError, match="scissors"):
         partition(comm, vertex_graph([np.array([[0, 1]])], 2) if comm.rank == 0 else None, 2)
-
-
-def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:
-    rng = np.random.default_rng(1)
-    path = rng.permutation(200)  # vertices with random numbers
-    graph = vertex_graph([np.column_stack([path[:-1], path[1:]])], 200)
-    position = locality_order(graph)
-    np.testing.assert_array_equal(np.sort(position), np.arange(200))
-    assert np.abs(np.diff(position[path])).max() == 1
 
 
 def with_edges(triangles: Ints, n_vertices: int) -> GlobalMesh:
@@ -238,15 +216,3 @@ def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: LocalM
     np.testing.assert_array_equal(values[:, 0], more.global_number)
     assert (more.n_vertices, more.n_edges) == (layout.n_vertices, layout.n_edges)
     more.destroy()
-
-
-def test_a_constant_with_one_value_takes_no_memory() -> None:
-    stencil = np.arange(12).reshape(4, 3)
-    data = {"same": np.full(4, 0.3), "other": np.arange(4.0), "wide": np.ones((4, 2))}
-    elements = Elements(stencil, data)
-    for name in (*data, "missing"):
-        assert elements.compress(name).data.keys() == data.keys()
-    assert elements.compress("other") is elements.compress("wide") is elements.compress("missing") is elements
-    once = elements.compress("same").data["same"]
-    assert once.strides == (0,)
-    np.testing.assert_array_equal(once, data["same"])

@@ -249,17 +249,6 @@ def test_truncated_files_are_refused(tmp_path: Path, name: str, monkeypatch: pyt
         assert not {"ended early", "did not finish"} & set(str(caught.value).split(": "))
 
 
-@pytest.mark.parametrize("suffix", LIBRARIES)
-def test_empty_files_and_solids_are_refused(tmp_path: Path, suffix: str) -> None:
-    file = tmp_path / f"mesh{suffix}"
-    file.write_text("")
-    with pytest.raises(InputError, match="empty"):
-        mesh_of(file)
-    file.write_text("mesh\n")
-    with pytest.raises(InputError):
-        mesh_of(file)
-
-
 def test_solid_elements_are_named(tmp_path: Path) -> None:
     file = tmp_path / "solid.inp"
     file.write_text(INP[: INP.index("*ELEMENT")] + "*ELEMENT, TYPE=C3D4\n1, 10, 20, 50, 60\n")

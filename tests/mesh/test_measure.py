@@ -9,18 +9,9 @@ import pytest
 from mesh_sources import Transform, grid_mesh, obj_mesh, rest_areas, turn
 
 from lyra_petsc.mesh.measures import (
-    bounding_diagonal,
-    mean_edge_length,
     plane_coordinates,
     rest_matrices,
 )
-
-
-def test_diagonal_and_mean_edge_length() -> None:
-    mesh = grid_mesh(Transform(rotate=turn((1, 2, 3), 40)), width=3.0, height=4.0, nx=1, ny=1)
-    assert bounding_diagonal(mesh.rest) == pytest.approx(5.0)
-    assert mean_edge_length(mesh) == pytest.approx((3 + 4 + 5) / 3)
-    assert bounding_diagonal(mesh.triangle_uv.reshape(-1, 2)) == pytest.approx(5.0)
 
 
 def test_rest_matrices_recover_the_deformation_gradient() -> None:

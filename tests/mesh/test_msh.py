@@ -141,13 +141,6 @@ def test_one_name_for_two_dimensions_gives_a_note(tmp_path: Path) -> None:
     assert any("'5' is used for several dimensions" in note for note in mesh.notes)
 
 
-def test_equal_names_of_one_dimension_are_one_group(tmp_path: Path) -> None:
-    names = '$PhysicalNames\n2\n2 1 "cloth"\n2 2 "cloth"\n$EndPhysicalNames\n'
-    file = tmp_path / "equal.msh"
-    file.write_text(ascii_2(NODES, "1 2 2 1 1 40 7 3;2 2 2 -2 1 40 3 12", names))
-    assert mesh_of(file).groups["cloth"].triangles.tolist() == [0, 1]
-
-
 @pytest.mark.parametrize("binary", [0, 1])
 def test_parametric_nodes_of_format_2(tmp_path: Path, two_squares: Callable[..., None], binary: int) -> None:
     plain, parametric = tmp_path / "plain.msh", tmp_path / "parametric.msh"

@@ -62,11 +62,6 @@ def test_seam_gives_corners_their_own_material_coordinates(tmp_path: Path) -> No
     assert mesh.flat_rest.all()
 
 
-def test_repeated_equal_vt_are_no_seam(tmp_path: Path) -> None:
-    text = SQUARE + VT + "vt 0 0\n" + "f 1/1 2/2 3/3\nf 1/5 3/3 4/4\n"
-    assert vertex_uv(obj_mesh(tmp_path, text)) is not None
-
-
 def test_mirrored_vt_keep_areas_and_give_positive_matrices(tmp_path: Path) -> None:
     mesh = obj_mesh(tmp_path, SQUARE + "vt 0 0\nvt -2 0\nvt -2 2\nvt 0 2\nf 1/1 2/2 3/3 4/4\n")
     inverse, area = rest_matrices(mesh)
@@ -150,17 +145,3 @@ def test_invalid_files_are_refused(tmp_path: Path, text: str, message: str) -> N
     with pytest.raises(InputError, match=message) as caught:
         obj_mesh(tmp_path, text)
     assert caught.value.file == str(tmp_path / "mesh.obj")
-
-
-def test_a_polygon_of_many_corners_is_refused(tmp_path: Path) -> None:
-    ring = "".join(f"v {np.cos(a)} {np.sin(a)} 0\n" for a in np.linspace(0, 6, 300))
-    with pytest.raises(
-        InputError, match=r"line 301: .*\(257 corners, at most 256; split it into triangles\)"
-    ):
-        obj_mesh(tmp_path, ring + f"f {' '.join(map(str, range(1, 258)))}\n")
-
-
-def test_control_characters_in_names_are_replaced(tmp_path: Path) -> None:
-    mesh = obj_mesh(tmp_path, SQUARE + "g \x1b[31mred\n\x1bword 1\nf 1 2 3\nf 1 3 4\n")
-    assert list(mesh.groups) == ["\N{REPLACEMENT CHARACTER}[31mred"]
-    assert all(note.isprintable() for note in mesh.notes)

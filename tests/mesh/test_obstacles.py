@@ -120,13 +120,6 @@ def test_sphere_and_capsule_keep_a_distance_from_point_and_edge(comm: MPI.Comm) 
     assert all(each.edges.dtype == each.triangles.dtype == np.int64 for each in (ball, rod))
 
 
-def test_a_plane_has_a_unit_normal(comm: MPI.Comm) -> None:
-    plane = built(comm, PLANE)
-    assert isinstance(plane, Container)
-    assert plane.points.tolist() == [[0, 0, 1]]
-    np.testing.assert_allclose(plane.normals, [[0, 0.6, 0.8]], rtol=0, atol=1e-15)
-
-
 def test_friction_of_an_obstacle_overrides_that_of_contact(comm: MPI.Comm) -> None:
     assert built(comm, BOX).friction == (0.4, 0.3)
     assert built(comm, {**BOX, "friction": 0.7}).friction == (0.7, 0.7)
@@ -158,13 +151,6 @@ def test_a_motion_is_relative_to_the_placement_in_the_scene(comm: MPI.Comm, name
         np.testing.assert_allclose(plane.normals_at(time), [rotation @ plane.normals[0]], rtol=0, atol=1e-13)
     moved = rod.positions(0.9)
     assert np.linalg.norm(moved[1] - moved[0]) == pytest.approx(2.0, abs=1e-13)  # rigid
-
-
-def test_obstacles_without_motion_stay(comm: MPI.Comm) -> None:
-    plane = built(comm, PLANE)
-    assert isinstance(plane, Container)
-    assert plane.positions(7.0) is plane.points
-    assert plane.normals_at(7.0) is plane.normals
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -216,14 +202,6 @@ def test_a_bad_mesh_is_refused_on_all_ranks(comm: MPI.Comm, shared_tmp: Path, te
     with pytest.raises(InputError, match=words) as caught:
         built(comm, {"mesh": {"file": str(file)}})
     assert "body.obj" in str(caught.value)
-
-
-def test_many_obstacles_are_in_the_order_of_the_scene(comm: MPI.Comm) -> None:
-    whole = scene(BOX, obstacles={"z": BOX, "a": PLANE, "m": SPHERE})
-    assert [each.name for each in build_scene_obstacles(comm, whole, None, Motion)] == ["z", "a", "m"]
-    assert (
-        build_scene_obstacles(comm, whole.changed({"obstacles": None, "contact": None}), None, Motion) == []
-    )
 
 
 def test_invalid_motions_are_refused(comm: MPI.Comm) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from mesh_sources import grid_mesh
 
 from lyra_petsc.mesh.topology import boundary_edges, enclosed_volumes, hinges, junctions
@@ -17,15 +16,6 @@ def test_hinges_agree_with_their_triangles() -> None:
         assert (first, a, b, c) in turns
         assert (second, b, a, d) in turns
         assert first < second
-
-
-@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
-def test_euler_formula(pattern: str) -> None:
-    mesh = grid_mesh(nx=6, ny=4, pattern=pattern)
-    interior, boundary = len(hinges(mesh.triangles).vertices), len(boundary_edges(mesh.triangles).edges)
-    assert boundary == 2 * (6 + 4)
-    assert mesh.n_vertices - (interior + boundary) + mesh.n_triangles == 1
-    assert 3 * mesh.n_triangles == 2 * interior + boundary
 
 
 def test_boundary_edges_have_the_direction_of_their_triangle_and_close() -> None:
@@ -53,9 +43,3 @@ def test_volumes_of_a_tetrahedron_one_turned_inside_out_an_open_and_a_flat_one()
     triangles = np.concatenate([faces, faces[:, ::-1] + 4, faces[:3] + 8, faces + 12])
     piece = np.repeat([0, 1, 2, 3], [4, 4, 3, 4])
     np.testing.assert_allclose(enclosed_volumes(points, triangles, piece), [1 / 6, -1 / 6, 0, 0], atol=1e-15)
-
-
-def test_no_triangles_no_edges() -> None:
-    empty = np.empty((0, 3), dtype=np.int64)
-    assert hinges(empty).vertices.shape == (0, 4)
-    assert boundary_edges(empty).edges.shape == (0, 2)
