@@ -125,10 +125,10 @@ def start_petsc(words: Sequence[str] = ()) -> None:
 def _missing(error: ImportError) -> InputError:
     """The error for a Python without petsc4py or mpi4py."""
     folders = map(os.path.dirname, sorted(glob.glob(DISTRIBUTION)))
-    found = [folder for folder in folders if folder not in sys.path]
+    absent = [folder for folder in folders if folder not in sys.path]
     remedy = "use 'bash scripts/run.sh', or see docs/install.md for Debian, conda, clusters and PyPI"
-    if found and "petsc4py" in str(error):
-        remedy = f"the distribution's is in {found[-1]}: add this folder to PYTHONPATH"
+    if absent and "petsc4py" in str(error):
+        remedy = f"the distribution's is in {absent[-1]}: add this folder to PYTHONPATH"
     return InputError(f"{error}: this Python ({sys.executable}) has no working petsc4py and mpi4py; {remedy}")
 
 

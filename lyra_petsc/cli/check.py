@@ -130,7 +130,10 @@ def _sizes(simulation: SteppedScene) -> list[tuple[str, str]]:
     extent = " x ".join(f"{length:.4g}" for length in np.ptp(mesh.positions, axis=0))
     rows = [("size", f"{extent} m"), ("mass", f"{rest.mass.sum():.4g} kg")]
     names = [f"material {block.group}" if block.group else "material" for block in scene.material]
-    return [*rows, *((one_line(name), str(each)) for name, each in zip(names, figures(rest), strict=True))]
+    return [
+        *rows,
+        *((one_line(name), str(figure)) for name, figure in zip(names, figures(rest), strict=True)),
+    ]
 
 
 def _sandbox(scene: Scene) -> list[tuple[str, str]]:

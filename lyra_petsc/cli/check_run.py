@@ -72,7 +72,7 @@ def crossings_of(
     x, time = run.positions[state], float(run.times[state])
     pairs = self_crossings(x, run.triangles)
     at_corner = have_common_vertex(run.triangles, pairs)
-    boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
+    boxes = {name for name, block in (run.scene.obstacles or {}).items() if block.box is not None}
     overlaps = {
         one.name: find_overlaps(one, x, run.triangles, time, is_box=one.name in boxes) for one in obstacles
     }
@@ -120,8 +120,8 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     _print(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_every_rank(comm, partial(_count_in_state, run, obstacles, walls, begin + comm.rank))
-        for state, one in enumerate(comm.allgather(found), start=begin):
+        counted = on_every_rank(comm, partial(_count_in_state, run, obstacles, walls, begin + comm.rank))
+        for state, one in enumerate(comm.allgather(counted), start=begin):
             if one is not None:
                 rows.append(one[0])
                 _print(comm, row.format(state, f"{run.times[state]:g}", *one[0]) + one[1])
@@ -143,13 +143,15 @@ def _count_in_state(
     """Counts of a state for its row of the table, and the names to print; None beyond the last state."""
     if state >= len(run):
         return None
-    found = crossings_of(run, obstacles, state, walls)
-    inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
+    crossings = crossings_of(run, obstacles, state, walls)
+    inside = [[len(part) for part in overlap] for overlap in crossings.overlaps.values()]
     in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else [0, 0, 0]
-    pairs = np.concatenate([found.pairs[:MAX_NAMED], found.corner_pairs[:MAX_NAMED]])[:MAX_NAMED]
+    pairs = np.concatenate([crossings.pairs[:MAX_NAMED], crossings.corner_pairs[:MAX_NAMED]])[:MAX_NAMED]
     names = [f"{one}-{other}" for one, other in pairs.tolist()]
-    names += [_describe(name, overlap) for name, overlap in found.overlaps.items() if len(overlap.triangles)]
-    return [len(found.pairs), len(found.corner_pairs), *in_all], ", ".join(names[: 2 * MAX_NAMED])
+    names += [
+        _describe(name, overlap) for name, overlap in crossings.overlaps.items() if len(overlap.triangles)
+    ]
+    return [len(crossings.pairs), len(crossings.corner_pairs), *in_all], ", ".join(names[: 2 * MAX_NAMED])
 
 
 def _describe(name: str, overlap: Overlaps) -> str:

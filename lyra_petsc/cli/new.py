@@ -53,10 +53,11 @@ def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool) -> Path:
     from lyra_petsc.cli.starter import starter
     from lyra_petsc.output.file_operations import open_output
 
-    given = Path(name)
-    if not given.name or not name.isprintable():
+    path = Path(name)
+    if not path.name or not name.isprintable():
         raise InputError("must be a name for the scene's file", key="NAME")
-    path = given if given.suffix.lower() in (".yaml", ".yml") else given.with_name(f"{given.name}.yaml")
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        path = path.with_name(f"{path.name}.yaml")
     if os.path.lexists(path):  # before the mesh is read, which may take long
         raise InputError("exists and is left as it is; choose another name", file=path)
     text = starter(path, start_commands(), mesh, trust_mesh=trust_mesh)

@@ -54,8 +54,8 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
     from lyra_petsc.show.render.paraview_script import write_script
     from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 
-    given = {name: value for name, value in chosen.items() if value is not None}
-    options = RenderOptions(run, ground=not no_ground, label=not no_label, **given)
+    asked = {name: value for name, value in chosen.items() if value is not None}
+    options = RenderOptions(run, ground=not no_ground, label=not no_label, **asked)
     if options.paraview:
         path = on_root(comm, lambda: write_script(options.run))
         if comm.rank == 0:

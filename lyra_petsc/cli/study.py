@@ -23,7 +23,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import default_scene
 
 
-def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **given: Any) -> None:
+def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **fields: Any) -> None:
     """Run a study; collective.
 
     Parameters
@@ -31,7 +31,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **give
     comm : MPI.Comm
     out, resume, force
         The options of these names.
-    **given
+    **fields
         Fields of `Request` from the command line; None or empty if not given. ``trust_mesh`` is always
         given: it is not read from a folder, which may be someone else's.
 
@@ -44,12 +44,14 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **give
     Interrupted
         After a signal; the folder can be resumed.
     """
-    scene = given["scene"] or default_scene()
-    stem = out.name if resume and given["scene"] is None and out is not None else scene.stem
+    scene = fields["scene"] or default_scene()
+    stem = out.name if resume and fields["scene"] is None and out is not None else scene.stem
     choice = choose_folder(comm, stem, out, force=force, resume=resume, kind=STUDY)
     base = on_root(comm, lambda: read_request(choice.path)) if resume else Request(str(scene))
-    given["scene"] = given["scene"] and str(scene)
-    request = dataclasses.replace(base, **{k: value for k, value in given.items() if value not in (None, ())})
+    fields["scene"] = fields["scene"] and str(scene)
+    request = dataclasses.replace(
+        base, **{k: value for k, value in fields.items() if value not in (None, ())}
+    )
     check = stop_check(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
     launcher = case_launcher(comm, "study", request.ranks)
     plan = on_root(comm, lambda: make_plan(request))

@@ -58,13 +58,13 @@ class Served:
         """
         if live:
             return cls.of(host, port, no_browser)
-        given = {"--host": host is not None, "--port": port is not None, "--no-browser": no_browser}
-        for name, is_given in given.items():
+        options = {"--host": host is not None, "--port": port is not None, "--no-browser": no_browser}
+        for name, is_given in options.items():
             if is_given:
                 raise InputError("says where the page of --live is, which is not given", key=name)
         return None
 
-    def check(self, what: str) -> None:
+    def check(self, option: str) -> None:
         """Check that the page can be served; to be called on one rank before anything else.
 
         Raises
@@ -74,7 +74,7 @@ class Served:
         """
         from lyra_petsc.show.view.live import PACKAGES
 
-        require_packages(what, PACKAGES, "view")
+        require_packages(option, PACKAGES, "view")
         from lyra_petsc.show.view.server import check_address
 
         check_address(self.host, self.port)

@@ -98,13 +98,13 @@ class Block(BaseModel):
         aliases = {field.alias: name for name, field in type(self).model_fields.items() if field.alias}
         return getattr(self, aliases.get(key, key))
 
-    def given(self, *keys: str) -> list[str]:
+    def present(self, *keys: str) -> list[str]:
         """Those of ``keys`` that have a value."""
         return [key for key in keys if self.get(key) is not None]
 
     def require_one(self, *keys: str) -> None:
         """Raise a `problem` unless exactly one of ``keys`` has a value."""
-        require(len(self.given(*keys)) == 1, f"must have exactly one of {', '.join(keys)}")
+        require(len(self.present(*keys)) == 1, f"must have exactly one of {', '.join(keys)}")
 
     def require_with(self, key: str, condition: object, message: str) -> None:
         """Raise a `problem` at ``key`` if it has a value and the condition does not hold."""
@@ -143,25 +143,25 @@ def summary(block: type) -> str:
 
 def attributes(block: type) -> dict[str, Described]:
     """The entries under ``Attributes`` in the docstrings of a class and its bases, by name."""
-    found: dict[str, Described] = {}
+    entries: dict[str, Described] = {}
     for parent in reversed(block.__mro__):
-        found |= _parse_attributes(inspect.cleandoc(parent.__dict__.get("__doc__") or ""))
-    return found
+        entries |= _parse_attributes(inspect.cleandoc(parent.__dict__.get("__doc__") or ""))
+    return entries
 
 
 def _parse_attributes(doc: str) -> dict[str, Described]:
     _, _, section = doc.partition("Attributes\n----------\n")
-    found: dict[str, Described] = {}
+    entries: dict[str, Described] = {}
     names: list[str] = []
     for line in section.splitlines():
         if line.startswith(" "):
             for name in names:
-                text = f"{found[name].text} {line.strip()}".strip()
-                found[name] = Described(found[name].kind, text)
+                text = f"{entries[name].text} {line.strip()}".strip()
+                entries[name] = Described(entries[name].kind, text)
         elif entry := _ENTRY.fullmatch(line):
             # an entry without a type refers to another docstring
             names = entry["names"].split(", ") if entry["kind"] else []
-            found |= {name: Described(entry["kind"], "") for name in names}
+            entries |= {name: Described(entry["kind"], "") for name in names}
         else:
             names = []
-    return found
+    return entries

@@ -146,7 +146,7 @@ class Quantity(Block):
     def check(self) -> None:
         """Refuse several quantities, and axes of one that has none."""
         self.require_one("probe", "points", "overhang", "drape", "force")
-        self.require_with("axes", self.given("probe", "force"), "are of a probe or a force; leave axes out")
+        self.require_with("axes", self.present("probe", "force"), "are of a probe or a force; leave axes out")
 
 
 class Measurement(Quantity):
@@ -170,9 +170,9 @@ class Measurement(Quantity):
     def check(self) -> None:
         """Refuse values that are missing, or given twice."""
         super().check()
-        given = self.given("value", "table")
+        values = self.present("value", "table")
         self.require_with(
-            "points", not given, "come with their values in the table; leave out value and table"
+            "points", not values, "come with their values in the table; leave out value and table"
         )
         if self.points is None:
             self.require_one("value", "table")

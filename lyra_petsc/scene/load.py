@@ -79,19 +79,19 @@ def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
     InputError
         The scene cannot be used; the message names the key.
     """
-    if scene._given is None:
+    if scene._content is None:
         other = _load_changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
     else:
-        other = _load_changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+        other = _load_changed(scene._content, changes, scene.source, scene._directory or Path.cwd())
     other._notes = scene._notes
     return other.trusting_meshes() if scene.trusts_meshes else other
 
 
 def _load_changed(
-    given: Mapping[str, Any], changes: Mapping[str, Any], source: Path | None, directory: Path
+    content: Mapping[str, Any], changes: Mapping[str, Any], source: Path | None, directory: Path
 ) -> Scene:
     with _refuse_recursion(source):
-        data = plain(given)
+        data = plain(content)
         apply_changes(data, changes)
     return _load_checked(data, source, directory)
 
@@ -117,7 +117,7 @@ def _load_checked(
     if meshes_needed:
         for key, mesh in scene.mesh_files.items():
             _check_mesh_file(mesh, dotted(key, data), source)
-    scene._source, scene._given, scene._directory = source, data, directory
+    scene._source, scene._content, scene._directory = source, data, directory
     return scene
 
 
@@ -144,10 +144,10 @@ def _check_mesh_file(file: Path, key: str, scene: Path | None) -> None:
     try:
         if file.is_file():
             return
-        what = "is a directory, not a mesh file" if file.is_dir() else "no such file"
+        reason = "is a directory, not a mesh file" if file.is_dir() else "no such file"
     except OSError as error:
-        what = f"cannot be read ({error.strerror})"
-    raise InputError(f"{what}: {file}", file=scene, key=key)
+        reason = f"cannot be read ({error.strerror})"
+    raise InputError(f"{reason}: {file}", file=scene, key=key)
 
 
 def default_scene() -> Path:

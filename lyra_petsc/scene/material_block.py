@@ -310,24 +310,24 @@ class Material(Block):
 
     def check(self) -> None:
         """Refuse numbers that are missing, given twice, or for another law or bending model."""
-        used = [given for given in (self.given(*keys) for keys, _ in _ALTERNATIVES) if given]
-        found = f"; {' and '.join(given[0] for given in used)} are given" if used else ""
+        used = [names for names in (self.present(*keys) for keys, _ in _ALTERNATIVES) if names]
+        several = f"; {' and '.join(names[0] for names in used)} are given" if used else ""
         require(
             len(used) == 1,
             "must be given in exactly one way: cloth, or density + membrane + bending,"
-            f" or young + poisson + thickness + density{found}",
+            f" or young + poisson + thickness + density{several}",
         )
         self.require_with("density", self.cloth is None, "comes with the cloth; use density_scale")
         by_curves = isinstance(self.law, LawCurves)
         for keys, required in _ALTERNATIVES:
-            for key in required if self.given(*keys) else ():
-                text = f"missing (needed beside {self.given(*keys)[0]})"
+            for key in required if self.present(*keys) else ():
+                text = f"missing (needed beside {self.present(*keys)[0]})"
                 require(self.get(key) is not None or (key == "membrane" and by_curves), text, key)
         midedge = self.bending_model == "midedge"
         isotropic = self.young is not None or self.cloth in isotropic_names()
         if by_curves:
             require(
-                not self.given("membrane", "young"),
+                not self.present("membrane", "young"),
                 "curves take the place of membrane; give them beside a cloth, or density and bending",
                 "law",
             )
@@ -362,7 +362,7 @@ class Material(Block):
             if kes.get(name) is not None:
                 text = f"kes has {name}, which takes its place; {one}"
                 require(self.get(key) in (None, 0), text, key)
-        for name in kes.given("B", "G") if self.young is not None else ():
+        for name in kes.present("B", "G") if self.young is not None else ():
             raise problem(f"has {name}, which young, poisson and thickness give, too; {one}", "kes")
         if kes.G is not None:
             for wrong, part, at in (

@@ -44,12 +44,12 @@ def petsc_options(value: Any) -> Any:
     """Check the names and values of a ``petsc`` block."""
     if not isinstance(value, dict):
         raise problem(f"must be a block of options like {{ksp_type: cg}}, not {shown(value)}")
-    for key, given in value.items():
+    for key, argument in value.items():
         if not isinstance(key, str) or not _NAME.fullmatch(key):
             word = key if isinstance(key, str) else shown(key)
             dash = " without the dash" if word.startswith("-") else ""
             raise problem(f"is not an option name; write it as in ksp_type: cg{dash}", word)
-        if _is_unsafe(key.lower(), given):
+        if _is_unsafe(key.lower(), argument):
             raise problem(
                 "may run code or name a file, which a scene must not; give it on the command line", key
             )

@@ -311,7 +311,7 @@ class Handle(Selector):
             "keeps no slope of an edge that springs hold along some axes; hold all axes, or leave clamp out",
             "clamp",
         )
-        others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.given("motion", "stiffness")
+        others = self.clamp or self.start > 0.0 or self.fade > 0.0 or self.present("motion", "stiffness")
         self.require_with(
             "symmetry",
             self.axes == AXES and not others,
@@ -539,7 +539,7 @@ class Obstacle(Block):
         """Refuse several shapes, and sheets inside of a plane or a mesh."""
         self.require_one(*SHAPES)
         require(
-            not self.inside or self.given("sphere", "capsule", "box"),
+            not self.inside or self.present("sphere", "capsule", "box"),
             "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
             "inside",
         )
@@ -547,7 +547,7 @@ class Obstacle(Block):
     @property
     def shape(self) -> str:
         """The key of `SHAPES` that is given."""
-        return self.given(*SHAPES)[0]
+        return self.present(*SHAPES)[0]
 
 
 class AppliedLoad(VertexChoice):
@@ -581,10 +581,10 @@ class AppliedLoad(VertexChoice):
     def check(self) -> None:
         """Refuse several loads, and vertices or triangles on which a load cannot act."""
         self.require_one("force", "pressure", "traction", "moment")
-        chosen = self.given("group", "nodes", "box")
+        chosen = self.present("group", "nodes", "box")
         self.require_with("force", len(chosen) == 1, "needs exactly one of group, nodes, box to act on")
-        for kind in self.given("pressure", "traction"):
-            for key in self.given("box", "nodes"):
+        for kind in self.present("pressure", "traction"):
+            for key in self.present("box", "nodes"):
                 raise problem(f"cannot select triangles for {kind}; use group", key)
         self.require_with("moment", self.group is not None, "needs a group of boundary edges to act on")
         _check_window(self.start, self.until)
@@ -668,7 +668,7 @@ class Time(Block):
     def check(self) -> None:
         """Refuse keys for another analysis, integrator or kind of steps."""
         if self.static:
-            for key in self.given("integrator", "tolerance", "spectral_radius"):
+            for key in self.present("integrator", "tolerance", "spectral_radius"):
                 raise problem(_MEANINGLESS, key)
             require(self.end == 1.0, "is 1 in a static analysis (the full load); leave it out", "end")
             require(
@@ -879,7 +879,7 @@ class Scene(Block):
     petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options)] = Field(default_factory=dict)
 
     _source: Path | None = PrivateAttr(default=None)
-    _given: dict[str, Any] | None = PrivateAttr(default=None)
+    _content: dict[str, Any] | None = PrivateAttr(default=None)
     _directory: Path | None = PrivateAttr(default=None)
     _trusts_meshes: bool = PrivateAttr(default=False)
     _notes: list[str] = PrivateAttr(default_factory=list)

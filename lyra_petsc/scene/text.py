@@ -43,8 +43,8 @@ def read_bytes(path: Path, *, largest: float = math.inf, remedy: str = "") -> by
     """
     try:
         if not path.is_file():
-            what = "is a directory, not a file" if path.is_dir() else "is not a regular file"
-            raise InputError(what if path.exists() else "no such file", file=path)
+            kind = "is a directory, not a file" if path.is_dir() else "is not a regular file"
+            raise InputError(kind if path.exists() else "no such file", file=path)
         size = path.stat().st_size
         if size > largest:
             message = f"holds {size} bytes; at most {largest} are read"

@@ -144,10 +144,10 @@ def _read_library(library: str) -> dict[str, Any]:
 @cache
 def library_entries() -> dict[str, ClothTable | ShellMaterial]:
     """All materials of all libraries, by name."""
-    found: dict[str, ClothTable | ShellMaterial] = {}
+    entries: dict[str, ClothTable | ShellMaterial] = {}
     for library in TABLE_LIBRARIES:
         for name, row in _read_library(library)["tables"].items():
-            found[name] = ClothTable(
+            entries[name] = ClothTable(
                 **{key: row[key] for key in ("density", "c11", "c12", "c22", "c33")},
                 bending=tuple(row["bending"]),
                 measured=row.get("measured", True),
@@ -155,8 +155,8 @@ def library_entries() -> dict[str, ClothTable | ShellMaterial]:
     for library in ISOTROPIC_LIBRARIES:
         for name, row in _read_library(library)["isotropic"].items():
             areal = row["density"] * row["thickness"]
-            found[name] = isotropic_shell(row["young"], row["poisson"], row["thickness"], areal)
-    return found
+            entries[name] = isotropic_shell(row["young"], row["poisson"], row["thickness"], areal)
+    return entries
 
 
 def material_names() -> list[str]:

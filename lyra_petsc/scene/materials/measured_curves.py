@@ -36,7 +36,7 @@ def read_curve(path: Path) -> list[LocatedPoint]:
     InputError
         The file cannot be read, or a line does not have two numbers.
     """
-    found: list[LocatedPoint] = []
+    points: list[LocatedPoint] = []
     remedy = f"thin the curve out to at most {MAX_POINTS} points"
     # limit on the bytes of a file
     text = read_text(path, largest=2**20, remedy=remedy)
@@ -47,15 +47,15 @@ def read_curve(path: Path) -> list[LocatedPoint]:
             if not math.isfinite(strain + force):
                 raise ValueError
         except ValueError:
-            if not columns or (not found and columns[0][0].isalpha()):
+            if not columns or (not points and columns[0][0].isalpha()):
                 _refuse_units(line, path)
                 continue
             raise InputError(
                 f"{path}, line {number}: must be two numbers with decimal points, strain and force [N/m], "
                 f"not {cut(line)!r}"
             ) from None
-        found.append((f"{path}, line {number}", strain, force))
-    return found
+        points.append((f"{path}, line {number}", strain, force))
+    return points
 
 
 def _refuse_units(heading: str, path: Path) -> None:
@@ -90,11 +90,11 @@ def checked_points(points: list[LocatedPoint], whole: str = "the curve") -> Poin
     if len(points) == 1:
         raise InputError(f"{whole} has no point but the origin; give some with strain")
     for (_, x0, y0), (location, x1, y1) in pairwise(points):
-        for what, before, after in (("strain", x0, x1), ("force", y0, y1)):
+        for column, before, after in (("strain", x0, x1), ("force", y0, y1)):
             if not after > before:
                 raise InputError(
-                    f"{location}: {what} {after:g} is not more than {before:g} before it; sort by strain and "
-                    "leave out or smooth what does not grow"
+                    f"{location}: {column} {after:g} is not more than {before:g} before it; sort by strain "
+                    "and leave out or smooth what does not grow"
                 )
     location, strain, _ = points[-1]
     # limit on strains; larger numbers are percent or degrees
@@ -102,11 +102,11 @@ def checked_points(points: list[LocatedPoint], whole: str = "the curve") -> Poin
         raise InputError(
             f"{location}: strain {strain:g} is {100.0 * strain:g} %; give fractions, as 0.05 for 5 %"
         )
-    found = tuple((x, y) for _, x, y in points)
+    curve = tuple((x, y) for _, x, y in points)
     with np.errstate(all="ignore"):
-        if not np.isfinite(interpolation(found)).all():
+        if not np.isfinite(interpolation(curve)).all():
             raise InputError(f"{whole} has slopes that are no numbers; points are too near one another")
-    return found
+    return curve
 
 
 def force_at(points: Points, strain: float) -> float:
