@@ -70,9 +70,9 @@ def main(name: str, runs: int, out: Path | None) -> None:
                 measure(bench, name, model, kind, SIZES[0])
                 errors, seconds = [], []
                 for n in SIZES:
-                    found = [measure(bench, name, model, kind, n) for _ in range(runs)]
-                    errors.append(100.0 * found[0][0])
-                    seconds.append(statistics.median(wall for _, wall in found))
+                    results = [measure(bench, name, model, kind, n) for _ in range(runs)]
+                    errors.append(100.0 * results[0][0])
+                    seconds.append(statistics.median(wall for _, wall in results))
                     click.echo(f"| {model} | {kind} | {n} | {errors[-1]:.3g} | {seconds[-1]:.2f} |")
                 lines.append(Series(f"{model}, {kind}", seconds, errors, labels=[f"{n}" for n in SIZES]))
     if out is not None:

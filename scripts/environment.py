@@ -53,11 +53,11 @@ def version_of(package):
 
 def probe(added):
     sys.path.extend(added)
-    found = [importlib.util.find_spec(name) for name in ("petsc4py", "mpi4py")]
-    if None in found:
+    specs = [importlib.util.find_spec(name) for name in ("petsc4py", "mpi4py")]
+    if None in specs:
         return 3
     folders, owner = package_folders(), "environment"
-    home = os.path.realpath(os.path.dirname(os.path.dirname(found[0].origin)))
+    home = os.path.realpath(os.path.dirname(os.path.dirname(specs[0].origin)))
     if sys.prefix == "/usr" and home.startswith("/usr/lib/"):
         # the distribution's own: leave out ~/.local and /usr/local, where a NumPy 2 or a serial
         # h5py installed for other work would hide the builds that petsc4py was compiled against

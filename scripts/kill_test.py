@@ -18,12 +18,12 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from pathlib import Path
+from subprocess import Popen
 
 os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
 
@@ -32,9 +32,9 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = map(str, (ROOT, *(ROOT / "tests" / name for name in ("", "surviving", "cli"))))
+from launch import DIRECT, finish, start  # noqa: E402
 from leftovers import announced, ranks_in  # noqa: E402
 
-from lyra_petsc.api.mpirun import environment, find_launcher  # noqa: E402
 from lyra_petsc.output.read_run import StoredRun, read_table  # noqa: E402
 
 PATIENCE = 20.0
@@ -63,8 +63,6 @@ INTEGRATORS = {
     "alpha2, adaptive": ["--set", "time={end: 0.4, step: auto, tolerance: 0.02, integrator: alpha2}"],
 }
 
-DIRECT = ["-ksp_type", "preonly", "-pc_type", "lu"]
-
 TARGETS = ("one rank", "all ranks", "launcher", "launcher, SIGTERM", "launcher, SIGINT")
 
 
@@ -72,22 +70,17 @@ class WrongResult(Exception):
     """A run has left wrong or incomplete files, or processes."""
 
 
-def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[bytes]:
-    """Start the program; its output goes to ``output.txt``."""
-    words = [sys.executable, str(ROOT / "lyra_petsc"), "run", *arguments, *DIRECT]
-    if ranks > 1:
-        words = [*find_launcher(ranks), *words, "-pc_factor_mat_solver_type", "mumps"]
-    variables = environment() | {"OMPI_MCA_mpi_yield_when_idle": "1"}
-    with open(folder / "output.txt", "ab") as output:
-        return subprocess.Popen(
-            words,
-            cwd=folder,
-            env=variables,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            start_new_session=True,
-        )
+def launch(arguments: list[str], folder: Path, ranks: int) -> Popen[str]:
+    """Start the program."""
+    parallel = ["-pc_factor_mat_solver_type", "mumps"] if ranks > 1 else []
+    return start(["run", *arguments, *DIRECT, *parallel], folder, ranks)
+
+
+def complete(process: Popen[str]) -> None:
+    """Wait for the end of a run."""
+    left = finish(process, 600.0)
+    if left.code != 0:
+        raise WrongResult(left.err[-2000:])
 
 
 def rows(path: Path) -> int:
@@ -98,23 +91,18 @@ def rows(path: Path) -> int:
         return 0
 
 
-def wait_random_time(
-    process: subprocess.Popen[bytes], history: Path, draw: random.Random, length: float
-) -> None:
+def wait_random_time(process: Popen[str], history: Path, draw: random.Random, length: float) -> None:
     """Wait for a random time of the run and its set-up, or for a random number of rows of the history."""
-    deadline = time.monotonic() + draw.uniform(0.0, length)
-    goal = None
-    if draw.random() < 0.6:
-        goal = rows(history) + draw.randint(1, 40)
-        deadline = time.monotonic() + 10 * length
+    by_rows, goal = draw.random() < 0.6, rows(history) + draw.randint(1, 40)
+    deadline = time.monotonic() + (10.0 * length if by_rows else draw.uniform(0.0, length))
     while process.poll() is None and time.monotonic() < deadline:
-        if goal is not None and rows(history) >= goal:
+        if by_rows and rows(history) >= goal:
             time.sleep(draw.uniform(0.0, 0.03))
             return
         time.sleep(0.002)
 
 
-def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: random.Random) -> bool:
+def strike(process: Popen[str], folder: Path, target: str, draw: random.Random) -> bool:
     """Kill the target; returns whether the run was still going on."""
     victims = ranks_in(folder)
     if process.poll() is not None:
@@ -136,15 +124,15 @@ def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: ra
     return True
 
 
-def wait_until_gone(process: subprocess.Popen[bytes], folder: Path) -> None:
+def wait_until_gone(process: Popen[str], folder: Path) -> None:
     deadline = time.monotonic() + PATIENCE
     while process.poll() is None or ranks_in(folder):
         if time.monotonic() > deadline:
             remaining = ranks_in(folder)
-            for victim in [*remaining, *([process.pid] if process.poll() is None else [])]:
-                os.kill(victim, signal.SIGKILL)
+            os.killpg(process.pid, signal.SIGKILL)
             raise WrongResult(f"after {PATIENCE:g} s there are still ranks: {remaining}")
         time.sleep(0.02)
+    process.communicate()
 
 
 def check_announced(out: Path) -> int:
@@ -163,15 +151,15 @@ def check_announced(out: Path) -> int:
 def check_vtkhdf(out: Path, times: list[float]) -> None:
     """Check that VTK finds the same states; the last ones may be missing, as they are written later."""
     path = out / "states.vtkhdf"
-    found: list[float] = []
+    stored: list[float] = []
     if path.exists():
         with h5py.File(path, "r") as file:
-            found = file["VTKHDF/Steps/Values"][()].tolist()
+            stored = file["VTKHDF/Steps/Values"][()].tolist()
             for name in ("Points", "PointData/velocity", "PointData/rest"):
                 if not np.isfinite(file[f"VTKHDF/{name}"][()]).all():
                     raise WrongResult(f"{path.name}: {name} is not finite")
-    if found != times[: len(found)] or len(times) - len(found) > 1 + 0.1 * len(times):
-        raise WrongResult(f"{path.name} has the times {found}, not {times}")
+    if stored != times[: len(stored)] or len(times) - len(stored) > 1 + 0.1 * len(times):
+        raise WrongResult(f"{path.name} has the times {stored}, not {times}")
 
 
 def table(path: Path) -> np.ndarray:
@@ -212,14 +200,6 @@ def continue_options(out: Path) -> list[str]:
     return ["--force"] if out.exists() else []
 
 
-def run_to_end(arguments: list[str], folder: Path, ranks: int) -> float:
-    began = time.monotonic()
-    process = launch(arguments, folder, ranks)
-    if process.wait(600) != 0:
-        raise WrongResult((folder / "output.txt").read_text(errors="replace")[-2000:])
-    return time.monotonic() - began
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -243,29 +223,25 @@ def main() -> int:
             integrator = list(INTEGRATORS)[finished % len(INTEGRATORS)]
             words = [str(scene), *INTEGRATORS[integrator]]
             if integrator not in whole:
-                straight = folder / f"whole-{len(whole)}"
-                seconds = run_to_end([*words, "--out", straight.name], folder, asked.ranks)
-                whole[integrator] = straight, seconds
+                straight, began = folder / f"whole-{len(whole)}", time.monotonic()
+                complete(launch([*words, "--out", straight.name], folder, asked.ranks))
+                whole[integrator] = straight, time.monotonic() - began
             straight, length = whole[integrator]
             out = folder / f"killed-{finished}"
-            while kills.total() < asked.kills:
-                target = draw.choice(TARGETS if asked.ranks > 1 else TARGETS[:1])
+            while True:
                 process = launch([*words, "--out", out.name, *continue_options(out)], folder, asked.ranks)
-                wait_random_time(process, out / "history.csv", draw, length)
-                struck = strike(process, folder, target, draw)
-                wait_until_gone(process, folder)
-                if not struck:
-                    if process.returncode != 0:
-                        raise WrongResult((folder / "output.txt").read_text(errors="replace")[-2000:])
+                target = draw.choice(TARGETS if asked.ranks > 1 else TARGETS[:1])
+                if kills.total() < asked.kills:
+                    wait_random_time(process, out / "history.csv", draw, length)
+                if kills.total() == asked.kills or not strike(process, folder, target, draw):
+                    complete(process)
                     break
+                wait_until_gone(process, folder)
                 kills[target] += 1
                 states += check_announced(out)
                 print(
-                    f"{kills.total():4d}  {integrator:<18} {target:<18} rows {rows(out / 'history.csv'):4d}",
-                    flush=True,
+                    f"{kills.total():4d}  {integrator:<18} {target:<18} rows {rows(out / 'history.csv'):4d}"
                 )
-            else:
-                run_to_end([*words, "--out", out.name, *continue_options(out)], folder, asked.ranks)
             compare(out, straight)
             finished += 1
             shutil.rmtree(out)

@@ -44,8 +44,8 @@ class Change(NamedTuple):
 
 
 CHANGES = [
-    Change(*(each[name] for name in Change._fields))
-    for each in YAML(typ="safe").load(Path(__file__).with_name("mutations.yaml"))
+    Change(*(entry[name] for name in Change._fields))
+    for entry in YAML(typ="safe").load(Path(__file__).with_name("mutations.yaml"))
 ]
 
 

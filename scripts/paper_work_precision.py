@@ -91,7 +91,7 @@ def compare(settings: tuple[str, ...], repeats: int, plot: Path | None) -> None:
     rows: dict[str, list[dict[str, Any]]] = {}
     for setting in settings:
         tries = [run(setting) for _ in range(repeats)]
-        row = tries[0] | {"seconds": statistics.median(each["seconds"] for each in tries)}
+        row = tries[0] | {"seconds": statistics.median(attempt["seconds"] for attempt in tries)}
         rows.setdefault(row["integrator"], []).append(row)
         shown = row | {"seconds": f"{row['seconds']:.2f}", "error": f"{100 * row['error']:.2f}"}
         click.echo("| " + " | ".join(map(str, shown.values())) + " |")

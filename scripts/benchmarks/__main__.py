@@ -37,18 +37,18 @@ class Parser(argparse.ArgumentParser):
 
 def flat(lists: Sequence[list[int]]) -> list[int]:
     """The numbers of all words of an option."""
-    return [entry for each in lists for entry in each]
+    return [number for numbers in lists for number in numbers]
 
 
 def numbers(text: str) -> list[int]:
     """Positive integers separated by commas."""
     try:
-        found = [int(word) for word in text.replace(",", " ").split()]
+        values = [int(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        found = []
-    if not found or min(found) < 1:
+        values = []
+    if not values or min(values) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} must be whole numbers from 1 on, as 1024,10201")
-    return found
+    return values
 
 
 def read_arguments(words: Sequence[str]) -> argparse.Namespace:
@@ -72,13 +72,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     )
     add("--contact", action="store_true", help="also sheets in contact, for a second and more")
     add("--bending", nargs="*", metavar="MESH", help=f"also directors on edges beside hinges, on {meshes}")
-    add(
-        "--settle",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="of simulated time before those are measured (1)",
-    )
+    add("--settle", type=float, default=1.0, metavar="S", help="simulated time before those are measured (1)")
     add("--scenes", nargs="+", default=[], metavar="WORD", help="those of contact with a word in their names")
     add("--gap", type=float, metavar="M", help="contact gap over the ball (a quarter of a mesh edge)")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
@@ -138,11 +132,11 @@ class Bench:
             "failures": [],
         }
 
-    def _attempt(self, what: str, work: Callable[..., Any], *given: Any, **more: Any) -> Any:
+    def _attempt(self, what: str, work: Callable[..., Any], *arguments: Any, **more: Any) -> Any:
         """Perform a measurement; prints a line and returns None if it fails."""
         print(f"bench: {what}", file=sys.stderr, flush=True)
         try:
-            return work(*given, **more)
+            return work(*arguments, **more)
         except Failed as error:
             line = f"{what}: {error}"
             self.results["failures"].append(line)
@@ -179,8 +173,8 @@ class Bench:
             for method, ranks in itertools.product(METHODS, asked.ranks):
                 self._add("rows", self._row(vertices, method, ranks))
             for name, command in asked.peers:
-                what, given = f"{vertices} vertices, peer {name}", (name, command, vertices)
-                self._measure("rows", what, measures.peer_row, *given, self._folder, asked.limits)
+                peer = name, command, vertices, self._folder, asked.limits
+                self._measure("rows", f"{vertices} vertices, peer {name}", measures.peer_row, *peer)
         self._growth()
         if asked.presets is not None:
             self._presets()
@@ -190,30 +184,31 @@ class Bench:
             self._single_numbers()
         self.save()
 
-    def _add(self, where: str, found: Any) -> None:
-        if found is not None:
-            self.results.setdefault(where, []).append(found)
-            self.results["versions"] |= found.get("versions", {})
+    def _add(self, where: str, row: Any) -> None:
+        if row is not None:
+            self.results.setdefault(where, []).append(row)
+            self.results["versions"] |= row.get("versions", {})
             self.save()
 
-    def _measure(self, where: str, what: str, work: Callable[..., Any], *given: Any) -> None:
-        self._add(where, self._attempt(what, work, *given))
+    def _measure(self, where: str, what: str, work: Callable[..., Any], *arguments: Any) -> None:
+        self._add(where, self._attempt(what, work, *arguments))
 
     def _compare(self) -> None:
         """Measure what was requested of: bending models, another checkout, contact."""
         asked, petsc, folder, limits = self._asked, self._petsc, self._folder, self._asked.limits
-        methods, each = METHODS, itertools.product
-        for kind, method, ranks, n in each(asked.bending or (), methods, asked.ranks, asked.vertices):
+        product = itertools.product
+        for kind, method, ranks, n in product(asked.bending or (), METHODS, asked.ranks, asked.vertices):
             what = f"{n} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
             self._measure("bending", what, measures.bending, kind, n, method, ranks, petsc, folder, limits)
-        for ranks, n, kind, method in each(asked.ranks, asked.vertices, PLAIN_MESHES, methods):
+        for ranks, n, kind, method in product(asked.ranks, asked.vertices, PLAIN_MESHES, METHODS):
             if asked.against is not None:
                 what = f"{n} vertices, {kind}, {method}, {ranks} rank(s), here and in {asked.against}"
-                given = kind, n, method, ranks, petsc, folder, limits, asked.against
-                self._measure("against", what, measures.against, *given)
-        for n, ranks in each(asked.vertices, asked.ranks) if asked.contact else ():
-            given = n, ranks, petsc, limits, asked.settle, asked.scenes, asked.gap
-            self._measure("contact", f"{n} vertices in contact, {ranks} rank(s)", measures.contact, *given)
+                pair = kind, n, method, ranks, petsc, folder, limits, asked.against
+                self._measure("against", what, measures.against, *pair)
+        for n, ranks in product(asked.vertices, asked.ranks) if asked.contact else ():
+            what = f"{n} vertices in contact, {ranks} rank(s)"
+            chosen = asked.settle, asked.scenes, asked.gap
+            self._measure("contact", what, measures.contact, n, ranks, petsc, limits, *chosen)
 
     def _scaling(self) -> None:
         """Measure other meshes, weak scaling, and independent sheets."""
@@ -234,9 +229,9 @@ class Bench:
         for vertices in self._asked.growth:
             if square_number(vertices) in [row["vertices"] for row in known]:
                 continue
-            found = self._row(vertices, METHODS[0], 1)
-            self._add("growth_rows", found)
-            rows += [found] if found else []
+            row = self._row(vertices, METHODS[0], 1)
+            self._add("growth_rows", row)
+            rows += [row] if row else []
             self.results["growth"] = growth(rows)
         self.results["growth"] = growth(rows)
         self.save()
@@ -246,25 +241,24 @@ class Bench:
         classes = measures.PROBLEM_CLASSES
         for name, title, vertices in itertools.product(asked.presets, classes, asked.vertices):
             failures = len(self.results["failures"])
-            found = self._row(vertices, METHODS[0], 1, measures.preset_options(name), **classes[title])
-            if found is None:
+            row = self._row(vertices, METHODS[0], 1, measures.preset_options(name), **classes[title])
+            if row is None:
                 failed = self.results["failures"][failures].rpartition(": ")[2]
-                found = {"vertices": square_number(vertices), "problem": failed}
-            self._add("presets", found | {"preset": name, "problem_class": title})
+                row = {"vertices": square_number(vertices), "problem": failed}
+            self._add("presets", row | {"preset": name, "problem_class": title})
 
     def _single_numbers(self) -> None:
         asked, folder, petsc, limits = self._asked, self._folder, self._petsc, self._asked.limits
         ranks, vertices = asked.ranks[-1], asked.output_vertices
         single = {
-            "overhead": partial(measures.overhead, petsc, limits),
             "output": partial(measures.output, vertices, ranks, petsc, folder, limits),
             "default_scene": partial(measures.default_scene, ranks, petsc, folder, limits, short=asked.quick),
             "start_up": partial(measures.start_up, petsc, folder, limits),
         }
         for name, work in single.items():
-            found = self._attempt(name.replace("_", " "), work)
-            if found is not None:
-                self.results[name] = found
+            result = self._attempt(name.replace("_", " "), work)
+            if result is not None:
+                self.results[name] = result
                 self.save()
 
 

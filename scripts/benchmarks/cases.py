@@ -1,4 +1,4 @@
-"""Scenes of the benchmark: a square of gray interlock hung by two corners, a small sheet, and contact."""
+"""Scenes of the benchmark: a square of gray interlock hung by two corners, and contact."""
 
 from __future__ import annotations
 
@@ -99,14 +99,6 @@ def square_script(vertices: int, ratio: float) -> str:
     lower = math.sqrt(2.0 / (math.sqrt(3.0) * ratio * vertices))
     sizes = (lower, lower, ratio * lower, ratio * lower)
     return rectangle_script(1.0, 1.0, sizes) + 'Physical Point("held") = {3, 4};\n'
-
-
-def small_sheet() -> dict[str, Any]:
-    """A sheet of 100 triangles, for the overhead of a step."""
-    scene = hanging_square(36)
-    scene["mesh"] = {"grid": {"width": 0.5, "height": 1.0, "nx": 5, "ny": 10}}
-    scene["handles"] = [{"nodes": [60, 65]}]
-    return scene
 
 
 SHEETS = 5

@@ -20,7 +20,6 @@ from cases import (
     hanging_square,
     in_contact,
     on_mesh,
-    small_sheet,
     square_number,
 )
 from peers import measure_peer
@@ -71,8 +70,8 @@ def row(
 
 def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
     """Measure steps of independent sheets, one a rank at the same time, each of vertices / ranks vertices."""
-    found = _steps("apart", hanging_square(vertices // ranks), ranks, petsc, limits)
-    return found | {"whole_vertices": square_number(vertices)}
+    apart = _steps("apart", hanging_square(vertices // ranks), ranks, petsc, limits)
+    return apart | {"whole_vertices": square_number(vertices)}
 
 
 def _steps(
@@ -99,12 +98,12 @@ def bending(
         scenes = {model: on_mesh(f"{kind}, {model}", vertices, scratch) for model in BENDING_MODELS}
         for scene in scenes.values():
             scene["time"]["integrator"] = method
-        found = measure("meshes", ranks, petsc, 2.0 * limits.process, scenes=scenes, **few)
+        both = measure("meshes", ranks, petsc, 2.0 * limits.process, scenes=scenes, **few)
         few = {"warm_up": 1, "steps": 1, "seconds": 1.0}
         for model, scene in scenes.items():
             alone = measure("steps", ranks, petsc, limits.process, scene=scene, **few)
-            found["meshes"][model]["peak_bytes"] = sum(alone["peak_bytes"])
-    return found | {"mesh": kind, "who": method, "ranks": ranks}
+            both["meshes"][model]["peak_bytes"] = sum(alone["peak_bytes"])
+    return both | {"mesh": kind, "who": method, "ranks": ranks}
 
 
 def against(
@@ -129,9 +128,9 @@ def against(
         for number in range(PAIRS):
             both = [("here", HERE), ("other", other)]
             for name, program in both if number % 2 == 0 else reversed(both):
-                found = measure("steps", ranks, petsc, limits.process, program=program, scene=scene, **few)
-                kept = {"peak_bytes": sum(found["peak_bytes"]), "set_up_seconds": found["set_up_seconds"]}
-                runs[name].append({"steps": found["steps"], "vertices": found["vertices"], **kept})
+                run = measure("steps", ranks, petsc, limits.process, program=program, scene=scene, **few)
+                kept = {key: run[key] for key in ("steps", "vertices", "set_up_seconds")}
+                runs[name].append(kept | {"peak_bytes": sum(run["peak_bytes"])})
     return {"mesh": kind, "who": method, "ranks": ranks, **runs}
 
 
@@ -141,31 +140,28 @@ def contact(
     petsc: Sequence[str],
     limits: Limits,
     settle: float,
-    only: Sequence[str],
-    ball_gap: float | None = None,
+    words: Sequence[str],
+    ball_gap: float | None,
 ) -> Result:
     """Measure steps of sheets in contact and of swinging sheets, by turns, after ``settle`` simulated
-    seconds.
-
-    With words ``only``, those scenes whose names contain one of them; over a ball with ``ball_gap`` [m].
+    seconds: of all scenes, or of those whose names contain one of ``words``; with ``ball_gap`` [m] if given.
     """
     few = {"warm_up": max(WARM_UP, round(settle / STEP)), "steps": limits.steps, "seconds": math.inf}
     scenes = in_contact(vertices, ball_gap)
-    scenes = {name: scenes[name] for name in scenes if not only or any(word in name for word in only)}
-    found = measure("meshes", ranks, petsc, 100 * limits.process, scenes=scenes, **few)
-    return found | {"ranks": ranks}
+    scenes = {name: scenes[name] for name in scenes if not words or any(word in name for word in words)}
+    return measure("meshes", ranks, petsc, 100 * limits.process, scenes=scenes, **few) | {"ranks": ranks}
 
 
 def first_method(rows: Sequence[Result]) -> list[Result]:
     """The rows of the first method on one rank."""
-    return [found for found in rows if found["who"] == METHODS[0] and found["ranks"] == 1]
+    return [row for row in rows if row["who"] == METHODS[0] and row["ranks"] == 1]
 
 
 def peer_row(name: str, command: str, vertices: int, folder: Path, limits: Limits) -> Result:
     """Measure the time per step of another program on the same scene; its files stay in ``folder``."""
     size = square_number(vertices)
-    found = measure_peer(command, folder / "peers" / str(size), size, limits)
-    return {"vertices": size, "who": name, "ranks": 1, "command": command, **found}
+    seconds = measure_peer(command, folder / "peers" / str(size), size, limits)
+    return {"vertices": size, "who": name, "ranks": 1, "command": command, **seconds}
 
 
 def preset_names(names: Sequence[str]) -> list[str]:
@@ -188,13 +184,6 @@ def preset_options(name: str) -> list[str]:
         text = str(value).lower() if isinstance(value, bool) else value
         words += [f"-{option}", *([] if text is None else [str(text)])]
     return words
-
-
-def overhead(petsc: Sequence[str], limits: Limits) -> Result:
-    """Measure steps per second of 100 triangles."""
-    return measure(
-        "overhead", 1, petsc, limits.process, scene=small_sheet(), warm_up=100, steps=200, blocks=5
-    )
 
 
 @contextmanager

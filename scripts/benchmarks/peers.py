@@ -107,7 +107,7 @@ def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> d
     return {
         "step_seconds": [max(0.0, after.wall - before.wall) / steps for before, after in pairs],
         "cpu_seconds": [max(0.0, after.cpu - before.cpu) / steps for before, after in pairs],
-        "short_seconds": [each.wall for each in short],
-        "long_seconds": [each.wall for each in long],
+        "short_seconds": [spent.wall for spent in short],
+        "long_seconds": [spent.wall for spent in long],
         "further_steps": steps,
     }

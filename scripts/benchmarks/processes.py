@@ -138,5 +138,5 @@ def measure(
         job_file.write_text(json.dumps({"kind": kind, **job}), encoding="utf-8")
         words = [sys.executable, str(program / WORKER), str(job_file), str(result), *petsc]
         run([*find_launcher(ranks), *words], limit, program=program)
-        found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
-    return found
+        measured: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+    return measured

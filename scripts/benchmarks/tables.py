@@ -65,7 +65,7 @@ def main_table(rows: Sequence[Result]) -> list[str]:
     cells = [_main_row(row, first.get(row["vertices"])) for row in ordered]
     # the first row may be a peer's, which has fewer columns
     columns: Row = dict.fromkeys(max(cells, key=len), "–")
-    return table([columns | each for each in cells])
+    return table([columns | row for row in cells])
 
 
 def _main_row(row: Result, first: Result | None) -> Row:
@@ -89,7 +89,9 @@ def _main_row(row: Result, first: Result | None) -> Row:
     assembly = [step["assembly"] for step in row["steps"]]
     for whose, times in (("", row["matmult_seconds"]), ("PETSc's ", row["petsc_matmult_seconds"])):
         cells[f"{whose}MatMult ms"] = spread(times, 1e3)
-        cells[f"assembly, {whose}MatMults"] = spread([each / statistics.median(times) for each in assembly])
+        cells[f"assembly, {whose}MatMults"] = spread(
+            [seconds / statistics.median(times) for seconds in assembly]
+        )
     return cells | {
         "CG iterations": number(median_of(row, "cg")),
         "Newton iterations": number(median_of(row, "newton")),
@@ -99,9 +101,9 @@ def _main_row(row: Result, first: Result | None) -> Row:
     }
 
 
-def cpu_per_vertex(found: Result) -> float:
+def cpu_per_vertex(row: Result) -> float:
     """CPU seconds of a step over the number of vertices."""
-    return median_of(found, "cpu") / found["vertices"]
+    return median_of(row, "cpu") / row["vertices"]
 
 
 def contact_table(results: Sequence[Result]) -> list[str]:
@@ -109,26 +111,26 @@ def contact_table(results: Sequence[Result]) -> list[str]:
     rows = []
     for result in results:
         base: Result = {}
-        for name, found in result["meshes"].items():
-            base = found if "swing" in name and "near" not in name else base
+        for name, steps in result["meshes"].items():
+            base = steps if "swing" in name and "near" not in name else base
             row = {
-                "vertices": str(found["vertices"]),
+                "vertices": str(steps["vertices"]),
                 "ranks": str(result["ranks"]),
                 "sheets": name,
-                "CPU ms a step": spread([step["cpu"] for step in found["steps"]], 1e3),
-                "wall ms a step": spread([step["seconds"] for step in found["steps"]], 1e3),
+                "CPU ms a step": spread([step["cpu"] for step in steps["steps"]], 1e3),
+                "wall ms a step": spread([step["seconds"] for step in steps["steps"]], 1e3),
                 "CPU, times those that swing": "",
                 "the whole run": "",
-                "Newton iterations": number(median_of(found, "newton")),
-                "CG iterations": number(median_of(found, "cg")),
+                "Newton iterations": number(median_of(steps, "newton")),
+                "CG iterations": number(median_of(steps, "cg")),
                 "times those that swing": "",
-                "preset": found["preset"],
+                "preset": steps["preset"],
             }
             if base and base["all_cpu"] > 0.0:
-                ratios = [a["cpu"] / b["cpu"] for a, b in zip(found["steps"], base["steps"], strict=False)]
+                ratios = [a["cpu"] / b["cpu"] for a, b in zip(steps["steps"], base["steps"], strict=False)]
                 row["CPU, times those that swing"] = spread(ratios)
-                row["the whole run"] = number(found["all_cpu"] / base["all_cpu"])
-                cg = median_of(found, "cg") / max(1.0, median_of(base, "cg"))
+                row["the whole run"] = number(steps["all_cpu"] / base["all_cpu"])
+                cg = median_of(steps, "cg") / max(1.0, median_of(base, "cg"))
                 row["times those that swing"] = number(cg)
             rows.append(row)
     return [*table(rows), *_growth_of_contact(results)]
@@ -161,19 +163,19 @@ def meshes_table(results: Sequence[Result]) -> list[str]:
     rows, slowest, first = [], (0.0, ""), next(iter(results[0]["meshes"]))
     for result in results:
         base = cpu_per_vertex(result["meshes"][first])
-        for kind, found in result["meshes"].items():
-            ratio = cpu_per_vertex(found) / base
-            slowest = max(slowest, (ratio, f"{kind}, {found['vertices']} vertices"))
+        for kind, steps in result["meshes"].items():
+            ratio = cpu_per_vertex(steps) / base
+            slowest = max(slowest, (ratio, f"{kind}, {steps['vertices']} vertices"))
             rows.append(
                 {
-                    "vertices": str(found["vertices"]),
+                    "vertices": str(steps["vertices"]),
                     "mesh": kind,
-                    "CPU ms a step": spread([step["cpu"] for step in found["steps"]], 1e3),
-                    "µs a vertex": number(1e6 * cpu_per_vertex(found)),
+                    "CPU ms a step": spread([step["cpu"] for step in steps["steps"]], 1e3),
+                    "µs a vertex": number(1e6 * cpu_per_vertex(steps)),
                     f"times {first}": number(ratio),
-                    "CG iterations": number(median_of(found, "cg")),
-                    "preset": found["preset"],
-                    "set-up CPU s": number(found["set_up_cpu"]),
+                    "CG iterations": number(median_of(steps, "cg")),
+                    "preset": steps["preset"],
+                    "set-up CPU s": number(steps["set_up_cpu"]),
                 }
             )
     ratio, where = slowest
@@ -190,9 +192,9 @@ def bending_table(results: Sequence[Result]) -> list[str]:
         cpu, wall = (
             statistics.median(two[key] / one[key] for one, two in pairs) for key in ("cpu", "seconds")
         )
-        cg = [statistics.mean(step["cg"] for step in found["steps"]) for found in (hinge, midedge)]
+        cg = [statistics.mean(step["cg"] for step in model["steps"]) for model in (hinge, midedge)]
         first = least.setdefault((result["mesh"], result["who"], result["ranks"]), cg[1])
-        newton = [median_of(found, "newton") for found in (hinge, midedge)]
+        newton = [median_of(model, "newton") for model in (hinge, midedge)]
         rows.append(
             {
                 "vertices": str(midedge["vertices"]),
@@ -262,14 +264,14 @@ def growth(rows: Sequence[Result]) -> Result:
     }
 
 
-def growth_lines(found: Result) -> list[str]:
-    if not math.isfinite(found["step"]):
+def growth_lines(exponents: Result) -> list[str]:
+    if not math.isfinite(exponents["step"]):
         return [f"Growth needs two sizes of {GROWTH_FROM} vertices or more: --vertices or --growth."]
-    sizes = ", ".join(map(str, found["vertices"]))
+    sizes = ", ".join(map(str, exponents["vertices"]))
     return [
         f"Exponent of growth over {sizes} vertices, first method, one rank: time per step "
-        f"{number(found['step'])}, assembly {number(found['assembly'])}, CG iterations "
-        f"{number(found['cg_iterations'])}, memory {number(found['memory'])}."
+        f"{number(exponents['step'])}, assembly {number(exponents['assembly'])}, CG iterations "
+        f"{number(exponents['cg_iterations'])}, memory {number(exponents['memory'])}."
     ]
 
 
@@ -295,27 +297,27 @@ def weak_table(rows: Sequence[Result]) -> list[str]:
 def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
     """Table of the speed-up on several ranks, and of that of independent sheets, its bound."""
 
-    def cells(found: Result) -> Row:
+    def cells(sheets: Result) -> Row:
         same = [
-            row for row in rows if row["who"] == METHODS[0] and row["vertices"] == found["whole_vertices"]
+            row for row in rows if row["who"] == METHODS[0] and row["vertices"] == sheets["whole_vertices"]
         ]
         alone, together = (
             next((median_of(row, "seconds") for row in same if row["ranks"] == ranks), math.nan)
-            for ranks in (1, found["ranks"])
+            for ranks in (1, sheets["ranks"])
         )
-        best = statistics.median(found["step_seconds"])
+        best = statistics.median(sheets["step_seconds"])
         return {
-            "vertices": str(found["whole_vertices"]),
-            "ranks": str(found["ranks"]),
+            "vertices": str(sheets["whole_vertices"]),
+            "ranks": str(sheets["ranks"]),
             "ms a step, one rank": number(1e3 * alone),
             "all ranks": number(1e3 * together),
             "times as fast": number(alone / together),
-            "sheets apart": f"{found['ranks']} × {found['vertices']}",
-            "ms a step": spread(found["step_seconds"], 1e3),
+            "sheets apart": f"{sheets['ranks']} × {sheets['vertices']}",
+            "ms a step": spread(sheets["step_seconds"], 1e3),
             "times as fast, at best": number(alone / best),
         }
 
-    return table([cells(found) for found in apart])
+    return table([cells(sheets) for sheets in apart])
 
 
 def presets_table(rows: Sequence[Result]) -> list[str]:
@@ -371,23 +373,18 @@ def document(results: Result) -> str:
 
 
 def _single_numbers(results: Result) -> Iterable[tuple[str, str]]:
-    if "overhead" in results:
-        found = results["overhead"]
-        rates = found["steps_a_second"]
-        yield f"steps a second, {found['triangles']} triangles ({found['preset']})", spread(rates)
-        yield "ms a Newton iteration there", spread([1e3 / rate / found["newton"] for rate in rates])
     if "output" in results:
-        found = results["output"]
-        ours, plain = found["states_bytes_a_second"], found["plain_bytes_a_second"]
-        size = f"{number(found['bytes'] / 1e6)} MB each, {found['ranks']} rank(s)"
+        result = results["output"]
+        ours, plain = result["states_bytes_a_second"], result["plain_bytes_a_second"]
+        size = f"{number(result['bytes'] / 1e6)} MB each, {result['ranks']} rank(s)"
         yield f"states, MB/s ({size})", spread(ours, 1e-6)
         yield "plain files of that size, MB/s", spread(plain, 1e-6)
         ratios = [mine / theirs for mine, theirs in zip(ours, plain, strict=True)]
         yield "states over plain files", spread(ratios)
     if "default_scene" in results:
-        found = results["default_scene"]
-        yield f"{found['what']}, {found['ranks']} rank(s), s", number(found["seconds"])
-        yield "share of its output", f"{100 * found['output_share']:.2g} %"
+        result = results["default_scene"]
+        yield f"{result['what']}, {result['ranks']} rank(s), s", number(result["seconds"])
+        yield "share of its output", f"{100 * result['output_share']:.2g} %"
     if "start_up" in results:
-        found = results["start_up"]
-        yield f"{found['what']}, start to end of the process, s", spread(found["seconds"])
+        result = results["start_up"]
+        yield f"{result['what']}, start to end of the process, s", spread(result["seconds"])

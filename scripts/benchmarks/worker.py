@@ -60,7 +60,7 @@ def resident() -> tuple[int, int]:
     """Current and peak resident memory of this process [bytes] (Linux)."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     now_and_peak = [re.search(rf"^{name}:\s+(\d+) kB", status, re.M) for name in ("VmRSS", "VmHWM")]
-    current, peak = (1024 * int(found[1]) if found else 0 for found in now_and_peak)
+    current, peak = (1024 * int(line[1]) if line else 0 for line in now_and_peak)
     return current, peak
 
 
@@ -75,11 +75,11 @@ def reset_peak() -> None:
 def events(comm: Comm) -> dict[str, tuple[float, int]]:
     """Seconds (mean over ranks) and number of calls of each of `PARTS` so far."""
     stage = phases.STAGES["solve"].id
-    found = {}
+    totals = {}
     for part, name in PARTS.items():
         info = PETSc.Log.Event(name).getPerfInfo(stage)
-        found[part] = (comm.allreduce(info["time"]) / comm.size, int(info["count"]))
-    return found
+        totals[part] = (comm.allreduce(info["time"]) / comm.size, int(info["count"]))
+    return totals
 
 
 def matrix_product(comm: Comm, matrix: PETSc.Mat) -> list[float]:
@@ -166,14 +166,14 @@ def meshes(comm: Comm, job: Result) -> Result:
 
     ``scenes`` by name; ``warm_up``, ``steps`` and ``seconds`` as for `steps`.
     """
-    simulations, found = {}, {}
+    simulations, results = {}, {}
     for name, scene in job["scenes"].items():
         began = time.process_time()
         simulation = SteppedScene(comm, Scene.model_validate(scene))
         simulation.problem.release()
         simulation.step()
         simulations[name] = simulation
-        found[name] = {
+        results[name] = {
             "vertices": simulation.problem.whole.n_vertices,
             "preset": simulation.stepper.preset,
             "set_up_cpu": comm.allreduce(time.process_time() - began),
@@ -188,41 +188,22 @@ def meshes(comm: Comm, job: Result) -> Result:
             report = simulation.step()
             cpu = comm.allreduce(time.process_time() - began)
             wall = comm.bcast(now(comm) - wall)
-            found[name]["all_cpu"] = found[name].get("all_cpu", 0.0) + cpu
+            results[name]["all_cpu"] = results[name].get("all_cpu", 0.0) + cpu
             if number >= job["warm_up"]:
                 iterations = {"cg": report.linear_iterations, "newton": report.newton_iterations}
-                found[name]["steps"].append({"cpu": cpu, "seconds": wall, **iterations})
+                results[name]["steps"].append({"cpu": cpu, "seconds": wall, **iterations})
         enough = number >= job["warm_up"] - 1 + MIN_STEPS
         if comm.bcast(time.perf_counter() - first > job["seconds"] and enough):
             break
-    return {"meshes": found}
+    return {"meshes": results}
 
 
 def apart(comm: Comm, job: Result) -> Result:
     """Measure steps of independent sheets, one a rank, at the same time."""
     own = steps(MPI.COMM_SELF, job)
     gathered = comm.gather([row["seconds"] for row in own["steps"]])
-    seconds = [each for of_rank in gathered or [] for each in of_rank]
+    seconds = [step for of_rank in gathered or [] for step in of_rank]
     return {"vertices": own["vertices"], "step_seconds": seconds}
-
-
-def overhead(comm: Comm, job: Result) -> Result:
-    """Measure steps per second in ``blocks`` blocks of ``steps`` steps, without logging."""
-    simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
-    for _ in range(job["warm_up"]):
-        simulation.step()
-    rates, newton = [], 0
-    for _ in range(job["blocks"]):
-        began = now(comm)
-        for _ in range(job["steps"]):
-            newton += simulation.step().newton_iterations
-        rates.append(job["steps"] / (now(comm) - began))
-    return {
-        "triangles": simulation.problem.whole.n_triangles,
-        "preset": simulation.stepper.preset,
-        "newton": newton / (job["steps"] * job["blocks"]),
-        "steps_a_second": rates,
-    }
 
 
 def output(comm: Comm, job: Result) -> Result:
@@ -263,7 +244,7 @@ def _write_plain(path: Path, block: bytes) -> None:
         os.fsync(file.fileno())
 
 
-KINDS = {"steps": steps, "meshes": meshes, "apart": apart, "overhead": overhead, "output": output}
+KINDS = {"steps": steps, "meshes": meshes, "apart": apart, "output": output}
 
 
 def main() -> None:

@@ -108,11 +108,11 @@ _DEFAULTS = {
 
 def options_read() -> set[str]:
     """Names of the PETSc options that the program itself reads."""
-    found = set()
+    names = set()
     for path in (ROOT / "lyra_petsc").rglob("*.py"):
         for match in _READ.finditer(path.read_text(encoding="utf-8")):
-            found.add(match[1] or match[2])
-    return found
+            names.add(match[1] or match[2])
+    return names
 
 
 # -- scene -------------------------------------------------------------------------------------------

@@ -30,21 +30,3 @@ def test_every_named_test_exists(mutate: ModuleType) -> None:
         file, _, name = test.rpartition("@")[2].partition("::")
         text = (mutate.ROOT / file).read_text(encoding="utf-8")
         assert not name or f"\ndef {name.partition('[')[0]}(" in text, test
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "code"), [("value = 1", "value = 2", 0), ("unused = 3", "unused = 4", 1)]
-)
-def test_mutations_that_are_noticed(
-    old: str, new: str, code: int, mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "code.py").write_text("value = 1\nunused = 3\n")
-    (tmp_path / "test_code.py").write_text(
-        "from pathlib import Path\n"
-        "def test(): assert 'value = 1' in Path(__file__).with_name('code.py').read_text()\n"
-    )
-    monkeypatch.setattr(mutate, "ROOT", tmp_path)
-    monkeypatch.setattr(mutate, "CHANGES", [mutate.Change("code.py", old, new, ("test_code.py",))])
-    monkeypatch.setattr(sys, "argv", ["mutate.py"])
-    assert mutate.main() == code
-    assert (tmp_path / "code.py").read_text() == "value = 1\nunused = 3\n"
