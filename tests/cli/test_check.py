@@ -79,17 +79,6 @@ def test_pieces_and_the_gap_that_follows_the_mesh(tmp_path: Path) -> None:
     assert "gap 0.02845 m by the mesh, thickness 0 m" in plan
 
 
-def test_obstacles_without_contact_are_refused(tmp_path: Path) -> None:
-    """On every rank, with the line to add to the scene."""
-    text = MEMBRANE + CONTACT.replace("contact: {gap: 0.01, friction: {static: 0.4, kinetic: 0.3}}", "")
-    (tmp_path / "floor.yaml").write_text(text)
-    result = lyra(["check", "floor.yaml"], tmp_path, ranks=2)
-    assert result.code == 2
-    assert result.err.count("add the line 'contact: {friction: 0.3}'") == 1
-    (tmp_path / "floor.yaml").write_text(text + "contact: {friction: 0.3}\n")
-    assert lyra(["check", "floor.yaml"], tmp_path).code == 0
-
-
 SQUARE = """
 Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
 Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
@@ -263,17 +252,3 @@ def test_what_of_another_program_has_no_effect_is_noted(tmp_path: Path) -> None:
     left = done(["run", "conf.json", "--out", "out"], tmp_path)
     assert "note: cloths[0].remeshing: no effect here" in left.err
     assert "obstacle0" in (tmp_path / "out" / "obstacles.csv").read_text()
-
-
-def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:
-    program = (
-        "import sys; from lyra_petsc.cli.app import run_command_line; code = run_command_line(sys.argv);"
-        "print('LOADED', *sorted(m for m in sys.modules if m.startswith('lyra_petsc.terms.')));"
-        "sys.exit(code)"
-    )
-    left = done(["check", write_scene(tmp_path, MEMBRANE)], tmp_path, program=("-c", program))
-    # PETSc may say more when it ends: to it -c is an option that nothing used
-    loaded = left.out.split("LOADED")[1].splitlines()[0].split()
-    names = {name.removeprefix("lyra_petsc.terms.") for name in loaded}
-    assert {"membrane", "membrane_laws.stvk"} <= names
-    assert not names & {"bending", "contact", "loads", "handles.spring"}

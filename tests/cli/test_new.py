@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from launch import ROOT, done, lyra
+from launch import ROOT, done
 
 from lyra_petsc.scene.json_schema import FILE
 from lyra_petsc.scene.load import load_scene
@@ -106,8 +106,3 @@ def test_completion_in_the_shell(words: str, offered: str, tmp_path: Path) -> No
     left = done([], tmp_path, extra={**asked, "COMP_CWORD": str(len(words.split()) - 1)})
     assert left.out.strip() == offered
     assert left.err == ""
-
-
-def test_completion_script_for_bash(tmp_path: Path) -> None:
-    left = lyra([], tmp_path, extra={"_LYRA_PETSC_COMPLETE": "bash_source"})
-    assert "complete -o nosort -F _lyra_petsc_completion lyra-petsc" in left.out

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from launch import SCENE, Left, done, lyra, read_csv, read_json, refused, write_scene
+from launch import SCENE, Left, done, lyra, read_csv, read_json, write_scene
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -31,11 +31,6 @@ def test_monitors_print_and_a_direct_solver_is_used(tmp_path: Path) -> None:
 def test_unused_options_are_one_warning(tmp_path: Path) -> None:
     left = ran(tmp_path, "-ksp_typo", "3", "-nonsense", ranks=2)
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo, -nonsense"]
-
-
-def test_an_unused_option_of_the_scene_is_named_too(tmp_path: Path) -> None:
-    left = ran(tmp_path, scene=SCENE + "petsc: {ksp_typo: 3}\n")
-    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo"]
 
 
 def unknown_options(text: str) -> list[str]:
@@ -192,8 +187,3 @@ def test_the_command_line_overrides_the_environment_which_overrides_the_scene(tm
         3,
         pytest.approx(0.002),
     )
-
-
-def test_options_in_files_are_refused_like_those_of_the_command_line(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("-ksp_rtol 1e-6  # and then\n-fp_trap\n")
-    refused(["info", "--petscrc=mine"], tmp_path, "--petscrc: mine: -fp_trap: ends Python")

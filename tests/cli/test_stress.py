@@ -14,7 +14,6 @@ from launch import (
     lyra,
     read_csv,
     read_json,
-    refused,
     start,
     wait_until,
     write_scene,
@@ -79,13 +78,6 @@ def test_a_given_scene_runs_the_cases_that_apply_to_it(tmp_path: Path, ranks: in
     assert list(content["left_out"]) == ["slivers"]
 
 
-def test_a_second_call_uses_another_folder(tmp_path: Path) -> None:
-    (tmp_path / "stress" / "scene").mkdir(parents=True)
-    (tmp_path / "stress" / "scene" / "stress.csv").write_text("")
-    done(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path, extra=PLAIN)
-    assert (tmp_path / "stress" / "scene-2" / "stress.csv").exists()
-
-
 def test_a_failed_verdict_is_exit_code_1(tmp_path: Path) -> None:
     # steps that stop at a tenth of their first residual violate the scene's tolerances
     left = lyra(["stress", "--quick", *TWO, "--out", "out", "-snes_rtol", "0.1"], tmp_path, extra=PLAIN)
@@ -121,11 +113,6 @@ def test_ranks_option_starts_mpirun(tmp_path: Path) -> None:
     assert [len(case["newton_iterations"]) for case in content["cases"]] == [20]
 
 
-def test_ranks_option_under_mpirun_is_refused(tmp_path: Path) -> None:
-    refused(["stress", "--quick", "--ranks", "2"], tmp_path, "--ranks", ranks=2)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_signal_ends_the_command_between_cases(tmp_path: Path) -> None:  # SIGINT: see the tests of verify
     process = start(["stress", "--only", "one-triangle,rigid-plate", "--out", "out"], tmp_path)
     wait_until((tmp_path / "out" / "stress.json").exists, process)
@@ -137,17 +124,3 @@ def test_a_signal_ends_the_command_between_cases(tmp_path: Path) -> None:  # SIG
     assert content["complete"] is False
     assert [case["name"] for case in content["cases"]] == ["one-triangle"]
     assert "one-triangle" in (tmp_path / "out" / "report.md").read_text()
-
-
-def test_petsc_options_are_passed_on_and_unused_ones_reported(tmp_path: Path) -> None:
-    left = lyra(
-        ["stress", "--quick", "--only", "one-triangle", "-pc_type", "lu", "-snes_typo", "1", "--out", "out"],
-        tmp_path,
-        extra=PLAIN,
-    )
-    assert left.code == 0, left.err + left.out
-    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
-    rows = read_csv(tmp_path / "out" / "stress.csv")
-    # a direct solver takes an iteration or two where the default takes tens
-    for row in rows:
-        assert int(row["linear_iterations"]) < 5 * 40 * float(row["newton_worst"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import math
-import os
 import re
 import signal
 from pathlib import Path
@@ -260,27 +259,3 @@ def test_an_existing_run_as_reference(tmp_path: Path) -> None:
 def test_bad_input_is_one_line_without_files(tmp_path: Path, words: list[str], because: str) -> None:
     write_scene(tmp_path, HANGING)
     refused(["study", "scene.yaml", *words], tmp_path, because)
-
-
-def test_bad_input_on_two_ranks_is_one_line(tmp_path: Path) -> None:
-    write_scene(tmp_path, HANGING)
-    refused(["study", "scene.yaml", "--vary", "dt=0.01,0.01"], tmp_path, "twice", ranks=2)
-
-
-def test_a_run_imports_no_module_of_studies(tmp_path: Path) -> None:
-    write_scene(tmp_path, HANGING)
-    program = (
-        "import sys; from lyra_petsc.cli.app import run_command_line; code = run_command_line(sys.argv); "
-        "print(sorted({'matplotlib', 'jinja2', 'lyra_petsc.experiments', 'lyra_petsc.show'}"
-        " & set(sys.modules))); sys.exit(code)"
-    )
-    left = done(["run", "scene.yaml"], tmp_path, program=("-c", program))
-    assert left.out.splitlines()[-1] == "[]"
-
-
-def test_help_names_all_options(tmp_path: Path) -> None:
-    left = done(["study", "--help"], tmp_path)
-    for word in ("--vary", "--reference", "--quantities", "--repeats", "--ranks", "--resume", "--force"):
-        assert word in left.out
-    assert "--job" not in left.out
-    assert os.listdir(tmp_path) == []

@@ -9,25 +9,22 @@ from __future__ import annotations
 import gc
 import json
 import os
-import signal
+import resource
 import sys
-import time
 import traceback
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from patience import Patience
-
 os.environ |= {"OMPI_MCA_ess_singleton_isolated": "1"}  # no daemon of Open MPI
-AT_A_TIME = 2
+CPU_SECONDS = 60
 
 
-def start(folder: Path, words: list[str], name: str) -> int:
+def start(folder: Path, words: list[str]) -> int:
     """Fork a process for one run; returns its process number."""
     pid = os.fork()
     if pid:
         return pid
-    for number, path in enumerate(files(folder, name), start=1):
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
+    for number, path in enumerate(files(folder), start=1):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
     code = 70
     try:
@@ -69,34 +66,19 @@ def simulate(scene: Path, words: list[str]) -> int:
     return 0
 
 
-def files(folder: Path, name: str) -> tuple[Path, Path]:
+def files(folder: Path) -> tuple[Path, Path]:
     """Files for stdout and stderr of a run."""
-    return folder / f"{name}.out", folder / f"{name}.err"
+    return folder / "out", folder / "err"
 
 
 def run_all(folder: Path, runs: list[list[str]]) -> list[tuple[int, str, str]]:
-    """Exit code (−1 if it hangs), stdout and stderr of each run; several run at the same time."""
-    waiting = list(enumerate(runs))
-    going: dict[int, tuple[int, Patience]] = {}
-    codes: dict[int, int] = {}
-    while waiting or going:
-        while waiting and len(going) < AT_A_TIME:
-            number, words = waiting.pop(0)
-            going[number] = start(folder, words, f"run{number}"), Patience()
-        for number, (pid, patience) in list(going.items()):
-            ended, status = os.waitpid(pid, os.WNOHANG)
-            late = patience.over
-            if late and not ended:
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-            if ended or late:
-                codes[number] = os.waitstatus_to_exitcode(status) if ended else -1
-                del going[number]
-        time.sleep(0.002)
-    return [
-        (codes[number], *(file.read_text(errors="replace") for file in files(folder, f"run{number}")))
-        for number in range(len(runs))
-    ]
+    """Exit code (negative for a signal, as after too long a time), stdout and stderr of each run."""
+    ended = []
+    for words in runs:
+        pid = start(folder, words)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        ended.append((code, *(file.read_text(errors="replace") for file in files(folder))))
+    return ended
 
 
 def main() -> None:

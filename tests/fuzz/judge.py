@@ -163,8 +163,8 @@ def _wait(pid: int) -> int:
     patience = Patience(WALL_SECONDS)
     pause = 1e-3
     while True:
-        found, status = os.waitpid(pid, os.WNOHANG)
-        if found:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
             return status
         if patience.over:
             os.kill(pid, signal.SIGKILL)

@@ -7,7 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
-from odd_values import listed
+from odd_values import listed, pieces
 from text_damage import damaged
 
 SCENE = """\
@@ -106,61 +106,29 @@ Plane Surface(1) = {1};
 Physical Surface("sheet") = {1};
 Physical Curve("edge") = {4};
 """
-STATEMENTS = [
-    'SystemCall "touch mark";',
-    'NonBlockingSystemCall "touch mark";',
-    'OnelabRun("a", "touch mark");',
-    'Save "mark.msh";',
-    'Print "mark.png";',
-    'Printf("a") > "mark";',
-    'CreateDir "mark";',
-    'Include "mesh.geo";',
-    'Include "part.geo";',
-    'Merge "/etc/hosts.msh";',
-    "Exit;",
-    "Abort;",
-    "Sleep 100;",
-    'Error("no");',
-    'Printf("%g", 1);',
-    "General.AbortOnError = 4;",
-    "General.Verbosity = 99;",
+STATEMENTS = pieces("""
+SystemCall "touch mark"; ¦ NonBlockingSystemCall "touch mark"; ¦ OnelabRun("a", "touch mark"); ¦
+Save "mark.msh"; ¦ Print "mark.png"; ¦ Printf("a") > "mark"; ¦ CreateDir "mark"; ¦ Include "mesh.geo"; ¦
+Include "part.geo"; ¦ Merge "/etc/hosts.msh"; ¦ Exit; ¦ Abort; ¦ Sleep 100; ¦ Error("no"); ¦
+Printf("%g", 1); ¦ General.AbortOnError = 4; ¦ General.Verbosity = 99; ¦ EndIf ¦ Return ¦ Mesh 2; ¦
+RecombineMesh; ¦ Delete Problem; ¦ Delete { Surface{1}; } ¦ NewModel; ¦ MeshSize {1, 2, 3, 4} = 1e-9; ¦
+MeshSize {1} = 0; ¦ Mesh.MeshSizeMax = 1e-7; ¦
+Transfinite Curve {1:4} = 3; Transfinite Surface {1}; Recombine Surface {1}; ¦
+Transfinite Curve {1:4} = 1000000000; ¦ Mesh.ElementOrder = 3; ¦ Mesh.Algorithm = 99; ¦
+Point(1) = {5, 5, 5}; ¦ Point(2147483647) = {0, 0, 0}; ¦ Point(1e300) = {0, 0, 0}; ¦ Line(5) = {1, 99}; ¦
+Curve Loop(2) = {1, 2}; ¦ Plane Surface(2) = {77}; ¦ Physical Curve("") = {1}; ¦
+Extrude {0, 0, 1} { Surface{1}; Layers{2}; } ¦ x() = {}; y = x(3); ¦
+SetFactory("OpenCASCADE"); Disk(7) = {0, 0, 0, 0.5}; ¦
+Field[1] = MathEval; Field[1].F = "x"; Background Field = 1; ¦ a = 1/0; ¦ a[] = LinSpace[0, 1, 1e9]; ¦
+a = Sqrt(-1); Point(9) = {a, a, a, a}; ¦ h = -1; ¦ Rotate {{0, 0, 1}, {0, 0, 0}, 1} { Surface{1}; } ¦
+Dilate {{0, 0, 0}, 0} { Surface{1}; }
+""")
+STATEMENTS += [
     "For i In {0:1e9}\na = i;\nEndFor",
     "For i In {0:3}\nPoint(10 + i) = {i, 2, 0};\nEndFor",
     "Macro f\nCall f;\nReturn\nCall f;",
-    "If (0)\n",
-    "EndIf",
-    "Return",
     'If (0) E" EndIf SystemCall "touch mark"; //"\nEndIf',
-    "Mesh 2;",
-    "RecombineMesh;",
-    "Delete Problem;",
-    "Delete { Surface{1}; }",
-    "NewModel;",
-    "MeshSize {1, 2, 3, 4} = 1e-9;",
-    "MeshSize {1} = 0;",
-    "Mesh.MeshSizeMax = 1e-7;",
-    "Transfinite Curve {1:4} = 3; Transfinite Surface {1}; Recombine Surface {1};",
-    "Transfinite Curve {1:4} = 1000000000;",
-    "Mesh.ElementOrder = 3;",
-    "Mesh.Algorithm = 99;",
-    "Point(1) = {5, 5, 5};",
-    "Point(2147483647) = {0, 0, 0};",
-    "Point(1e300) = {0, 0, 0};",
-    "Line(5) = {1, 99};",
-    "Curve Loop(2) = {1, 2};",
-    "Plane Surface(2) = {77};",
-    'Physical Curve("") = {1};',
-    "Extrude {0, 0, 1} { Surface{1}; Layers{2}; }",
-    "x() = {}; y = x(3);",
-    'SetFactory("OpenCASCADE"); Disk(7) = {0, 0, 0, 0.5};',
-    'Field[1] = MathEval; Field[1].F = "x"; Background Field = 1;',
-    "a = 1/0;",
-    "a[] = LinSpace[0, 1, 1e9];",
-    "a = Sqrt(-1); Point(9) = {a, a, a, a};",
-    "h = -1;",
     'Physical Surface("a\\nb") = {1};',
-    "Rotate {{0, 0, 1}, {0, 0, 0}, 1} { Surface{1}; }",
-    "Dilate {{0, 0, 0}, 0} { Surface{1}; }",
 ]
 
 

@@ -18,6 +18,11 @@ def listed(text: str) -> list[str]:
     return text.split()
 
 
+def pieces(text: str) -> list[str]:
+    """The parts of a text between bars."""
+    return [piece.strip() for piece in text.split("¦")]
+
+
 NUMBERS = listed("""
 0 -0.0 1 -1 2 3 0.5 1e-3 1e3 1e308 -1e308 1.7976931348623157e308 1e309 -1e309 5e-324 2.2e-308 1e-320 1e-160
 1e160 1e-30 1e30 1e15 1e-15 .nan .NaN .inf -.inf 2147483647 2147483648 -2147483648 4294967296
@@ -31,72 +36,26 @@ WORDS = listed(r"""
 "\ud83d\ude00" "\x07" "\e[31m" ünïcödé 日本語 2001-01-01 2001-12-14t21:59:43.10-05:00 2001-13-45 12:30
 ../../etc/passwd /etc/passwd /dev/zero / mesh.obj none.geo - ? % @a `a` * *nowhere &anchor
 """)
-WORDS += [
-    "",
-    '" "',
-    "'" + "x" * 3000 + "'",
-    "|\n  a\n  b",
-    ">\n  a\n  b",
-    "a: b",
-    "- a",
-    "&anchor 1",
-    "!!str 1",
-    "!!int 1.5",
-    "!!int abc",
-    "!!float abc",
-    "!!bool 1",
-    "!!binary aGVsbG8=",
-    "!!binary ?",
-    "!!null ''",
-    "!!timestamp 2001-01-01",
-    "!!timestamp abc",
-    "!!omap [a: 1]",
-    "!!set {a, b}",
-    "!!pairs [a: 1]",
-    "!local 1",
-    "!!python/object/apply:os.system ['touch mark']",
-    "!!python/name:os.system ''",
-    "!<tag:x> 1",
-    "! 1",
-]
+WORDS += pieces(r"""
+" " ¦ a: b ¦ - a ¦ &anchor 1 ¦ !!str 1 ¦ !!int 1.5 ¦ !!int abc ¦ !!float abc ¦ !!bool 1 ¦
+!!binary aGVsbG8= ¦ !!binary ? ¦ !!null '' ¦ !!timestamp 2001-01-01 ¦ !!timestamp abc ¦ !!omap [a: 1] ¦
+!!set {a, b} ¦ !!pairs [a: 1] ¦ !local 1 ¦ !!python/object/apply:os.system ['touch mark'] ¦
+!!python/name:os.system '' ¦ !<tag:x> 1 ¦ ! 1
+""")
+WORDS += ["", "'" + "x" * 3000 + "'", "|\n  a\n  b", ">\n  a\n  b"]
 
-BLOCKS = [
-    "[]",
-    "{}",
-    "[[]]",
-    "[{}]",
-    "{a: 1}",
-    "{1: 2}",
-    "{[1]: 2}",
-    "{? a}",
-    "[1, 2]",
-    "[1, 2, 3]",
-    "[0, 0, 0]",
-    "[a, b, c]",
-    "[1, [2], 3]",
-    "[.nan, 0, 0]",
-    "[1e308, 1e308, 1e308]",
-    "[1e-320, 0, 0]",
-    "[x]",
-    "[x, y, z]",
-    "[x, x]",
-    "[[0, 0, 0], [1, 1, 1]]",
-    "[" + "1, " * 3000 + "1]",
-    "[" * 300 + "]" * 300,
-    "{a: " * 100 + "1" + "}" * 100,
-    "{<<: {a: 1}}",
-    "{<<: [1]}",
-    "{<<: 1}",
-    "{a: 1, a: 2}",
-    "[&a [1, *a]]",
-    "&loop [*loop]",
-    "&b {c: *b}",
-]
+BLOCKS = pieces("""
+[] ¦ {} ¦ [[]] ¦ [{}] ¦ {a: 1} ¦ {1: 2} ¦ {[1]: 2} ¦ {? a} ¦ [1, 2] ¦ [1, 2, 3] ¦ [0, 0, 0] ¦ [a, b, c] ¦
+[1, [2], 3] ¦ [.nan, 0, 0] ¦ [1e308, 1e308, 1e308] ¦ [1e-320, 0, 0] ¦ [x] ¦ [x, y, z] ¦ [x, x] ¦
+[[0, 0, 0], [1, 1, 1]] ¦ {<<: {a: 1}} ¦ {<<: [1]} ¦ {<<: 1} ¦ {a: 1, a: 2} ¦ [&a [1, *a]] ¦
+&loop [*loop] ¦ &b {c: *b}
+""")
+BLOCKS += ["[" + "1, " * 3000 + "1]", "[" * 300 + "]" * 300, "{a: " * 100 + "1" + "}" * 100]
 
 
-def raw(pieces: list[str]) -> st.SearchStrategy[Any]:
-    """One of the pieces, to be written unchanged."""
-    return st.sampled_from([Raw(piece) for piece in pieces])
+def raw(words: list[str]) -> st.SearchStrategy[Any]:
+    """One of the pieces of YAML, to be written unchanged."""
+    return st.sampled_from(list(map(Raw, words)))
 
 
 def anything() -> st.SearchStrategy[Any]:
@@ -156,10 +115,10 @@ def document(blocks: dict[str, Any]) -> str:
 
 def paths_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths of all entries below ``value``."""
-    found = []
+    paths = []
     entries = (
         value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     )
     for key, entry in entries:
-        found += [(*path, key), *paths_of(entry, (*path, key))]
-    return found
+        paths += [(*path, key), *paths_of(entry, (*path, key))]
+    return paths

@@ -1,11 +1,7 @@
-"""Some hundred fuzz cases, always the same; ``scripts/fuzz.py`` runs thousands of others.
-
-Most run in a forked process (`judge`), a sample in the program itself, and a few on two ranks.
-"""
+"""Some hundred fuzz cases, always the same; ``scripts/fuzz.py`` runs thousands of others."""
 
 from __future__ import annotations
 
-import random
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -16,14 +12,11 @@ import pytest
 pytest.importorskip("hypothesis")
 
 from all_cases import KINDS, for_each
-from judge import Case, Outcome, complaint, judge, listing, warm
-from launch import lyra
+from judge import Case, judge, warm
 from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
 from scene_cases import bomb, nested
 
 CASES = 150
-IN_THE_PROGRAM = 5
-ON_TWO_RANKS = 2
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,25 +57,6 @@ def test_each_case_is_a_run_or_one_line(kind: str, tmp_path: Path) -> None:
     assert ran, f"no case ran, of {codes}; the last one printed {outcome.err[-500:]}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_a_sample_in_the_program_itself(ranks: int, tmp_path: Path) -> None:
-    cases = [case for kind in KINDS for case in drawn(kind, 30, seed=21)]
-    number = IN_THE_PROGRAM if ranks == 1 else ON_TWO_RANKS
-    for count, case in enumerate(random.Random(ranks).sample(cases, number)):
-        folder = tmp_path / str(count)
-        folder.mkdir()
-        case.write(folder)
-        before = listing(folder)
-        left = lyra([*case.arguments, "-ts_max_steps", 2], folder, ranks)
-        err = left.err
-        if ranks > 1 and left.code:  # the launcher adds its banner
-            assert len(left.ours) == 1, err
-            err = left.ours[0] + "\n"
-        outcome = Outcome(left.code, left.out, err)
-        assert complaint(outcome, folder, before) == "", f"{folder}: {left.err}"
-
-
 @pytest.mark.parametrize("name", ["obj", "msh2", "msh2-binary", "msh4", "msh4-binary", "geo"])
 def test_the_meshes_before_mutation_are_valid(name: str, fresh: Path) -> None:
     form, _, binary = name.partition("-")
@@ -114,18 +88,3 @@ def test_small_files_with_large_content_are_refused(text: bytes, words: str, fre
     outcome = judge(Case("bomb", {"scene.yaml": text}), fresh)
     assert (outcome.code, outcome.complaint) == (2, ""), outcome.err
     assert words in outcome.line
-
-
-def test_complaints(fresh: Path) -> None:
-    before = listing(fresh)
-    line = "lyra-petsc: scene.yaml: wrong\n"
-    assert complaint(Outcome(2, "", line), fresh, before) == ""
-    assert complaint(Outcome(2, "", line + line), fresh, before) != ""
-    assert complaint(Outcome(2, "words", line), fresh, before) != ""
-    assert complaint(Outcome(70, "", line), fresh, before) == "exit code 70"
-    assert complaint(Outcome(-11, "", ""), fresh, before) == "ended by SIGSEGV"
-    assert complaint(Outcome(0, "", "x.py:1: RuntimeWarning: overflow\n"), fresh, before) != ""
-    assert complaint(Outcome(0, "", ""), fresh, before) == "neither a plan nor results"
-    assert complaint(Outcome(3, "", line), fresh, before) == "no states.xdmf"
-    (fresh / "mark").touch()
-    assert complaint(Outcome(2, "", line), fresh, before) == "bad input, and mark is left"

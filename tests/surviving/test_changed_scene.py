@@ -92,11 +92,6 @@ def test_changed_parameters_are_reported(run: Path) -> None:
     assert announced(run) == pytest.approx([0, 0.02, 0.025, 0.04, 0.05, 0.06])
 
 
-def test_an_unchanged_scene_gives_no_note(run: Path) -> None:
-    left = done(["run", write_scene(run.parent, SCENE), "--out", "out", "--resume"], run.parent)
-    assert "note: " not in left.err
-
-
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2", "midpoint", "semi-implicit"])
 def test_another_integrator_starts_without_past_states(run: Path, integrator: str) -> None:
     left = done(["run", "--out", "out", "--resume", "--set", f"time.integrator={integrator}"], run.parent)
@@ -109,12 +104,6 @@ def test_another_step_length_is_used(run: Path, step: str) -> None:
     done(["run", "--out", "out", "--resume", "--set", f"time.step={step}"], run.parent)
     assert steps(run) == list(range(len(steps(run))))
     assert announced(run) == pytest.approx([0, 0.02, 0.025, 0.04])
-
-
-def test_a_new_handle_with_an_earlier_start_is_reported(run: Path) -> None:
-    handles = "handles=[{nodes: [0, 4]}, {nodes: [24], from: 0.01}]"
-    left = done(["run", "--out", "out", "--resume", "--set", handles], run.parent)
-    assert "handles[1]: absent → " in left.err
 
 
 def test_a_missing_scene_yaml_is_no_obstacle(run: Path) -> None:

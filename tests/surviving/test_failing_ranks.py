@@ -97,13 +97,6 @@ def test_no_memory_left_on_one_rank(tmp_path: Path, place: str, rank: int) -> No
     assert line.endswith("take more memory, more machines or a coarser mesh")
 
 
-def test_an_error_of_the_program_on_one_rank_only(tmp_path: Path) -> None:
-    """The job ends without waiting for the other ranks."""
-    what = "from lyra_petsc.errors import OutputError; raise OutputError('nowhere: cannot be written')"
-    left = job(tmp_path, "a row of the history", what, 1, 2)
-    assert left.code != 0
-
-
 def test_a_petsc_error_on_one_rank_only(tmp_path: Path) -> None:
     """No state can be written, and the message does not promise one."""
     left = job(tmp_path, "residual", "from petsc4py import PETSc; raise PETSc.Error(56)", 1, 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from itertools import cycle
 from pathlib import Path
 
 import pytest
-from launch import PLAIN, ROOT, SCENE, done, lyra, write_scene
+from launch import PLAIN, SCENE, done, lyra, write_scene
 
 OWN = b"the user's own\n"
 
@@ -154,40 +153,3 @@ def test_the_usual_folder_of_a_scene_is_no_link(stranger: Path, own: Path) -> No
     (stranger / "runs" / "scene").symlink_to(own.parent)
     own.rename(own.with_name("scene.yaml"))
     attack(["run", "scene.yaml", "--force"], stranger, own.with_name("scene.yaml"))
-
-
-OPENS = {
-    "output/file_operations.py": "opens",
-    "output/hdf5.py": "a file that was opened there before",
-    "scene/json_schema.py": "the user's cache",
-    "mesh/library_file.py": "a temporary folder",
-    "mesh/library_process.py": "an open file",
-    "experiments/bench.py": "a temporary folder",
-    "show/export.py": "a folder that it has just made",
-    "show/view/live.py": "/proc",
-}
-"""Modules that open files for writing themselves, and where."""
-
-
-def opens_for_writing(call: ast.Call) -> bool:
-    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-    if name in ("write_text", "write_bytes", "touch", "mkstemp"):
-        return True
-    modes = [
-        word.value
-        for word in [*call.args, *(key.value for key in call.keywords)]
-        if isinstance(word, ast.Constant)
-    ]
-    written = any(
-        isinstance(mode, str) and set(mode) <= set("rwaxbt+") and set(mode) & set("wax+") for mode in modes
-    )
-    in_memory = any(key.arg is None for key in call.keywords)  # HDF5's driver without a file
-    return name in ("open", "File", "ZipFile") and written and not in_memory
-
-
-def test_results_are_opened_in_one_place() -> None:
-    package = ROOT / "lyra_petsc"
-    for path in package.rglob("*.py"):
-        if str(path.relative_to(package)) not in OPENS:
-            calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-            assert [call.lineno for call in calls if opens_for_writing(call)] == [], path
