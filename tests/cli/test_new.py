@@ -75,8 +75,8 @@ def test_groups_of_a_mesh_are_listed_and_one_is_held(tmp_path: Path) -> None:
     done(["new", "scenes/sail", "--mesh", "my mesh.geo"], tmp_path)
     text = (tmp_path / "scenes" / "sail.yaml").read_text(encoding="utf-8")
     assert '  #   "the mast"  curve, ' in text
-    assert "  #   head        point, 1 vertex\n" in text
-    assert "  #   sail        surface, " in text
+    assert '  #   "head"  point, vertices: 1\n' in text
+    assert '  #   "sail"  surface, ' in text
     scene = load_scene(tmp_path / "scenes" / "sail.yaml")
     assert scene.mesh[0].file == tmp_path / "scenes" / ".." / "my mesh.geo"
     assert scene.handles[0].group == "the mast"
