@@ -199,4 +199,5 @@ def _solver_options(simulation: SteppedScene) -> str:
     stepper = simulation.stepper
     options = PETSc.Options()
     named = [f"-{name} {options.getString(name, '')}" for name in stepper.our_options]
-    return " ".join(named) or f"-ksp_type {stepper.ksp.getType()} -pc_type {stepper.ksp.getPC().getType()}"
+    ksp = stepper.solver.ksp
+    return " ".join(named) or f"-ksp_type {ksp.getType()} -pc_type {ksp.getPC().getType()}"

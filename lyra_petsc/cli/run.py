@@ -158,7 +158,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def done(self, simulation: SteppedScene, folder: Path) -> None:
         """Print the closing table, and a warning of unused PETSc options."""
-        simulation.stepper.ts.viewFromOptions("-ts_view")
+        simulation.stepper.solver.ts.viewFromOptions("-ts_view")
         outcome = "done"
         if not simulation.at_end:
             now = f"step {simulation.step_number}, t = {simulation.time:g} of {simulation.control.end:g} s"

@@ -86,20 +86,18 @@ class StageForces:
                 yield self._with_square(step, name, self.sum(terms, at.x, step.frozen))
         yield self._with_square(step, "loads", -step.loads.force_at(at.x))
         if self._damping.active:
-            yield self._with_square(step, "damping", self._damping_at(at))
+            yield self._with_square(step, "damping", at.damping)
         if active.viscous and not step.lagged:
             yield self._with_square(step, "wind", self.sum(active.viscous, at.v, step.frozen))
-        if at.internal is None:
-            at.internal = self.sum(active.sheet, at.x, step.frozen)
         yield self._with_square(step, "internal", at.internal)
 
-    def _damping_at(self, at: Evaluation) -> Array:
-        if at.damping is not None:
-            return at.damping
-        found = self._damping.product(at.v)
-        if not at.step.linear:  # else there is no second evaluation
-            at.damping = found
-        return found
+    def internal(self, at: Evaluation) -> Array:
+        """Forces (n_owned, 3) [N] of the sheet."""
+        return self.sum(self._active.sheet, at.x, at.step.frozen)
+
+    def damping(self, at: Evaluation) -> Array:
+        """Forces (n_owned, 3) [N] of material damping."""
+        return self._damping.product(at.v)
 
     def _with_square(self, step: TimeStep, name: str, part: Array) -> tuple[str, Array]:
         """The part of F, after its square is kept for `largest_force`."""
@@ -130,17 +128,11 @@ class StageForces:
     # -- objective ---------------------------------------------------------------------------------
 
     def objective(self, at: Evaluation) -> tuple[float, float]:
-        """Value of the function whose gradient F is, and the scale to which its round-off is relative, both
-        [W]; collective.
+        """As `Evaluation.objective`; collective.
 
         The scale is the sum of the absolute summands and of the geometric mean of each elastic energy and the
         energy at which strains are of order one: small strains are small differences of large coordinates.
         """
-        if at.objective is None:
-            at.objective = self._objective(at)
-        return at.objective
-
-    def _objective(self, at: Evaluation) -> tuple[float, float]:
         step, n = at.step, len(self._mass)
         rate, v, frozen = 1.0 / step.stage.c, at.v[:n], step.frozen
         parts, square = [step.stage.sigma * kinetic_energy(self._mass, v - step.v_h)], 0.0
@@ -164,7 +156,7 @@ class StageForces:
         if step.loads.following is not None:
             parts.append(rate * step.loads.following.energy(at.x))
         if self._damping.active:
-            parts.append(0.5 * float(np.vdot(v, self._damping_at(at))))
+            parts.append(0.5 * float(np.vdot(v, at.damping)))
         if not step.lagged:
             parts += [float(wind.potentials(at.v, frozen[wind]).sum()) for wind in self._active.viscous]
         value, size, square = self._layout.global_sum(sum(parts), sum(map(abs, parts)), square)
@@ -190,8 +182,6 @@ class StageForces:
         unknowns in steps of one linear solve, or None.
         """
         step, rows, reach = at.step, self._discretisation.rows, at.step.stage.c
-        if step.linear:  # the linear solve needs the memory
-            at.internal = None
         inertia = step.stage.sigma * self._mass
         if len(self._edge_stiffness):
             inertia[len(inertia) - len(self._edge_stiffness) :] += reach * self._edge_stiffness

@@ -114,7 +114,7 @@ def _give_up(run: SteppedScene, step: RejectedStep) -> NoReturn:
     run.failure = explain_failure(
         run.problem,
         run.scene,
-        run.stepper,
+        run.stepper.solver,
         step.attempt.failed_solve,
         step.earlier,
         step=run.step_number + 1,
@@ -202,11 +202,11 @@ def _take_backward_euler(run: SteppedScene, step: RejectedStep) -> None:
 
 
 def _other_solver_is_left(run: SteppedScene, step: RejectedStep) -> bool:
-    return run.stepper.linear_solver_failed and len(run.stepper.presets) > 1
+    return run.stepper.solver.linear_failed and len(run.stepper.presets) > 1
 
 
 def _take_next_solver(run: SteppedScene, step: RejectedStep) -> None:
-    previous, slow = run.stepper.preset, run.stepper.convergence.too_slow
+    previous, slow = run.stepper.preset, run.stepper.solver.convergence.too_slow
     following = run.stepper.next_preset()
     why = "took too many iterations" if slow else "broke down"
     run.run_notes.texts.append(
@@ -226,7 +226,7 @@ def _limit_increment(run: SteppedScene, step: RejectedStep) -> None:
 
 
 def _may_halve(run: SteppedScene, step: RejectedStep) -> bool:
-    return not (run.in_vain or run.stepper.stopped_by) and run.control.can_halve()
+    return not (run.in_vain or run.stepper.solver.stopped_by) and run.control.can_halve()
 
 
 def _halve(run: SteppedScene, step: RejectedStep) -> None:
@@ -235,7 +235,7 @@ def _halve(run: SteppedScene, step: RejectedStep) -> None:
     run.control.halve()
     why, solve = step.attempt.message or "no solution was found", step.attempt.failed_solve
     if solve and solve.snes_reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
-        why += f" ({_iterations_key()} {run.stepper.snes.getTolerances()[3]})"
+        why += f" ({_iterations_key()} {run.stepper.solver.snes.getTolerances()[3]})"
     run.run_notes.count_repeat(why, run.control.factor * run.control.step)
 
 

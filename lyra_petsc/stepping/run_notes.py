@@ -99,9 +99,9 @@ def note_step(run: SteppedScene, attempt: Attempt) -> None:
                 f"at this stiffness, {times:.1g} times the loads"
                 + (doubt if run.scene.time.static and times > DOUBTFUL else ""),
             )
-    if run.stepper.stopped_by:
+    if run.stepper.solver.stopped_by:
         notes.once(
             "option",
-            f"{when}: {run.stepper.stopped_by} stopped Newton's method at a residual of "
+            f"{when}: {run.stepper.solver.stopped_by} stopped Newton's method at a residual of "
             f"{attempt.residual:.2g} N, short of solver.force_tolerance",
         )

@@ -497,7 +497,7 @@ class Sensitivities:
     def _solver(self, velocity: Array, *, set_up: bool, keep: bool) -> Iterator[Callable[[Array], Array]]:
         """A context that gives approximate solutions by the Jacobian at the velocities of the stage."""
         stepper, equations = self.simulation.stepper, self._equations
-        ksp, linear = stepper.ksp, stepper.linear
+        ksp, linear = stepper.solver.ksp, stepper.solver.linear
         if set_up:
             equations.predicted_stress.forget()
             linear.assemble(equations.linearised(velocity), 0.0, keep=keep, convex=True)
@@ -505,7 +505,7 @@ class Sensitivities:
         tolerances, guess = ksp.getTolerances(), ksp.getInitialGuessNonzero()
         ksp.setTolerances(rtol=max(0.3 * self._tolerance, 1e-13), atol=0.0, max_it=5000)
         ksp.setInitialGuessNonzero(False)
-        right, left = stepper.velocity.duplicate(), stepper.velocity.duplicate()
+        right, left = stepper.solver.velocity.duplicate(), stepper.solver.velocity.duplicate()
 
         def solve(values: Array) -> Array:
             right.setArray(np.ascontiguousarray(values).ravel())

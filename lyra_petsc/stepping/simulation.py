@@ -141,8 +141,8 @@ class SteppedScene:
             self.stepper = Stepper(scene, equations, self.problem.surface, whole.spacing, floor)
         self.notes.extend(on_root(self.comm, lambda: unknown(self.stepper.our_options)))
         self.roundoff = floor
-        self.max_steps = self.stepper.ts.getMaxSteps()
-        self.control = planned_control(scene, self.stepper.ts, [*event_times(scene), *self._stops])
+        self.max_steps = self.stepper.solver.ts.getMaxSteps()
+        self.control = planned_control(scene, self.stepper.solver.ts, [*event_times(scene), *self._stops])
         self.accuracy: Accuracy | None = None
         if isinstance(self.control, ToleranceControl):
             self.accuracy = Accuracy(equations, self.control, scene.time.tolerance or 0.0, whole.size)

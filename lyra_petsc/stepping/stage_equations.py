@@ -119,7 +119,7 @@ class StageEquations:
         rest = Stage(1.0, 1.0, 1.0)
         zero = self.v[: len(mass)]
         self.step = TimeStep(0.0, 0.0, rest, self.x, self.x, zero, none, nothing, frozen, lagged=once)
-        self.evaluated = Evaluation(self.step, self.x, self.v)
+        self.evaluated = self.at(self.x, self.v)
         self.start_acceleration = StartAcceleration(events)
         self.predicted_stress = PredictedStress()
 
@@ -171,7 +171,7 @@ class StageEquations:
     def refreeze_end(self, changed: Mapping[Any, Any]) -> None:
         """End the step just accepted with other frozen data of some terms."""
         self.refreeze(changed)
-        self.evaluated = Evaluation(self.step, self.evaluated.x, self.evaluated.v)
+        self.evaluated = self.at(self.evaluated.x, self.evaluated.v)
         if self.state.evaluation is not None:
             self.state.evaluation = self.evaluated
 
@@ -284,7 +284,7 @@ class StageEquations:
         self.state.set(moved, rate)
         if step.linear and not self.active.moving:
             # the stage is at the end, and the next step is linearised there
-            self.evaluated = self.state.evaluation = Evaluation(step, self.x, solution.v)
+            self.evaluated = self.state.evaluation = self.at(self.x, solution.v)
         if self.integrator.dynamic:
             self.nears_limit = self.active.limits_act(self.x, step.frozen, self.points)
         if not self.integrator.dynamic or self.contact is None:
@@ -312,10 +312,14 @@ class StageEquations:
 
     # -- evaluations -------------------------------------------------------------------------------
 
+    def at(self, x: Array, v: Array, known: Array | None = None) -> Evaluation:
+        """An evaluation of the present step at positions and velocities x, v (n_local, 3)."""
+        return Evaluation(self.step, x, v, self.forces, known)
+
     def evaluate(self, v: Array) -> Evaluation:
         """The stage at velocities v (n_owned, 3); collective."""
         rates = self.points.extended(v)
-        return self.revisit(Evaluation(self.step, self.step.stage.c * rates + self.step.x_h, rates))
+        return self.revisit(self.at(self.step.stage.c * rates + self.step.x_h, rates))
 
     def linearised(self, v: Array) -> Evaluation:
         """The stage at which F and its Jacobian are evaluated for velocities v (n_owned, 3); collective.
@@ -327,7 +331,7 @@ class StageEquations:
             return self.evaluate(v)
         x_h, known = self.step.x_h, self.state.evaluation
         self.state.evaluation = None
-        return self.revisit(Evaluation(self.step, x_h, np.zeros_like(x_h), known.internal if known else None))
+        return self.revisit(self.at(x_h, np.zeros_like(x_h), known.internal if known else None))
 
     def revisit(self, evaluation: Evaluation) -> Evaluation:
         """An evaluation of the present step again, with the pairs that are near there; collective."""
@@ -346,13 +350,13 @@ class StageEquations:
 
     def out_of_balance(self, v: Array | None = None) -> Array:
         """Force (n_owned, 3) [N] on the free unknowns, with the state's velocities or v (n_local, 3)."""
-        at = Evaluation(self.step, self.x, self.v if v is None else v)
+        at = self.at(self.x, self.v if v is None else v)
         total = self.forces.total(at, np.zeros((len(self.mass), 3)), np.empty((len(self.mass), 3)))
         return np.where(self.step.prescribed.free, -total, 0.0)
 
     def forces_now(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the start of the step without inertia, each (n_owned, 3) [N]."""
-        return self.forces.parts(Evaluation(self.step, self.x, self.v), np.zeros((len(self.mass), 3)))
+        return self.forces.parts(self.at(self.x, self.v), np.zeros((len(self.mass), 3)))
 
     def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
@@ -417,7 +421,7 @@ class StageEquations:
         held = self.prescriptions.resized(self.step.prescribed)
         self.change(x=extended(self.step.x), x_h=extended(self.step.x_h), prescribed=held)
         now = self.evaluated
-        self.evaluated = Evaluation(self.step, extended(now.x), extended(now.v))
+        self.evaluated = self.at(extended(now.x), extended(now.v))
 
     def update_pattern(self) -> bool:
         """Update the pattern of the block rows to the pairs that act at the positions last evaluated.

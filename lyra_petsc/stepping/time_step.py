@@ -5,13 +5,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.applied_loads import StepLoads
 from lyra_petsc.stepping.integrators.integrator import Stage
 from lyra_petsc.stepping.prescribed import PrescribedUnknowns
 from lyra_petsc.terms.term import Term
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.forces import StageForces
 
 _numbers = itertools.count()
 
@@ -80,24 +84,40 @@ class TimeStep:
         return self.stage.offset == self.dt
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The stage of a step at given velocities, and what has been computed there.
+    """The stage of a step at given velocities, and what follows from these, computed when it is first needed.
 
     Attributes
     ----------
     step : TimeStep
     x, v : (n_local, 3)
         Positions [m] and velocities [m/s], ghosts up to date.
-    internal, damping : (n_owned, 3) or None
-        Forces [N] of the sheet and of its damping, once they are known.
-    objective : (float, float) or None
-        Value of the function that the step minimises and the scale of its round-off [W], once they are known.
+    forces : StageForces
+        The equations.
+    known : (n_owned, 3) or None
+        The internal forces, where an earlier evaluation has had them.
     """
 
     step: TimeStep
     x: Array
     v: Array
-    internal: Array | None = None
-    damping: Array | None = None
-    objective: tuple[float, float] | None = None
+    forces: StageForces
+    known: Array | None = None
+
+    @cached_property
+    def internal(self) -> Array:
+        """Forces (n_owned, 3) [N] of the sheet."""
+        return self.forces.internal(self) if self.known is None else self.known
+
+    @cached_property
+    def damping(self) -> Array:
+        """Forces (n_owned, 3) [N] of material damping."""
+        return self.forces.damping(self)
+
+    @cached_property
+    def objective(self) -> tuple[float, float]:
+        """Value of the function whose gradient F is, and the scale to which its round-off is relative, both
+        [W]; collective.
+        """
+        return self.forces.objective(self)

@@ -139,7 +139,7 @@ def steps(comm: Comm, job: Result) -> Result:
             break
     _, peak = resident()
     whole, stepper = simulation.problem.whole, simulation.stepper
-    operator, pattern = stepper.linear.operator, simulation.problem.pattern
+    operator, pattern = stepper.solver.linear.operator, simulation.problem.pattern
     # PETSc's own product, with the storage of as many entries
     assembled = AssembledMatrix(simulation.problem.points, pattern, "sbaij")
     assembled.set(operator.rows)

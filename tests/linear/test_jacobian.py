@@ -143,7 +143,7 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
         h = 1e-3
 
         def value(step: float) -> float:
-            return simulation.equations.forces.objective(simulation.equations.evaluate(v + step * d))[0]
+            return simulation.equations.evaluate(v + step * d).objective[0]
 
         numeric = (8.0 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12.0 * h)
         slope = comm.allreduce(float(np.vdot(residual(simulation, v), d)))

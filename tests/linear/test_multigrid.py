@@ -186,7 +186,7 @@ def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm
     given = {"pc_type": "python", "mat_partitioning_type": "average"}
     with stepped(comm, Scene.model_validate(content), **given) as simulation:
         simulation.step()
-        pc = simulation.stepper.snes.getKSP().getPC()
+        pc = simulation.stepper.solver.snes.getKSP().getPC()
         b, x = pc.getOperators()[0].createVecs()
         columns = []
         for unknown in range(b.getSize()):

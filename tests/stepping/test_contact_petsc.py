@@ -136,7 +136,9 @@ def test_linear_systems_are_solved_accurately_while_a_sheet_buckles(comm: MPI.Co
     simulation.stepper.start(0.0, 0)
     simulation.energy_balance = EnergyBalance(equations)
     simulation.step()  # the first step does not know the Hessian of one before
-    simulation.stepper.snes.getKSP().setMonitor(lambda ksp, *_: tolerances.append(ksp.getTolerances()[0]))
+    simulation.stepper.solver.snes.getKSP().setMonitor(
+        lambda ksp, *_: tolerances.append(ksp.getTolerances()[0])
+    )
     simulation.step()
     assert max(tolerances) <= 1e-3
     assert (1e-5 in tolerances) == (rate > 0.0)

@@ -25,7 +25,7 @@ def test_steps_equal_those_with_a_preconditioner_per_step(comm: MPI.Comm, kind: 
             reused = 0
             while not simulation.finished:
                 simulation.step()
-                reused += simulation.stepper.linear.reuse.reused
+                reused += simulation.stepper.solver.linear.reuse.reused
             assert (reused > 10) == (lag is None)
             ends.append(shape(simulation))
     # the linear tolerance of a step is 1e-6 of its change of velocities

@@ -14,7 +14,8 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure.failure_diagnosis import SNES, Diagnosis, diagnose
 from lyra_petsc.stepping.newton.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.problem import Problem
-from lyra_petsc.stepping.stepper import BEYOND_LIMIT, Attempt, Stepper
+from lyra_petsc.stepping.stage_solver import StageSolver
+from lyra_petsc.stepping.stepper import BEYOND_LIMIT, Attempt
 
 if TYPE_CHECKING:
     from lyra_petsc.contact.nearest_pair import NearPair
@@ -202,7 +203,7 @@ class Failure:
 def explain_failure(
     problem: Problem,
     scene: Scene,
-    stepper: Stepper,
+    solver: StageSolver,
     solve: FailedSolve,
     attempts: list[FailedAttempt],
     *,
@@ -217,7 +218,7 @@ def explain_failure(
     problem : Problem
         In the state before the step.
     scene : Scene
-    stepper : Stepper
+    solver : StageSolver
     solve : FailedSolve
         Of the last attempt.
     attempts : list of FailedAttempt
@@ -244,7 +245,7 @@ def explain_failure(
         if static
         else f"a smaller time.step, or -ts_adapt_dt_min below {attempts[-1].dt:.3g}"
     )
-    advice = [f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []
+    advice = [f"a smaller {solver.stopped_by}, or none"] if solver.stopped_by else []
     if near is not None and near.blocks:
         # contact forces grow without bounds where parts would cross, so other advice would mislead
         advice += [
@@ -263,10 +264,13 @@ def explain_failure(
     elif kind == "linear trouble":
         package = " -pc_factor_mat_solver_type mumps" if problem.points.comm.size > 1 else ""
         advice += [f"a direct solver: -pc_type lu{package}, with -pc_factor_shift_type positive_definite"]
-        advice += [f"-ksp_max_it above {stepper.ksp.getTolerances()[3]}", "solver.hessian: regularised"]
+        advice += [
+            f"-ksp_max_it above {solver.ksp.getTolerances()[3]}",
+            "solver.hessian: regularised",
+        ]
     else:
         if solve.snes_reason == SNES.DIVERGED_MAX_IT:
-            advice += [f"{iterations_key} above {stepper.snes.getTolerances()[3]}"]
+            advice += [f"{iterations_key} above {solver.snes.getTolerances()[3]}"]
         advice += [shorter, "more material.damping, gentler motions and loads, or a finer mesh"]
         advice += ["a larger solver.force_tolerance, if the residual is small compared with the forces"]
     return Failure(

@@ -20,12 +20,13 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array, Mask
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.directors import match
+from lyra_petsc.stepping.prescribed import PrescribedUnknowns
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 
@@ -66,7 +67,7 @@ class Arcs:
         self._area, self._slopes = data["area"], np.stack([-one - two, one, two], axis=1)
         self._matrix: AssembledMatrix | None = None
         self._ksp: PETSc.KSP | None = None
-        self._held: Mask = np.empty(0, dtype=bool)
+        self._factored_for = -1
 
     def turns_notably(self, increment: Array) -> bool:
         """Whether an increment (n_owned, 3) [m/s] rotates directors so far that its arc differs notably."""
@@ -121,20 +122,18 @@ class Arcs:
 
     def _solve(self, forces: Array) -> Array:
         """Displacements (n_owned, 3) [m] of the free unknowns by the Poisson equation for ``forces``."""
-        mask, free = self._equations.step.prescribed.mask, self._equations.step.prescribed.free
-        (changed,) = self._equations.points.global_max(float(not np.array_equal(mask, self._held)))
-        if changed:
-            self._factor()
+        prescribed = self._equations.step.prescribed
+        if prescribed.number != self._factored_for:
+            self._factor(prescribed)
         assert self._matrix is not None
         assert self._ksp is not None
-        return self._matrix.solve(self._ksp, np.where(free, forces, 0.0))
+        return self._matrix.solve(self._ksp, np.where(prescribed.free, forces, 0.0))
 
-    def _factor(self) -> None:
+    def _factor(self, prescribed: PrescribedUnknowns) -> None:
         self.destroy()
-        layout, mask, name = self._equations.points, self._equations.step.prescribed.mask, self._term.name
+        layout, mask, name = self._equations.points, prescribed.mask, self._term.name
         pattern = BlockPattern({name: self._term.stencil}, layout.n_owned, layout.n_local)
         rows = BlockRows(pattern)
-        self._held = mask.copy()
         size = np.einsum("eck,eck->e", self._slopes, self._slopes)
         (largest,) = layout.global_max(float((self._area * size).max(initial=0.0)))
         values, diagonal = rows.zeros(), np.full(layout.n_owned, REGULARISATION * largest)
@@ -148,6 +147,7 @@ class Arcs:
         self._matrix.set(values)
         self._ksp = self._matrix.cholesky()
         self._ksp.setUp()
+        self._factored_for = prescribed.number
 
     def destroy(self) -> None:
         """Free the factors and the matrix; collective."""

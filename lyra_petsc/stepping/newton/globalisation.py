@@ -136,7 +136,7 @@ class Globalisation:
 
     def note_iterate(self, u: PETSc.Vec) -> None:
         """Note energy and residual of iterate u, with which trial points are compared; collective."""
-        self._energy = self._equations.forces.objective(self._iterates.at(u))
+        self._energy = self._iterates.at(u).objective
         self._norm = self._snes.getFunctionNorm()
         # near equilibrium energy differences are round-off; in statics, where steps are long, line searches
         # would progress slowly
@@ -182,7 +182,7 @@ class Globalisation:
         value that every line search accepts.
         """
         at = self._iterates.at(u)
-        value, size = self._equations.forces.objective(at)
+        value, size = at.objective
         here, own_size = self._energy
         if value != here and np.isfinite(value) and (self._returns or self.takes_full_steps):
             return min(value, here - self._slope)

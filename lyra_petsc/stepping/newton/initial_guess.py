@@ -44,7 +44,7 @@ def first_guess(equations: StageEquations, start: Array, out: Array) -> bool:
     if integrator.order > 1 and equations.contact is None and not equations.active.limiting:
         out[:] = moving
         return False
-    energies = [equations.forces.objective(equations.evaluate(each))[0] for each in (still, moving)]
+    energies = [equations.evaluate(v).objective[0] for v in (still, moving)]
     use_still = energies[0] < energies[1]
     out[:] = still if use_still else moving
     return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,6 @@ from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping import motion_limits as limits
 from lyra_petsc.stepping.directors import turn_with_triangles
-from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton.blend import HessianBlend
 from lyra_petsc.stepping.newton.convergence import Convergence
 from lyra_petsc.stepping.newton.globalisation import Globalisation
@@ -27,7 +25,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.time_step import Evaluation
 
 if TYPE_CHECKING:
-    from lyra_petsc.stepping.newton.arcs import Arcs
+    from lyra_petsc.stepping.newton.shell_steps import ShellSteps
 
 
 SMALL_GAP = 0.005
@@ -39,32 +37,6 @@ MAX_INCREMENT = 1.0
 """Largest displacement of a vertex, over the mean edge length, in a Newton iteration of an equilibrium while
 parts are near each other. Full steps of indefinite Hessians lead sheets that slide or fall far off, and
 Newton's method takes many iterations to return."""
-
-MAX_REMAINING = 0.5
-"""A correction of a step is taken if it leaves less than this fraction of the residual."""
-
-MAX_CORRECTIONS = 8
-"""Largest number of corrections of one step."""
-
-MIN_OVERLAP, MAX_OVERLAP = -1.0, 0.5
-"""Range of the correction's projection on the last step, over that step, in which Broyden's update acts."""
-
-
-def _max_norm(vector: PETSc.Vec) -> float:
-    return float(vector.norm(PETSc.NormType.INFINITY))
-
-
-def _apply_broyden(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
-    """Change a correction solved with the matrix of the first step to that of Broyden's matrix; collective.
-
-    ``steps`` are the Newton step and the corrections before this one.
-    (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.4, algorithm QNERR.)
-    """
-    for step, following in itertools.pairwise(steps):
-        correction.axpy(step.dot(correction) / step.dot(step), following)
-    repeated = steps[-1].dot(correction) / steps[-1].dot(steps[-1])
-    if MIN_OVERLAP < repeated < MAX_OVERLAP:
-        correction.scale(1.0 / (1.0 - repeated))
 
 
 class NewtonCallbacks:
@@ -119,14 +91,11 @@ class NewtonCallbacks:
         self._last_iterate: PETSc.Vec | None = None
         self._last_c = 0.0
         self._convex_at_start = False
-        self._can_correct = (
-            not equations.integrator.dynamic and linear.factors and bool(equations.active.with_edges)
-        )
-        self._arcs: Arcs | None = None
-        if self._can_correct:
-            from lyra_petsc.stepping.newton.arcs import Arcs, can_factor  # needed in equilibria only
+        self._shell: ShellSteps | None = None
+        if not equations.integrator.dynamic and linear.factors and equations.active.with_edges:
+            from lyra_petsc.stepping.newton.shell_steps import ShellSteps  # needed in equilibria only
 
-            self._arcs = Arcs(equations) if can_factor(equations.points.comm.size) else None
+            self._shell = ShellSteps(snes, equations, convergence)
         fixed = is_set("ksp_rtol") or not equations.integrator.dynamic
         self.forcing = Forcing(
             self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.contact is not None
@@ -149,9 +118,9 @@ class NewtonCallbacks:
         self.forcing.begin_solve(near=near, collides=collides, buckles=not self._convex_at_start)
 
     @property
-    def _corrects(self) -> bool:
-        """Whether steps follow arcs and are corrected: in equilibria of shells, while no parts are near."""
-        return self._can_correct and not self._equations.near
+    def _full_steps(self) -> ShellSteps | None:
+        """Changes full steps in equilibria of shells, while no parts are near."""
+        return None if self._equations.near else self._shell
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
@@ -161,7 +130,8 @@ class NewtonCallbacks:
             self._equations.predicted_stress.set_iterate(at.x)
             self.forcing.before_solve(self.convergence)
         # where Newton converges the geometry hardly changes, and the last preconditioner still serves
-        blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
+        exact = self._full_steps is not None and self.convergence.halved
+        blend = self._blend.after(self._taken(u), exact=exact)
         keep = self.convergence.fell_fast
         by_prescribed = self._linear.assemble(at, blend, keep=keep, convex=self._convex)
         if by_prescribed is not None:
@@ -211,16 +181,21 @@ class NewtonCallbacks:
             failed = self._lacks_descent(residual, y)
         if self._models_contact and not failed:
             changed |= self._apply_contact_model(x, residual, y)
-        full = self.globalisation.takes_full_steps
-        curved = self._arcs is not None and full and self._corrects and self._apply_arcs(x, residual, y)
-        if self._equations.active.with_edges and full and not curved:
+        v, full = self._array(x), self.globalisation.takes_full_steps
+        shell = self._full_steps if full else None
+        curved = shell is not None and shell.curve(v, residual, y)
+        if curved:
+            self.step_fraction = 1.0
+        elif self._equations.active.with_edges and full:
             changed |= self._turn_directors(x, residual, y)
         if limits.limits_steps(self._equations) and not curved:
             changed |= self._limit_step(x, residual, y)
         changed |= curved
-        if full and self._corrects:
+        if shell is not None:
             exact = self._linear.uses_operator and self._blend.value == 0.0
-            changed |= self._apply_corrections(x, y, exact=exact)
+            before = shell.iterations
+            changed |= shell.correct(v, y, exact=exact)
+            self.extra_iterations += shell.iterations - before
         if self._last_iterate is not None:
             self._last_iterate.destroy()
         self._last_iterate, self._step_length = x.copy(), y.norm()
@@ -262,107 +237,22 @@ class NewtonCallbacks:
         self.contact_iterations += solves.iterations
         return changed
 
-    def _apply_corrections(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
-        """Add corrections, solved with the same factors, to a step y that is taken in full.
-
-        Each is solved for the residual at the end of the step, as long as it reduces that residual notably.
-        With ``exact``, where y is the unmodified Newton step, several are tried, else one. Returns whether y
-        changed. The first removes the stretch of a linear step (Traub, Iterative Methods for the Solution of
-        Equations, 1964, chapter 8: of third order), the others are steps of Broyden's method.
-        """
-        convergence, v = self.convergence, self._array(x)
-        first = v - self._array(y)
-        size, force = self._residual(first)
-        if size == 0.0:
-            return False
-        right, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
-        corrected = False
-        for _ in range(MAX_CORRECTIONS if exact else 1):
-            right.setArray(force.ravel())
-            self._ksp.solve(right, correction)
-            self.extra_iterations += self._ksp.getIterationNumber()
-            if exact:
-                _apply_broyden(correction, steps)
-            before, increment = size, -self._array(y) - self._array(correction)
-            if not limits.moves_freely(self._equations, v, increment):
-                break
-            size, force = self._residual(v + increment)
-            if not size < MAX_REMAINING * before:
-                break
-            corrected = True
-            y.axpy(1.0, correction)
-            if exact and convergence.correction_suffices(_max_norm(correction), _max_norm(steps[-1]), size):
-                break
-            steps.append(correction.copy())
-        if corrected:
-            self._equations.predicted_stress.take_uncorrected(self._equations.evaluate(first).x)
-        for vector in (right, correction, *steps):
-            vector.destroy()
-        return corrected
-
-    def _residual(self, v: Array) -> tuple[float, Array]:
-        """F (n_owned, 3) [N] at velocities v and its norm; collective."""
-        force = self._equations.residual_at(v)
-        (square,) = self._equations.points.global_sum(float(np.vdot(force, force)))
-        return float(np.sqrt(square)), force
-
-    def curve_guess(self, v: Array, start: Array, guess: Array) -> None:
-        """Change a first guess (n_owned, 3) [m/s] far from v to one along arcs that moves freely from
-        ``start``; collective.
-
-        Of all expected increments it takes the one whose end has the least energy.
-        """
-        integrator = self._equations.integrator
-        if self._arcs is None or not isinstance(integrator, Static):
-            return
-        others = [displacement / integrator.pseudo_dt for displacement in integrator.alternatives]
-        lowest = np.inf
-        for increment in (guess - v, *others):
-            end = v + self._arcs.curve(v, increment, strains=False)[0]
-            self._equations.prescribe(end)
-            if not limits.moves_freely(self._equations, start, end - start):
-                continue
-            energy = self._equations.forces.objective(self._equations.evaluate(end))[0] if others else 0.0
-            if energy < lowest:
-                lowest, guess[:] = energy, end
-
-    def tangent(self, force: Array) -> tuple[Array | None, int]:
-        """See `Stepper.tangent`."""
-        if self._arcs is None or not self._corrects or self._last_c == 0.0:
-            return None, 0
-        b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
-        b.setArray(force.ravel())
-        self._ksp.solve(b, x)
-        displacement = self._last_c * self._array(x) if self._ksp.getConvergedReason() > 0 else None
-        b.destroy()
-        x.destroy()
-        return displacement, int(self._ksp.getIterationNumber())
-
-    def _apply_arcs(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Replace a step y that is taken in full by one along arcs if it descends and hits nothing.
-
-        Returns whether y changed.
-        """
-        assert self._arcs is not None
-        v = self._array(x)
-        if not self._arcs.turns_notably(-self._array(y)):
-            return False
-        before = y.copy()
-        curved, increment = self._arcs.curve(v, -self._array(y))
-        y.setArray(-curved.ravel())
-        descends = bool(residual.dot(y) > 0.0) and limits.moves_freely(self._equations, v, curved)
-        if descends:
-            self._equations.predicted_stress.take_uncorrected(self._equations.evaluate(v + increment).x)
-            self.step_fraction = 1.0
-        else:
-            before.copy(y)
-        before.destroy()
-        return descends
-
     def destroy(self) -> None:
         """Free the PETSc objects of its own; collective."""
-        if self._arcs is not None:
-            self._arcs.destroy()
+        if self._shell is not None:
+            self._shell.destroy()
+
+    def curve_guess(self, v: Array, start: Array, guess: Array) -> None:
+        """See `ShellSteps.curve_guess`; collective."""
+        if self._shell is not None:
+            self._shell.curve_guess(v, start, guess)
+
+    def tangent(self, force: Array) -> tuple[Array | None, int]:
+        """Linear response (n_owned, 3) [m] to a small force (n_owned, 3) [N] at the end of the last solve, by
+        its factors, or None without; and the number of linear iterations; collective.
+        """
+        shell = self._full_steps
+        return (None, 0) if shell is None or self._last_c == 0.0 else shell.tangent(force, self._last_c)
 
     def _turn_directors(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Turn directors with their triangles in a step y that is taken in full; whether y changed."""

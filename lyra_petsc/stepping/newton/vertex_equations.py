@@ -46,13 +46,13 @@ class VertexEquations:
         self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local, layout.n_vertices))
         self.pattern = self._rows.pattern
         self.turns = DirectorRotations(self._bent, layout.n_owned)
-        self._hold(np.zeros((layout.n_local, 3), dtype=bool))
+        self._held_number = -1
 
     def _hold(self, held: Mask) -> None:
         """Set the data that depend on the prescribed unknowns ``held`` (n_local, 3)."""
         term = self._bent
         assert term.edges is not None
-        self._held, self._constrained = held.copy(), self._rows.constrained_entries(held)
+        self._constrained = self._rows.constrained_entries(held)
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
         self.turns.exclude(held)
 
@@ -64,7 +64,8 @@ class VertexEquations:
         equations, rows = self._equations, self._rows
         x, vs = equations.evaluated.x, equations.evaluated.v
         stage, damped = equations.step.stage, equations.damping.active
-        if not np.array_equal(held, self._held):
+        if (number := equations.step.prescribed.number) != self._held_number:
+            self._held_number = number
             self._hold(held)
         self.turns.update(x)
         values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)

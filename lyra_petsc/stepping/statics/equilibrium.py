@@ -139,7 +139,7 @@ class Equilibrium:
             spacing,
             leaps=not equations.active.viscous,
             contact=equations.contact is not None,
-            factors=stepper.linear.factors,
+            factors=stepper.solver.linear.factors,
         )
         self._extrapolation = Extrapolation(equations.points.comm)
         self._follows = bool(equations.active.viscous or equations.active.following)
@@ -174,7 +174,7 @@ class Equilibrium:
             return found
         attempt = self._by_proximal_steps(before, factor, limited=limited)
         hard = not attempt.converged or attempt.newton_iterations > HARD_STEP
-        if not (attempt.converged or self._whole_first or self._stepper.stopped_by):
+        if not (attempt.converged or self._whole_first or self._stepper.solver.stopped_by):
             found = self._by_whole_stiffness(before, factor)
         self._whole_first = hard
         if found is None:
@@ -273,7 +273,7 @@ class Equilibrium:
                 resumed += 1
             elif leap:
                 self._pseudo_time.record_failed_leap(first=not solved_once)
-            elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
+            elif self._stepper.solver.linear_failed or self._stepper.solver.stopped_by:
                 break
             else:
                 if contact:
@@ -380,13 +380,13 @@ class Equilibrium:
 
     def _proximal_step(self, before: float, factor: float, limit: int | None) -> Attempt:
         """One proximal step; ``limit`` bounds Newton iterations, and then also displacements; collective."""
-        snes, convergence = self._stepper.snes, self._stepper.convergence
+        snes, convergence = self._stepper.solver.snes, self._stepper.solver.convergence
         maximum = snes.getTolerances()[3]
         snes.setTolerances(max_it=min(maximum, limit or maximum))
         convergence.max_displacement = self._size if limit else np.inf
         attempt = self._stepper.attempt(before, factor)
-        self._stepper.snes.setTolerances(max_it=maximum)
-        self._stepper.convergence.max_displacement = np.inf
+        self._stepper.solver.snes.setTolerances(max_it=maximum)
+        self._stepper.solver.convergence.max_displacement = np.inf
         return attempt
 
     def _resume_from_lowest(self, attempt: Attempt) -> bool:
